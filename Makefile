@@ -1,0 +1,44 @@
+# Two commands do all the set-up: `make demo` and `make test`. Every other target is one line.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: demo test lint types tests fmt bench docs native clean
+
+demo: $(STAMP)
+	$(BIN)/splatctrl demo --force -o demo_output
+
+test: lint types tests
+
+lint: $(STAMP)
+	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+types: $(STAMP)
+	$(BIN)/mypy
+
+tests: $(STAMP)
+	$(BIN)/python -m pytest
+
+fmt: $(STAMP)
+	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks
+
+docs: $(STAMP)
+	$(BIN)/python docs/generate.py
+
+native: $(STAMP)
+	$(PIP) install -q --no-build-isolation --no-deps -c constraints.txt -e .
+
+clean:
+	rm -rf $(VENV) build demo_output
+
+# Reinstalls when the build's inputs change; a repeated `make demo` starts at once.
+$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard splatctrl_cli/kernels/src/*)
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) install -q -c constraints.txt torch==2.13.0 scikit-build-core nanobind cmake ninja
+	$(PIP) install -q --no-build-isolation -c constraints.txt -e '.[dev]'
+	touch $(STAMP)

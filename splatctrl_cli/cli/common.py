@@ -1,0 +1,126 @@
+"""What subcommands share: common options, tables and JSON on stdout, log lines on stderr, gates."""
+
+import argparse
+import json
+import operator
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.errors import GateFailed, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.config import Config
+
+Subparsers = Any  # argparse keeps its subparser type private
+
+
+def add_command(
+    subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int], *, summary: str
+) -> argparse.ArgumentParser:
+    """A subcommand's parser with the options every command has: --json, -v, -q."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        name, help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; show tracebacks")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress, no log lines")
+    return parser
+
+
+def add_output(parser: argparse.ArgumentParser, *, default: str, what: str) -> None:
+    """``-o/--out`` and ``--force``."""
+    parser.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"{what} (default: {default})")
+    parser.add_argument("--force", action="store_true", help="replace the output if it exists")
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """``--config``, ``--set``, ``--seed``, ``--threads``."""
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="configuration, see docs/config.md")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="one setting (repeatable)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
+    parser.add_argument("--threads", type=int, default=0, help="threads (default: one per core)")
+
+
+def add_gates(parser: argparse.ArgumentParser) -> None:
+    """``--require 'metric>=value'``."""
+    parser.add_argument(
+        "--require", action="append", default=[], metavar="METRIC>=VALUE", help="fail (exit 1) unless it holds"
+    )
+
+
+def configured(args: argparse.Namespace) -> "Config":
+    """The configuration that --config and --set give."""
+    from splatctrl_cli.config import load_config
+
+    return load_config(args.config, args.set)
+
+
+class Console:
+    """Results to stdout, as a table or one JSON object; log lines to stderr unless --quiet."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.is_json = bool(args.json)
+        self.is_quiet = bool(args.quiet)
+
+    def log(self, line: str) -> None:
+        """One progress line on stderr."""
+        if not self.is_quiet:
+            print(line, file=sys.stderr, flush=True)
+
+    def result(self, result: Mapping[str, Any], lines: Sequence[str]) -> None:
+        """The command's result: `result` as JSON with --json, else `lines`."""
+        if self.is_json:
+            print(json.dumps(result, indent=2, allow_nan=False, default=_plain))
+        else:
+            print("\n".join(lines))
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
+    """Aligned text columns; numbers to the right, words to the left."""
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))]
+    is_number = [all(re.match(r"^[-+]?[\d.]|^(nan|-)$", row[i]) for row in cells) for i in range(len(header))]
+    lines = []
+    for row in [list(header), *cells]:
+        padded = [c.rjust(w) if n else c.ljust(w) for c, w, n in zip(row, widths, is_number, strict=True)]
+        lines.append("  ".join(padded).rstrip())
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return lines
+
+
+_COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
+
+
+def check_gates(requirements: Sequence[str], metrics: Mapping[str, float | None]) -> None:
+    """Raise GateFailed naming every requirement that does not hold; a metric that is None fails its gate."""
+    failed = []
+    for requirement in requirements:
+        match = re.fullmatch(r"\s*([\w.]+)\s*(>=|<=|>|<)\s*(\S+)\s*", requirement)
+        if not match:
+            raise UsageError(f"--require {requirement}: expected METRIC>=VALUE (or <=, >, <)")
+        name, comparison, text = match.groups()
+        if name not in metrics:
+            raise UsageError(f"--require {requirement}: unknown metric", remedy=f"known here: {', '.join(metrics)}")
+        try:
+            bound = float(text)
+        except ValueError:
+            raise UsageError(f"--require {requirement}: {text!r} is not a number") from None
+        value = metrics[name]
+        if value is None or not _COMPARISONS[comparison](value, bound):
+            failed.append(
+                f"{name} is {'unknown' if value is None else f'{value:.6g}'}, required {comparison} {bound:g}"
+            )
+    if failed:
+        raise GateFailed("gate failed: " + "; ".join(failed))
+
+
+def _plain(value: object) -> object:
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)

@@ -1,0 +1,64 @@
+"""``splatctrl``: builds the parser, runs one subcommand, turns errors into one line and an exit code.
+
+Nothing heavy is imported here or at the top of a subcommand's file: ``splatctrl --help`` answers at once.
+"""
+
+import argparse
+import importlib
+import sys
+import traceback
+from collections.abc import Sequence
+
+from splatctrl_cli import __version__
+from splatctrl_cli.errors import SplatCtrlError
+
+COMMANDS = ("simulate", "ingest", "info", "reconstruct", "export", "sdf-bake", "score", "replay", "demo")
+
+EXIT_CODES = """\
+exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
+damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug; 130 interrupted"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser with every subcommand registered."""
+    parser = argparse.ArgumentParser(
+        prog="splatctrl",
+        description="What did the robot's cameras know, and would this controller have kept it safe?",
+        epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"splatctrl {__version__}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for command in COMMANDS:
+        module = importlib.import_module(f"splatctrl_cli.cli.{command.replace('-', '_')}")
+        module.register(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    args = build_parser().parse_args(argv)
+    verbose = getattr(args, "verbose", 0)
+    try:
+        code: int = args.run(args)
+        sys.stdout.flush()
+        return code
+    except SplatCtrlError as error:
+        return _fail(error, str(error), error.exit_code, verbose)
+    except KeyboardInterrupt as error:
+        return _fail(error, "interrupted", 130, verbose)
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except OSError as error:
+        return _fail(error, f"{error.filename or 'system'}: {error.strerror or error}", 6, verbose)
+    except Exception as error:
+        return _fail(error, f"internal error: {type(error).__name__}: {error}; please report it", 70, verbose)
+
+
+def _fail(error: BaseException, line: str, code: int, verbose: int) -> int:
+    if verbose:
+        traceback.print_exception(error)
+    print(f"splatctrl: {' '.join(line.split())}", file=sys.stderr)
+    return code

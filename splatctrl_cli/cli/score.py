@@ -1,0 +1,15 @@
+"""``splatctrl score``."""
+
+import argparse
+
+from splatctrl_cli.cli.common import Subparsers, add_command
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the subcommand to the parser."""
+    add_command(subparsers, "score", run, summary="score")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the subcommand and return its exit code."""
+    raise NotImplementedError

@@ -1,0 +1,152 @@
+"""Every number of the method, by section of the paper. The paper's value is the default where it gives one."""
+
+import dataclasses
+import difflib
+import tomllib
+import types
+import typing
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from splatctrl_cli.errors import InputError, UsageError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneConfig:
+    """III-B and III-C: splats, losses, add and relocate."""
+
+    max_splats: int = 5000  # IV-C
+    initial_opacity: float = 0.5  # III-C
+    max_radius: float = 0.02  # [m] r_max; the paper gives none, one voxel
+    lambda_dssim: float = 0.2  # III-C, eq. 4
+    lambda_color: float = 1.0
+    lambda_depth: float = 1.0
+    lambda_reg: float = 0.02
+    lambda_mde: float = 50.0  # III-C eq. 5 gives none; its source (SplaTAM) uses 50
+    min_depth_error: float = 0.02  # [m] floor of lambda_mde * MDE, so that a perfect map is not re-seeded
+    hole_opacity: float = 0.5  # accumulated opacity below which a pixel is a hole in the map
+    min_opacity: float = 0.1  # III-C, alpha_min
+    iterations_per_step: int = 5  # K optimiser steps per time step
+    first_iterations: int = 150  # optimiser steps on the first time step
+    lr_center: float = 2e-4
+    lr_log_radius: float = 5e-3
+    lr_color: float = 5e-3
+    lr_logit_opacity: float = 2e-2
+    noise: float = 5e5  # lambda_noise of 3DGS-MCMC; a step is capped at half a radius
+    window: int = 6  # keyframes kept beside the newest frame of each camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class OccupancyConfig:
+    """III-C: occupancy grid, free-space filter, robot labels."""
+
+    voxel: float = 0.02  # [m], at least the largest radius
+    free_below: float = 0.3  # III-C
+    occupied_above: float = 0.7  # III-C
+    log_odds_hit: float = 0.85
+    log_odds_miss: float = -0.4
+    log_odds_limit: float = 3.5
+    max_range: float = 3.0  # [m]
+    uncertain_patience: int = 10  # time steps a splat may stand in an uncertain voxel
+    robot_margin: float = 0.015  # [m] beyond the robot's spheres that still counts as robot
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldConfig:
+    """III-D: distance field."""
+
+    kernel: str = "matern"  # eq. 7
+    length_scale: float = 0.02  # [m] l, IV-C
+    noise: float = 1e-6  # epsilon of eq. 8
+    voxel: float = 0.02  # [m], IV-B
+    padding: float = 0.20  # [m] around the splats where no workspace is given
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlConfig:
+    """III-E: QP inverse kinematics with control barrier functions."""
+
+    margin: float = 0.02  # [m] epsilon, IV-C
+    period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """The whole configuration, one table per section in TOML."""
+
+    scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    occupancy: OccupancyConfig = dataclasses.field(default_factory=OccupancyConfig)
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    control: ControlConfig = dataclasses.field(default_factory=ControlConfig)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Nested plain values, as written to ``run.json``."""
+        return asdict(self)
+
+
+T = TypeVar("T")
+
+
+def load_config(path: Path | None, assignments: typing.Sequence[str]) -> Config:
+    """Defaults, then the TOML file, then each ``section.key=value``.
+
+    Raises UsageError for an unknown section or key (naming the nearest), a value of the wrong type, or TOML that
+    does not parse; InputError for a file that is not there.
+    """
+    config = Config()
+    if path is not None:
+        config = _merge(config, _read_toml(path), where=str(path))
+    for assignment in assignments:
+        key, separator, text = assignment.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not separator or not dot:
+            raise UsageError(f"--set {assignment}: expected section.key=value")
+        config = _merge(config, {section: {name: _parse_value(text.strip())}}, where=f"--set {assignment}")
+    return config
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file", remedy="give --config an existing TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: not valid TOML: {error}") from None
+
+
+def _parse_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _merge(target: T, values: dict[str, Any], *, where: str, prefix: str = "") -> T:
+    assert is_dataclass(target) and not isinstance(target, type)
+    known = {f.name: f for f in fields(target)}
+    hints = typing.get_type_hints(type(target))
+    changes: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+            choices = f"did you mean {prefix}{near[0]}?" if near else f"known here: {', '.join(known)}"
+            raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
+        current = getattr(target, name)
+        if is_dataclass(current) and not isinstance(current, type):
+            if not isinstance(value, dict):
+                raise UsageError(f"{where}: {name}: expected a table, got {value!r}")
+            changes[name] = _merge(current, value, where=where, prefix=f"{name}.")
+        else:
+            changes[name] = _checked(value, hints[name], f"{where}: {prefix}{name}")
+    return replace(target, **changes)
+
+
+def _checked(value: Any, hint: Any, where: str) -> Any:
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if float in options and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not any(type(value) is option for option in options):
+        names = " or ".join(getattr(option, "__name__", str(option)) for option in options)
+        raise UsageError(f"{where}: expected {names}, got {value!r}")
+    return value

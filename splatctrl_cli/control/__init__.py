@@ -1,0 +1,1 @@
+"""III-E: barriers, QP inverse kinematics, replay loop."""

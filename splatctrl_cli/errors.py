@@ -1,0 +1,45 @@
+"""Errors the library raises; the command line alone turns them into a line on stderr and an exit code.
+
+Wording is ``thing: expected X, got Y``; the remedy follows on the same line after a semicolon.
+"""
+
+
+class SplatCtrlError(Exception):
+    """An expected failure: `message` names the thing, `remedy` says what to do about it."""
+
+    exit_code = 70
+
+    def __init__(self, message: str, *, remedy: str = "") -> None:
+        super().__init__(f"{message}; {remedy}" if remedy else message)
+        self.message = message
+        self.remedy = remedy
+
+
+class GateFailed(SplatCtrlError):  # noqa: N818  (a verdict, not a fault)
+    """A `--require` gate or a check did not hold (exit code 1)."""
+
+    exit_code = 1
+
+
+class UsageError(SplatCtrlError):
+    """Usage, configuration, or an output that exists or cannot be written (exit code 2)."""
+
+    exit_code = 2
+
+
+class InputError(SplatCtrlError):
+    """The input is missing or unusable (exit code 4)."""
+
+    exit_code = 4
+
+
+class NotEvaluableError(SplatCtrlError):
+    """The question cannot be answered from this input, e.g. a path leaves known space (exit code 5)."""
+
+    exit_code = 5
+
+
+class WriteError(SplatCtrlError):
+    """Writing failed, e.g. the disk is full (exit code 6)."""
+
+    exit_code = 6

@@ -1,0 +1,1 @@
+"""Scores, distance accuracy, pictures."""

@@ -1,0 +1,1 @@
+"""III-D: distance, gradient and probability fields from splats."""

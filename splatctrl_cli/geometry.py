@@ -1,0 +1,96 @@
+"""Rigid transforms, rotations and the pinhole camera. float64; T_world_camera maps camera to world."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatctrl_cli.records import Float64, Intrinsics
+
+
+def invert_transform(T: Float64) -> Float64:
+    """The inverse of a rigid transform (4, 4)."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = T[:3, :3].T
+    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
+def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
+    """Points (..., 3) moved by T (4, 4)."""
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3], dtype=np.float64)
+
+
+def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
+    """Rotation (3, 3) of a quaternion (x, y, z, w) of any length but zero."""
+    x, y, z, w = np.asarray(quat_xyzw, dtype=np.float64) / np.linalg.norm(quat_xyzw)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quat_from_rotation(R: Float64) -> Float64:
+    """Unit quaternion (x, y, z, w) with w >= 0 of a rotation (3, 3); the largest component is the pivot."""
+    K = np.array(
+        [
+            [R[0, 0] - R[1, 1] - R[2, 2], 0, 0, 0],
+            [R[0, 1] + R[1, 0], R[1, 1] - R[0, 0] - R[2, 2], 0, 0],
+            [R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], R[2, 2] - R[0, 0] - R[1, 1], 0],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
+        ]
+    )
+    quat = np.linalg.eigh(K, UPLO="L")[1][:, -1]
+    return np.asarray(-quat if quat[3] < 0 else quat)
+
+
+def transform_from(position: ArrayLike, quat_xyzw: ArrayLike) -> Float64:
+    """T (4, 4) from a position (3,) [m] and a quaternion (x, y, z, w)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_from_quat(quat_xyzw)
+    T[:3, 3] = position
+    return T
+
+
+def interpolate_transform(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
+    """T at `fraction` in [0, 1] between two transforms: position linear, rotation by slerp."""
+    quat_a, quat_b = quat_from_rotation(T_a[:3, :3]), quat_from_rotation(T_b[:3, :3])
+    cosine = float(quat_a @ quat_b)
+    if cosine < 0:
+        quat_b, cosine = -quat_b, -cosine
+    angle = np.arccos(min(cosine, 1.0))
+    if angle < 1e-6:
+        quat = (1 - fraction) * quat_a + fraction * quat_b
+    else:
+        quat = (np.sin((1 - fraction) * angle) * quat_a + np.sin(fraction * angle) * quat_b) / np.sin(angle)
+    return transform_from((1 - fraction) * T_a[:3, 3] + fraction * T_b[:3, 3], quat)
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float64:
+    """T_world_camera (4, 4) of an optical camera (z forward, y down) at `eye` that looks at `target`."""
+    eye_world = np.asarray(eye, dtype=np.float64)
+    forward = np.asarray(target, dtype=np.float64) - eye_world
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = eye_world
+    return T
+
+
+def project(intrinsics: Intrinsics, points_camera: NDArray[np.floating]) -> Float64:
+    """Pixels (..., 2) of camera-frame points (..., 3) with z > 0."""
+    z = points_camera[..., 2]
+    u = intrinsics.fx * points_camera[..., 0] / z + intrinsics.cx
+    v = intrinsics.fy * points_camera[..., 1] / z + intrinsics.cy
+    return np.stack([u, v], axis=-1).astype(np.float64)
+
+
+def back_project(intrinsics: Intrinsics, depth: NDArray[np.floating]) -> Float64:
+    """Camera-frame points (H, W, 3) of a depth image (H, W) [m]."""
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    x = (u - intrinsics.cx) / intrinsics.fx * depth
+    y = (v - intrinsics.cy) / intrinsics.fy * depth
+    return np.stack([x, y, depth], axis=-1).astype(np.float64)

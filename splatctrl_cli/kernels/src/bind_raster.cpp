@@ -1,0 +1,7 @@
+#include "bind.h"
+
+namespace splatctrl {
+
+void bind_raster(nb::module_&) {}
+
+}  // namespace splatctrl

@@ -1,0 +1,85 @@
+#include "parallel.h"
+
+#include <atomic>
+#include <condition_variable>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace splatctrl {
+namespace {
+
+// Workers sleep between jobs. One job at a time; a second caller waits its turn.
+class Pool {
+ public:
+  void run(int num_chunks, int num_threads, const std::function<void(int)>& fn) {
+    const std::lock_guard<std::mutex> turn(turn_);
+    grow(num_threads - 1);
+    next_.store(0);
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      fn_ = &fn;
+      num_chunks_ = num_chunks;
+      num_wanted_ = num_threads - 1;
+      num_running_ = num_threads - 1;
+      ++generation_;
+    }
+    wake_.notify_all();
+    work(fn, num_chunks);
+    std::unique_lock<std::mutex> lock(mutex_);
+    done_.wait(lock, [this] { return num_running_ == 0; });
+  }
+
+ private:
+  void grow(int num_workers) {
+    while (static_cast<int>(workers_.size()) < num_workers) {
+      const int index = static_cast<int>(workers_.size());
+      workers_.emplace_back([this, index] { loop(index); });
+      workers_.back().detach();
+    }
+  }
+
+  void work(const std::function<void(int)>& fn, int num_chunks) {
+    for (int chunk = next_.fetch_add(1); chunk < num_chunks; chunk = next_.fetch_add(1)) fn(chunk);
+  }
+
+  void loop(int index) {
+    long seen = 0;
+    for (;;) {
+      std::unique_lock<std::mutex> lock(mutex_);
+      wake_.wait(lock, [&] { return generation_ != seen && index < num_wanted_; });
+      seen = generation_;
+      const auto* fn = fn_;
+      const int num_chunks = num_chunks_;
+      lock.unlock();
+      work(*fn, num_chunks);
+      lock.lock();
+      if (--num_running_ == 0) done_.notify_one();
+    }
+  }
+
+  std::mutex turn_, mutex_;
+  std::condition_variable wake_, done_;
+  std::vector<std::thread> workers_;
+  std::atomic<int> next_{0};
+  const std::function<void(int)>* fn_ = nullptr;
+  int num_chunks_ = 0, num_wanted_ = 0, num_running_ = 0;
+  long generation_ = 0;
+};
+
+Pool& pool() {
+  static Pool* const instance = new Pool;  // never destroyed: its threads may outlive static destruction
+  return *instance;
+}
+
+}  // namespace
+
+void parallel_for(int num_chunks, int num_threads, const std::function<void(int)>& fn) {
+  if (num_threads <= 1 || num_chunks <= 1) {
+    for (int chunk = 0; chunk < num_chunks; ++chunk) fn(chunk);
+    return;
+  }
+  pool().run(num_chunks, num_threads, fn);
+}
+
+}  // namespace splatctrl

@@ -1,0 +1,202 @@
+"""The plain data that rooms hand to each other. SI units, world frame, stamps in int nanoseconds.
+
+Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixels.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+
+class Label(IntEnum):
+    """Two-bit entity labels of a splat or voxel (paper, III-C)."""
+
+    OBJECT = 0b00
+    ROBOT = 0b01
+    HUMAN = 0b10
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intrinsics:
+    """Pinhole camera; pixel (0, 0) has its centre at u = v = 0 (the ROS and OpenCV convention).
+
+    A camera-frame point (x right, y down, z forward) lands at ``u = fx x / z + cx, v = fy y / z + cy`` [px].
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class RgbdFrame:
+    """One colour image with its registered depth and pose.
+
+    color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = none;
+    T_world_camera (4, 4) float64 maps optical camera coordinates (z forward) to world.
+    """
+
+    stamp_ns: int
+    camera: str
+    color: UInt8
+    depth: Float32
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointState:
+    """Joint positions (J,) float64 [rad or m] and velocities (J,) float64 [1/s], in the source's joint order."""
+
+    stamp_ns: int
+    position: Float64
+    velocity: Float64
+
+
+Record = RgbdFrame | JointState
+
+
+@dataclass(kw_only=True)
+class LossReport:
+    """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted."""
+
+    unpaired_color: int = 0
+    unpaired_depth: int = 0
+    without_pose: int = 0
+    without_intrinsics: int = 0
+    damaged: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+class RecordSource(Protocol):
+    """A recorded dataset as records in time order (a log, a capture, an image folder)."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def cameras(self) -> tuple[str, ...]: ...
+
+    @property
+    def joint_names(self) -> tuple[str, ...]: ...
+
+    @property
+    def has_clock(self) -> bool:
+        """False when stamps are made up (a folder of views of a scene that does not move)."""
+        ...
+
+    @property
+    def loss(self) -> LossReport:
+        """Complete once `records` has been read to its end."""
+        ...
+
+    def records(self) -> Iterator[Record]:
+        """Yield records by stamp; joint states come before frames of the same stamp."""
+        ...
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of every input file, by name."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatSet:
+    """Isotropic 3D Gaussians (paper, III-B).
+
+    centers (N, 3) float32 [m], world; radii (N,) float32 [m] (the Gaussian's sigma); colors (N, 3) float32 in
+    [0, 1]; opacities (N,) float32 in (0, 1); labels (N,) uint8 (`Label`); density (N,) float32, rho of III-D
+    (the row sum of the kernel, 0 where not computed).
+    """
+
+    centers: Float32
+    radii: Float32
+    colors: Float32
+    opacities: Float32
+    labels: UInt8
+    density: Float32
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+    def select(self, keep: Bool) -> "SplatSet":
+        """The splats where `keep` (N,) is true, in order."""
+        return SplatSet(
+            centers=self.centers[keep],
+            radii=self.radii[keep],
+            colors=self.colors[keep],
+            opacities=self.opacities[keep],
+            labels=self.labels[keep],
+            density=self.density[keep],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """Axis-aligned box, lower (3,) and upper (3,) float64 [m], world."""
+
+    lower: Float64
+    upper: Float64
+
+    def contains(self, points_world: NDArray[np.floating]) -> Bool:
+        """(…, 3) points -> (…,) True inside, borders included."""
+        inside = (points_world >= self.lower) & (points_world <= self.upper)
+        return np.asarray(np.all(inside, axis=-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class OccupancyGrid:
+    """Log-odds voxels; voxel (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
+
+    log_odds (X, Y, Z) float32; num_updates (X, Y, Z) uint16, 0 = never seen; entity (X, Y, Z) uint8 bits of
+    `Label`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is observed free, above 0.7 occupied.
+    """
+
+    origin: Float64
+    voxel: float
+    log_odds: Float32
+    num_updates: NDArray[np.uint16]
+    entity: UInt8
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereSet:
+    """Spheres that stand for a robot's links: centers (S, 3) [m] in the frame of links[s], radii (S,) [m]."""
+
+    links: tuple[str, ...]
+    centers: Float64
+    radii: Float64
+
+
+class DistanceField(Protocol):
+    """Distance to the scene: what a controller asks. Positive outside."""
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3) of that very distance, not normalised."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistanceGrid:
+    """A baked field; cell (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
+
+    channels: `sdf` (X, Y, Z) float32 [m], `hard` (X, Y, Z) float32 [m] the exact distance to the spheres,
+    `gpdf` (X, Y, Z) float32 [m], `gradient` (X, Y, Z, 3) float32, `observed` (X, Y, Z) uint8 (0 never seen,
+    1 free, 2 occupied, 3 uncertain). header: sign, frame, units, kernel, length scale, digests.
+    """
+
+    origin: Float64
+    voxel: float
+    channels: dict[str, NDArray[np.generic]]
+    header: dict[str, object]

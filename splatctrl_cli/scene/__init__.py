@@ -1,0 +1,1 @@
+"""III-B and III-C: splats, rasteriser, losses, occupancy, add and relocate, robot labels."""

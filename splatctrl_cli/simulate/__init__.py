@@ -1,0 +1,1 @@
+"""Recorded data with known truth."""

@@ -1,0 +1,61 @@
+"""Imports go down only: a room imports lower rooms, never its neighbours."""
+
+import ast
+from pathlib import Path
+
+PACKAGE = Path(__file__).parent.parent / "splatctrl_cli"
+RANK = {
+    "cli": 3,
+    **dict.fromkeys(["io", "scene", "field", "control", "simulate", "evaluate", "batch"], 2),
+    "robot": 1,
+    **dict.fromkeys(["records", "geometry", "config", "errors", "kernels"], 0),
+}
+HOMES = {
+    "torch": {"scene"},
+    "pinocchio": {"robot"},
+    "clarabel": {"control"},
+    "daqp": {"control"},
+    "rosbags": {"io"},
+    "mcap": {"io"},
+}
+
+
+def imports(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return names
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def modules() -> list[Path]:
+    return [p for p in PACKAGE.rglob("*.py") if room_of(p) in RANK]
+
+
+def test_imports_go_down_only() -> None:
+    offences = []
+    for path in modules():
+        here = room_of(path)
+        for name in imports(path):
+            parts = name.split(".")
+            if parts[0] != "splatctrl_cli" or len(parts) < 2 or parts[1] == here:
+                continue
+            if here == "kernels" or (RANK[parts[1]] >= RANK[here] and RANK[here] > 0):
+                offences.append(f"{path.relative_to(PACKAGE)} imports {name}")
+    assert not offences, offences
+
+
+def test_heavy_libraries_stay_in_their_rooms() -> None:
+    offences = [
+        f"{path.relative_to(PACKAGE)} imports {name}"
+        for path in modules()
+        for name in imports(path)
+        if name.split(".")[0] in HOMES and room_of(path) not in HOMES[name.split(".")[0]]
+    ]
+    assert not offences, offences
