@@ -1,0 +1,23 @@
+"""Where tests find data: the project's own sample_data/, and real recordings kept outside it."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="session")
+def sample_data() -> Path:
+    """The committed simulated recording."""
+    return ROOT / "sample_data"
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Real recordings: SPLATCTRL_REAL_DATA, else ../shared/data; skips, saying so, where neither is there."""
+    folder = Path(os.environ.get("SPLATCTRL_REAL_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real recordings at {folder}; set SPLATCTRL_REAL_DATA")
+    return folder
