@@ -69,6 +69,28 @@ class ControlConfig:
 
     margin: float = 0.02  # [m] epsilon, IV-C
     period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
+    barrier_gain: float = 10.0  # [1/s] alpha of every limit and barrier row; printed as 1; alpha * dt <= 1 is checked
+    self_margin: float = 0.02  # [m] epsilon of the self-collision rows, III-E
+    weight_linear: float = 10.0  # Q of III-E, linear part; III-E gives no weights
+    weight_angular: float = 1.0  # Q of III-E, angular part
+    weight_kinematics: float = 100.0  # R of III-E as a multiple of Q: (1/Q + 1/R)^-1 is then 0.99 Q
+    weight_slack: float = 100.0  # S of III-E
+    slack_cost: float = 1e3  # L1 cost of an external slack [1 / (m/s)]: above every multiplier met, so exact
+    self_slack_cost: float = 1e5  # the same for self-collision rows: given up last
+    posture_weight: float = 1e-3  # lambda on joint velocity; without it 7 joints on a 6-D task are undetermined
+    posture_gain: float = 0.5  # [1/s] pull towards the home posture, under posture_weight
+    pose_gain: float = 2.0  # [1/s] pose error to end-effector velocity
+    max_linear_speed: float = 0.25  # [m/s] cap of the reference, the collaborative speed of ISO 10218
+    max_angular_speed: float = 1.0  # [rad/s]
+    max_residual: float = 1e-5  # a solution whose relative KKT residual exceeds this is not used
+    slack_tolerance: float = 1e-4  # [m/s] slack above which a row counts as relaxed
+    promise_tolerance: float = 1e-4  # [m] a step may fall short of what its rows promised before it is scaled back
+    limit_tolerance: float = 1e-3  # [rad] a start this far outside a joint limit is encoder noise
+    goal_position: float = 0.01  # [m] the goal counts as reached
+    goal_rotation: float = 0.0175  # [rad] 1 degree
+    max_time: float = 30.0  # [s] of a closed-loop replay
+    stall_time: float = 2.0  # [s] a local minimum: over this long ...
+    stall_speed: float = 2e-3  # [rad/s] ... the joints moved on average slower than this
 
 
 @dataclass(frozen=True, kw_only=True)
