@@ -1,0 +1,164 @@
+"""One element of a PLY file as a table of numbers, read strictly: every byte the header promises, and none more."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float64
+
+SCALARS = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
+    **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlyFile:
+    """The rows of one element, a structured array, and the header's comment lines."""
+
+    path: Path
+    rows: NDArray[Any]
+    comments: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __contains__(self, name: str) -> bool:
+        return name in (self.rows.dtype.names or ())
+
+    def column(self, name: str) -> Float64:
+        """(N,) float64 values of one property; raises InputError where one is not finite, naming its index."""
+        values = self.rows[name].astype(np.float64)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            raise InputError(f"{self.path}: splat {bad[0]}: {name}: expected a finite number, got {values[bad[0]]}")
+        return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Element:
+    name: str
+    count: int
+    properties: list[tuple[str, str]]
+
+    def dtype(self, path: Path, byte_order: str) -> "np.dtype[Any]":
+        if any(kind == "list" for _, kind in self.properties):
+            raise InputError(f"{path}: element {self.name} has list properties: a mesh, not a table of splats")
+        return np.dtype([(name, byte_order + SCALARS[kind]) for name, kind in self.properties])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Header:
+    format: str
+    elements: list[_Element]
+    comments: list[str]
+    length: int
+
+
+def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
+    """Element `element` of a PLY file (ASCII or binary, either byte order) that has all of the `required` properties.
+
+    Raises InputError for a file that is missing, no PLY, cut short or too long, or lacks a property.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    header = _parse_header(path, content)
+    wanted = next((found for found in header.elements if found.name == element), None)
+    if wanted is None:
+        raise InputError(f"{path}: expected an element {element}, got {[found.name for found in header.elements]}")
+    names = [name for name, _ in wanted.properties]
+    missing = [name for name in required if name not in names]
+    if missing:
+        raise InputError(
+            f"{path}: no 3D-GS splat file: missing properties {' '.join(missing)} (it has {' '.join(names)})",
+            remedy="a point cloud or mesh has to be reconstructed first",
+        )
+    read = _read_ascii if header.format == "ascii" else _read_binary
+    return PlyFile(path=path, rows=read(path, content, header)[element], comments=tuple(header.comments))
+
+
+def _read_binary(path: Path, content: bytes, header: _Header) -> dict[str, NDArray[Any]]:
+    dtypes = {found.name: found.dtype(path, BYTE_ORDERS[header.format]) for found in header.elements}
+    expected = header.length + sum(found.count * dtypes[found.name].itemsize for found in header.elements)
+    if len(content) != expected:
+        what = "cut short" if len(content) < expected else "longer than its header says"
+        raise InputError(
+            f"{path}: {what}: expected {expected} bytes ({header.length} of header and the data it promises), "
+            f"got {len(content)}",
+            remedy="copy or write the file again",
+        )
+    tables, offset = {}, header.length
+    for found in header.elements:
+        tables[found.name] = np.frombuffer(content, dtypes[found.name], count=found.count, offset=offset)
+        offset += found.count * dtypes[found.name].itemsize
+    return tables
+
+
+def _read_ascii(path: Path, content: bytes, header: _Header) -> dict[str, NDArray[Any]]:
+    dtypes = {found.name: found.dtype(path, BYTE_ORDERS[header.format]) for found in header.elements}
+    lines = [line.split() for line in content[header.length :].split(b"\n") if line.strip()]
+    expected = sum(found.count for found in header.elements)
+    if len(lines) != expected:
+        raise InputError(f"{path}: expected {expected} lines of data, got {len(lines)}")
+    tables, start = {}, 0
+    for found in header.elements:
+        rows = lines[start : start + found.count]
+        start += found.count
+        dtype = dtypes[found.name]
+        table = np.zeros(found.count, dtype=dtype)
+        bad = next((i for i, row in enumerate(rows) if len(row) != len(found.properties)), None)
+        if bad is not None:
+            raise InputError(
+                f"{path}: {found.name} {bad}: expected {len(found.properties)} numbers, got {len(rows[bad])}"
+            )
+        for index, (name, _) in enumerate(found.properties):
+            try:
+                table[name] = [float(row[index]) for row in rows]
+            except (ValueError, OverflowError) as error:
+                raise InputError(f"{path}: {found.name}: property {name}: {error}") from None
+        tables[found.name] = table
+    return tables
+
+
+def _parse_header(path: Path, content: bytes) -> _Header:
+    if not content.startswith((b"ply\n", b"ply\r\n")):
+        raise InputError(f"{path}: no PLY file: expected it to start with 'ply', got {content[:8]!r}")
+    end = content.find(b"\nend_header")
+    newline = content.find(b"\n", end + 1)
+    if end < 0 or newline < 0 or content[end:newline].strip() != b"end_header":
+        raise InputError(f"{path}: cut short: its header has no end_header line")
+    form, elements, comments = "", list[_Element](), list[str]()
+    for line in content[:end].decode("utf-8", "backslashreplace").splitlines()[1:]:
+        words = line.split()
+        match words:
+            case ["format", name, "1.0"] if name in BYTE_ORDERS:
+                form = name
+            case ["comment" | "obj_info", *_]:
+                comments.append(line.strip().partition(" ")[2])
+            case ["element", name, count] if count.isdigit():
+                elements.append(_Element(name=name, count=int(count), properties=[]))
+            case ["property", "list", _, _, name] if elements:
+                elements[-1].properties.append((name, "list"))
+            case ["property", kind, name] if elements and kind in SCALARS:
+                _append_property(path, elements[-1], name, kind)
+            case []:
+                continue
+            case _:
+                raise InputError(f"{path}: header line not understood: {line.strip()!r}")
+    if not form:
+        raise InputError(f"{path}: its header has no format line; expected one of {', '.join(BYTE_ORDERS)}")
+    return _Header(format=form, elements=elements, comments=comments, length=newline + 1)
+
+
+def _append_property(path: Path, element: _Element, name: str, kind: str) -> None:
+    if name in (known for known, _ in element.properties):
+        raise InputError(f"{path}: element {element.name} names property {name} twice")
+    element.properties.append((name, kind))
