@@ -1,0 +1,102 @@
+"""How far a rendered image is from a photo: PSNR, SSIM, depth errors, over the pixels that a mask selects."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+
+from splatctrl_cli.records import Bool, Float64
+
+SSIM_WINDOW = 11  # pixels
+SSIM_SIGMA = 1.5  # pixels
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthErrors:
+    """Absolute depth errors over `num_pixels` pixels where both images have a depth; nan where there are none.
+
+    median, mean, p90 [m]; within_1cm and within_2cm are shares of those pixels.
+    """
+
+    num_pixels: int
+    median: float
+    mean: float
+    p90: float
+    within_1cm: float
+    within_2cm: float
+
+
+def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None) -> float:
+    """Peak signal-to-noise ratio [dB] for a peak of 1: ``-10 log10(mean squared error)`` of the masked pixels.
+
+    image, reference (H, W, 3) in [0, 1]; mask (H, W), None = all. Pixels outside the mask count in neither sum nor
+    share. Identical images give inf, an empty mask nan.
+    """
+    squared = np.square(image.astype(np.float64) - reference)
+    selected = squared if mask is None else squared[mask]
+    if not selected.size:
+        return math.nan
+    error = float(selected.mean())
+    return math.inf if error == 0 else -10.0 * math.log10(error)
+
+
+def ssim_map(image: NDArray[np.floating], reference: NDArray[np.floating]) -> Float64:
+    """Structural similarity (H, W, 3) per pixel and channel of images (H, W, 3) in [0, 1] (Wang et al. 2004).
+
+    Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments; at the border the image is mirrored
+    with its edge pixel repeated.
+    """
+    x, y = image.astype(np.float64), np.asarray(reference, dtype=np.float64)
+    mean_x, mean_y = _window_mean(x), _window_mean(y)
+    variance_x = _window_mean(x * x) - mean_x**2
+    variance_y = _window_mean(y * y) - mean_y**2
+    covariance = _window_mean(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
+    return np.asarray(luminance * structure)
+
+
+def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None) -> float:
+    """Mean of `ssim_map` over channels and the masked pixels; nan for an empty mask.
+
+    The mask selects from the map: a window near the mask's border also sees pixels outside it.
+    """
+    similarity = ssim_map(image, reference)
+    selected = similarity if mask is None else similarity[mask]
+    return float(selected.mean()) if selected.size else math.nan
+
+
+def depth_errors(
+    depth: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool | None = None
+) -> DepthErrors:
+    """Errors of `depth` (H, W) [m] against `reference` (H, W) [m] where both are above 0 and the mask holds."""
+    both = (depth > 0) & (reference > 0)
+    if mask is not None:
+        both &= mask
+    errors = np.abs(depth[both].astype(np.float64) - reference[both])
+    if not errors.size:
+        return DepthErrors(num_pixels=0, **dict.fromkeys(_DEPTH_FIGURES, math.nan))
+    return DepthErrors(
+        num_pixels=int(errors.size),
+        median=float(np.median(errors)),
+        mean=float(errors.mean()),
+        p90=float(np.percentile(errors, 90)),
+        within_1cm=float(np.mean(errors <= 0.01)),
+        within_2cm=float(np.mean(errors <= 0.02)),
+    )
+
+
+_DEPTH_FIGURES = ("median", "mean", "p90", "within_1cm", "within_2cm")
+
+
+def _window_mean(image: Float64) -> Float64:
+    """The Gaussian-weighted mean of each pixel's window, rows then columns."""
+    offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
+    weights /= weights.sum()
+    rows = correlate1d(image, weights, axis=0, mode="reflect")
+    return np.asarray(correlate1d(rows, weights, axis=1, mode="reflect"))

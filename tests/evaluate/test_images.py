@@ -1,0 +1,91 @@
+"""PSNR, SSIM and depth errors against known answers."""
+
+import math
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.evaluate.images import depth_errors, psnr, ssim, ssim_map
+from splatctrl_cli.records import Float64
+from tests.reference.images import ssim_at
+
+
+def noise(seed: int, shape: tuple[int, ...] = (24, 31, 3)) -> Float64:
+    return np.random.default_rng(seed).random(shape)
+
+
+def test_psnr_of_a_constant_offset_of_a_tenth_is_20_db() -> None:
+    image = np.full((8, 9, 3), 0.5)
+    assert psnr(image + 0.1, image) == pytest.approx(20.0, abs=1e-9)
+
+
+def test_psnr_of_identical_images_is_infinite() -> None:
+    assert psnr(noise(0), noise(0)) == math.inf
+
+
+def test_psnr_averages_only_masked_pixels() -> None:
+    image = np.full((10, 10, 3), 0.5)
+    other = image.copy()
+    mask = np.zeros((10, 10), dtype=bool)
+    mask[:, :1] = True
+    other[mask] += 0.1
+    other[~mask] = 0.0
+    assert psnr(other, image, mask) == pytest.approx(20.0, abs=1e-9)
+    zero_filled = psnr(other * mask[..., None], image * mask[..., None])
+    assert zero_filled == pytest.approx(30.0, abs=1e-9), "the mean over a zero-filled image would read 10 dB more"
+
+
+def test_psnr_of_an_empty_mask_is_not_a_number() -> None:
+    assert math.isnan(psnr(noise(0), noise(1), np.zeros((24, 31), dtype=bool)))
+
+
+def test_psnr_is_symmetric() -> None:
+    assert psnr(noise(0), noise(1)) == psnr(noise(1), noise(0))
+
+
+def test_ssim_of_identical_images_is_one() -> None:
+    assert ssim(noise(0), noise(0)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_ssim_of_two_constants_is_the_luminance_term() -> None:
+    dark, bright = np.full((20, 20, 3), 0.25), np.full((20, 20, 3), 0.75)
+    expected = (2 * 0.25 * 0.75 + 1e-4) / (0.25**2 + 0.75**2 + 1e-4)
+    assert ssim(dark, bright) == pytest.approx(expected, abs=1e-12)
+
+
+def test_ssim_map_equals_the_reference_window_by_window_and_at_the_border() -> None:
+    x, y = noise(3), np.clip(noise(3) + 0.2 * noise(4), 0, 1)
+    similarity = ssim_map(x, y)
+    for row, column in [(0, 0), (0, 15), (12, 15), (23, 30), (5, 5), (22, 1)]:
+        for channel in range(3):
+            expected = ssim_at(x[..., channel], y[..., channel], row, column)
+            assert similarity[row, column, channel] == pytest.approx(expected, abs=1e-12)
+
+
+def test_ssim_averages_only_masked_pixels() -> None:
+    x, y = noise(0), noise(1)
+    y[:, :15] = x[:, :15]
+    far_left = np.zeros((24, 31), dtype=bool)
+    far_left[:, :10] = True
+    assert ssim(x, y, far_left) == pytest.approx(1.0, abs=1e-12)
+    assert ssim(x, y) < 0.9
+    assert math.isnan(ssim(x, y, np.zeros((24, 31), dtype=bool)))
+
+
+def test_depth_errors_count_only_pixels_where_both_have_depth() -> None:
+    reference = np.array([[1.0, 1.0, 1.0, 0.0, 1.0]], dtype=np.float32)
+    depth = np.array([[1.005, 1.015, 1.1, 1.0, 0.0]], dtype=np.float32)
+    errors = depth_errors(depth, reference)
+    assert errors.num_pixels == 3
+    assert errors.median == pytest.approx(0.015, abs=1e-6)
+    assert errors.mean == pytest.approx(0.04, abs=1e-6)
+    assert errors.p90 == pytest.approx(0.015 + 0.8 * 0.085, abs=1e-6)
+    assert errors.within_1cm == pytest.approx(1 / 3)
+    assert errors.within_2cm == pytest.approx(2 / 3)
+
+
+def test_depth_errors_without_a_common_pixel_are_not_numbers() -> None:
+    errors = depth_errors(np.zeros((3, 3), np.float32), np.ones((3, 3), np.float32))
+    assert errors.num_pixels == 0
+    assert math.isnan(errors.median)
+    assert math.isnan(errors.within_1cm)
