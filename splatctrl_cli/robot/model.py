@@ -1,0 +1,252 @@
+"""A robot arm as a controller sees it: forward kinematics and Jacobians of its collision spheres and frames.
+
+Only the kinematics of the URDF is built (Pinocchio), so meshes need not be there. S spheres, J joints, T postures.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pinocchio
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.robot.spheres import matched_links, read_spheres, spheres_of
+from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+
+Index = NDArray[np.int64]
+
+
+class RobotModel:
+    """Kinematics, limits and collision spheres of one arm; everything in the world frame, SI units, float64.
+
+    joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: what
+    `frame_pose` knows; urdf: the file it came from; left_out: links of the sphere file that the URDF does not have.
+    """
+
+    def __init__(
+        self,
+        urdf: UrdfFile,
+        model: pinocchio.Model,
+        spheres: SphereSet,
+        T_world_base: Float64,
+        left_out: Sequence[str],
+    ) -> None:
+        self._model = model
+        self._data = model.createData()
+        self.urdf = urdf
+        self.T_world_base = T_world_base
+        self.joint_names: tuple[str, ...] = tuple(str(name) for name in model.names)[1:]
+        self.sphere_set = spheres
+        self.left_out = left_out
+        self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
+        rows = [joint.idx_q for joint in model.joints][1:]
+        self.lower: Float64 = np.where(self._is_wrapped, -np.inf, model.lowerPositionLimit[rows])
+        self.upper: Float64 = np.where(self._is_wrapped, np.inf, model.upperPositionLimit[rows])
+        self.velocity_limit: Float64 = np.array(model.velocityLimit, dtype=np.float64)
+        self._frames = {
+            str(frame.name): index
+            for index, frame in enumerate(model.frames)
+            if frame.type == pinocchio.FrameType.BODY
+        }
+        self.frame_names = tuple(link for link in urdf.links if link in self._frames)
+        self._sphere_joint, self._sphere_offset = self._joint_offsets()
+        self._ancestors = self._ancestor_table()
+        self.moving_spheres: Bool = self._moved()
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: Path,
+        spheres: Path | None = None,
+        *,
+        T_world_base: Float64 | None = None,
+        locked: Mapping[str, float] | None = None,
+    ) -> "RobotModel":
+        """The robot of a URDF file, its collision spheres from a YAML file, else from the URDF's own spheres.
+
+        T_world_base (4, 4) places the URDF's root link (default: at the world's origin); locked holds joints still
+        at a value [rad or m], e.g. fingers that no log moves. Raises InputError, naming file and remedy.
+        """
+        file = read_urdf(urdf)
+        try:
+            model = pinocchio.buildModelFromXML(file.text)
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"{urdf}: not a URDF that can be built: {error}") from None
+        model = _without(model, dict(locked or {}), urdf)
+        left_out: tuple[str, ...] = ()
+        if spheres is None:
+            sphere_set = spheres_of(file)
+        else:
+            sphere_set, left_out = matched_links(read_spheres(spheres), file, spheres)
+        return cls(file, model, sphere_set, np.eye(4) if T_world_base is None else T_world_base, left_out)
+
+    @property
+    def num_joints(self) -> int:
+        """J."""
+        return len(self.joint_names)
+
+    @property
+    def base_position(self) -> Float64:
+        """Origin of the root link (3,) [m], world."""
+        return np.array(self.T_world_base[:3, 3])
+
+    @property
+    def middle(self) -> Float64:
+        """The posture (J,) in the middle of the limits, 0 for a joint without limits."""
+        limited = np.isfinite(self.lower) & np.isfinite(self.upper)
+        return np.where(limited, (np.where(limited, self.lower, 0) + np.where(limited, self.upper, 0)) / 2, 0.0)
+
+    def sphere_centers(self, q: Float64) -> Float64:
+        """Sphere centres (S, 3) [m], world, at joint positions q (J,)."""
+        self._place(q)
+        return self._centers()
+
+    def sphere_centers_batch(self, q: Float64) -> Float64:
+        """Sphere centres (T, S, 3) [m], world, at joint positions q (T, J)."""
+        return np.array([self.sphere_centers(row) for row in q]).reshape(-1, len(self.sphere_set.radii), 3)
+
+    def sphere_jacobians(self, q: Float64) -> Float64:
+        """d centre / d q (S, 3, J), world, at q (J,)."""
+        self._jacobians(q)
+        return self._point_jacobians(self._centers(), self._sphere_joint)
+
+    def frame_pose(self, q: Float64, frame: str) -> Float64:
+        """T_world_frame (4, 4) of a link at q (J,). Raises InputError for a frame that is not there."""
+        index = self._frame(frame)
+        self._place(q)
+        placement = pinocchio.updateFramePlacement(self._model, self._data, index)
+        return np.asarray(self.T_world_base @ placement.homogeneous)
+
+    def frame_jacobian(self, q: Float64, frame: str) -> Float64:
+        """Jacobian (6, J) of a link's origin, world axes: linear velocity rows [m] first, then angular."""
+        joint = np.array([self._model.frames[self._frame(frame)].parentJoint])
+        origin = self.frame_pose(q, frame)[:3, 3]
+        self._jacobians(q)
+        linear = self._point_jacobians(origin[None], joint)[0]
+        angular = self._axes()[1].T * self._ancestors[joint[0]]
+        return np.concatenate([linear, angular])
+
+    def reach(self) -> float:
+        """Radius [m] of a ball about the base that holds every sphere in every posture (sum of link lengths)."""
+        return float(np.max(self._lever_arms() + self.sphere_set.radii))
+
+    def self_pairs(self, posture: Float64 | None = None, touching: float = 0.0) -> Index:
+        """Pairs (P, 2) of spheres that could collide with each other.
+
+        Left out: pairs on the same or on adjacent bodies (links joined by fixed joints are one), and pairs whose
+        gap at `posture` (J,) (default: the middle of the limits) is at most `touching` [m].
+        """
+        centers = self.sphere_centers(self.middle if posture is None else posture)
+        parents = np.array(self._model.parents, dtype=np.int64)
+        a, b = np.triu_indices(len(centers), k=1)
+        body_a, body_b = self._sphere_joint[a], self._sphere_joint[b]
+        is_near = (body_a == body_b) | (parents[body_a] == body_b) | (parents[body_b] == body_a)
+        gap = np.linalg.norm(centers[a] - centers[b], axis=1) - self.sphere_set.radii[a] - self.sphere_set.radii[b]
+        keep = ~is_near & (gap > touching)
+        return np.stack([a[keep], b[keep]], axis=1).astype(np.int64)
+
+    def joint_order(self, log_joint_names: Sequence[str]) -> Index:
+        """Index array (J,) that puts a log's joints in the model's order: ``position[order]``.
+
+        Raises InputError naming the joints that the log lacks, and what it has.
+        """
+        missing = [name for name in self.joint_names if name not in log_joint_names]
+        if missing:
+            raise InputError(
+                f"{self.urdf.path}: joints not in the log: {', '.join(missing)}",
+                remedy=f"the log has: {', '.join(log_joint_names) or 'no joints'}",
+            )
+        return np.array([list(log_joint_names).index(name) for name in self.joint_names], dtype=np.int64)
+
+    def _configuration(self, q: Float64) -> Float64:
+        if np.shape(q) != (self.num_joints,):
+            raise InputError(f"joint positions: expected shape ({self.num_joints},), got {np.shape(q)}")
+        if not self._is_wrapped.any():
+            return np.asarray(q, dtype=np.float64)
+        columns = [[np.cos(x), np.sin(x)] if w else [x] for x, w in zip(q, self._is_wrapped, strict=True)]
+        return np.concatenate(columns)
+
+    def _place(self, q: Float64) -> None:
+        pinocchio.forwardKinematics(self._model, self._data, self._configuration(q))
+
+    def _jacobians(self, q: Float64) -> None:
+        pinocchio.computeJointJacobians(self._model, self._data, self._configuration(q))
+
+    def _centers(self) -> Float64:
+        R = np.array([placement.rotation for placement in self._data.oMi])[self._sphere_joint]
+        t = np.array([placement.translation for placement in self._data.oMi])[self._sphere_joint]
+        base = np.einsum("sij,sj->si", R, self._sphere_offset) + t
+        return np.asarray(base @ self.T_world_base[:3, :3].T + self.T_world_base[:3, 3])
+
+    def _axes(self) -> tuple[Float64, Float64]:
+        """Columns of the world Jacobian: linear (J, 3) at the base's origin and angular (J, 3), world axes."""
+        R = self.T_world_base[:3, :3]
+        return self._data.J[:3].T @ R.T, self._data.J[3:].T @ R.T
+
+    def _point_jacobians(self, points_world: Float64, joint: Index) -> Float64:
+        linear, angular = self._axes()
+        arm = points_world - self.base_position
+        columns = linear[None] + np.cross(angular[None], arm[:, None])  # (S, J, 3)
+        return np.asarray(np.swapaxes(columns * self._ancestors[joint][:, :, None], 1, 2))
+
+    def _joint_offsets(self) -> tuple[Index, Float64]:
+        joints, offsets = [], []
+        for link, center in zip(self.sphere_set.links, self.sphere_set.centers, strict=True):
+            frame = self._model.frames[self._frame(link)]
+            joints.append(frame.parentJoint)
+            offsets.append(frame.placement.rotation @ center + frame.placement.translation)
+        return np.array(joints, dtype=np.int64), np.array(offsets, dtype=np.float64)
+
+    def _ancestor_table(self) -> Bool:
+        """(J + 1, J) True where joint j moves body i; body 0 is the base."""
+        table = np.zeros((self.num_joints + 1, self.num_joints), dtype=bool)
+        for body in range(1, self.num_joints + 1):
+            table[body] = table[self._model.parents[body]]
+            table[body, body - 1] = True
+        return table
+
+    def _moved(self) -> Bool:
+        """Structural: a sphere on the base, or centred on the only axes that carry it, never moves."""
+        postures = [self.middle + np.sin(np.arange(1, self.num_joints + 1) * (k + 1)) for k in range(3)]
+        gain = [np.abs(self.sphere_jacobians(q)).max(axis=(1, 2)) for q in postures]
+        return np.asarray(np.max(gain, axis=0) > 1e-9)
+
+    def _lever_arms(self) -> Float64:
+        length = np.zeros(self.num_joints + 1)
+        for body in range(1, self.num_joints + 1):
+            step = float(np.linalg.norm(self._model.jointPlacements[body].translation))
+            if "JointModelP" in self._model.joints[body].shortname():
+                step += max(abs(self.lower[body - 1]), abs(self.upper[body - 1]))
+            length[body] = length[self._model.parents[body]] + step
+        return np.asarray(length[self._sphere_joint] + np.linalg.norm(self._sphere_offset, axis=1))
+
+    def _frame(self, frame: str) -> int:
+        if frame not in self._frames:
+            raise InputError(
+                f"{self.urdf.path}: no frame '{frame}'", remedy=f"frames there: {', '.join(self.urdf.links)}"
+            )
+        return self._frames[frame]
+
+
+def _without(model: pinocchio.Model, locked: dict[str, float], path: Path) -> pinocchio.Model:
+    """`model` with the joints of `locked` fixed at their values."""
+    names = [str(name) for name in model.names]
+    for name, joint in zip(names[1:], list(model.joints)[1:], strict=True):
+        if joint.nv != 1:
+            raise InputError(f"{path}: joint '{name}': expected one degree of freedom, got {joint.nv}")
+    missing = [name for name in locked if name not in names]
+    if missing:
+        raise InputError(
+            f"{path}: no joint '{missing[0]}' to lock", remedy=f"movable joints there: {', '.join(names[1:])}"
+        )
+    if len(locked) == len(names) - 1:
+        raise InputError(f"{path}: every joint is locked", remedy="leave at least one joint free")
+    if not locked:
+        return model
+    q = pinocchio.neutral(model)
+    for name, value in locked.items():
+        joint = model.joints[names.index(name)]
+        q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)] if joint.nq == 2 else [value]
+    return pinocchio.buildReducedModel(model, [names.index(name) for name in locked], q)

@@ -1,0 +1,186 @@
+"""The simulated arm: seven joints with the published kinematics of the Franka Emika Panda, in primitive shapes.
+
+Joint placements follow the published (modified) Denavit-Hartenberg table (d1 = 0.333, d3 = 0.316, a4 = 0.0825,
+a5 = -0.0825, d5 = 0.384, a7 = 0.088, flange 0.107 m) and the published position and velocity limits. The shapes are
+ours: capsules (a cylinder and a sphere at either end) and boxes that roughly follow the real links.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.records import Float64
+
+BASE = "link0"
+HAND = "hand"
+JOINT_NAMES = tuple(f"joint{i}" for i in range(1, 8))
+
+# name, origin xyz [m], roll about x [rad], lower, upper [rad], velocity [rad/s], effort [N m]
+JOINTS = (
+    ("joint1", (0.0, 0.0, 0.333), 0.0, -2.8973, 2.8973, 2.175, 87.0),
+    ("joint2", (0.0, 0.0, 0.0), -np.pi / 2, -1.7628, 1.7628, 2.175, 87.0),
+    ("joint3", (0.0, -0.316, 0.0), np.pi / 2, -2.8973, 2.8973, 2.175, 87.0),
+    ("joint4", (0.0825, 0.0, 0.0), np.pi / 2, -3.0718, -0.0698, 2.175, 87.0),
+    ("joint5", (-0.0825, 0.384, 0.0), -np.pi / 2, -2.8973, 2.8973, 2.61, 12.0),
+    ("joint6", (0.0, 0.0, 0.0), np.pi / 2, -0.0175, 3.7525, 2.61, 12.0),
+    ("joint7", (0.088, 0.0, 0.0), np.pi / 2, -2.8973, 2.8973, 2.61, 12.0),
+)
+FLANGE = 0.107  # [m] along z of link7
+HAND_YAW = -np.pi / 4  # the hand is mounted turned by 45 degrees
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule:
+    """All points within `radius` [m] of the segment from `start` to `end` (3,) [m], link frame."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """Axis-aligned box: middle and full size (3,) [m], link frame."""
+
+    middle: tuple[float, float, float]
+    size: tuple[float, float, float]
+
+
+SHAPES: dict[str, tuple[Capsule | Block, ...]] = {
+    "link0": (
+        Capsule(start=(-0.08, 0, 0.06), end=(0, 0, 0.06), radius=0.06),
+        Capsule(start=(0, 0, 0.06), end=(0, 0, 0.10), radius=0.06),
+    ),
+    "link1": (
+        Capsule(start=(0, 0, -0.18), end=(0, 0, 0), radius=0.06),
+        Capsule(start=(0, -0.07, 0), end=(0, 0, 0), radius=0.06),
+    ),
+    "link2": (
+        Capsule(start=(0, 0, 0.07), end=(0, 0, 0), radius=0.06),
+        Capsule(start=(0, -0.16, 0), end=(0, 0, 0), radius=0.06),
+    ),
+    "link3": (
+        Capsule(start=(0, 0, -0.10), end=(0, 0, -0.03), radius=0.055),
+        Capsule(start=(0, 0, -0.03), end=(0.0825, 0.055, 0), radius=0.052),
+    ),
+    "link4": (
+        Capsule(start=(0, 0, 0.05), end=(0, 0, 0), radius=0.052),
+        Capsule(start=(0, 0, 0), end=(-0.0825, 0.09, 0), radius=0.055),
+    ),
+    "link5": (
+        Capsule(start=(0, 0, -0.25), end=(0, 0.01, -0.19), radius=0.052),
+        Capsule(start=(0, 0.01, -0.19), end=(0, 0.07, -0.02), radius=0.042),
+    ),
+    "link6": (
+        Capsule(start=(0, 0, -0.01), end=(0.088, 0, 0), radius=0.048),
+        Capsule(start=(0.088, 0, 0), end=(0.088, 0.02, 0), radius=0.048),
+    ),
+    "link7": (Capsule(start=(0, 0, 0.04), end=(0, 0, 0.065), radius=0.042),),
+    "hand": (
+        Block(middle=(0, 0, 0.033), size=(0.05, 0.18, 0.066)),
+        Block(middle=(0, 0.04, 0.085), size=(0.02, 0.02, 0.05)),
+        Block(middle=(0, -0.04, 0.085), size=(0.02, 0.02, 0.05)),
+    ),
+}
+
+
+def arm_urdf() -> str:
+    """The arm as URDF text: links link0..link7 and hand, joints joint1..joint7 and a fixed hand_joint."""
+    lines = ['<?xml version="1.0"?>', '<robot name="arm">']
+    for link, shapes in SHAPES.items():
+        lines.append(f'  <link name="{link}">')
+        for geometry, origin in _primitives(shapes):
+            body = f"      {origin}\n      <geometry>{geometry}</geometry>"
+            lines += [f"    <visual>\n{body}\n    </visual>", f"    <collision>\n{body}\n    </collision>"]
+        lines.append("  </link>")
+    for index, (name, xyz, roll, lower, upper, velocity, effort) in enumerate(JOINTS):
+        lines += [
+            f'  <joint name="{name}" type="revolute">',
+            f'    <origin xyz="{_words(xyz)}" rpy="{_words((roll, 0, 0))}"/>',
+            f'    <parent link="link{index}"/>',
+            f'    <child link="link{index + 1}"/>',
+            '    <axis xyz="0 0 1"/>',
+            f'    <limit lower="{lower}" upper="{upper}" velocity="{velocity}" effort="{effort}"/>',
+            "  </joint>",
+        ]
+    lines += [
+        '  <joint name="hand_joint" type="fixed">',
+        f'    <origin xyz="0 0 {FLANGE}" rpy="{_words((0, 0, HAND_YAW))}"/>',
+        '    <parent link="link7"/>',
+        '    <child link="hand"/>',
+        "  </joint>",
+        "</robot>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def arm_spheres_yaml() -> str:
+    """The arm's covering spheres as YAML text, in cuRobo's layout (`collision_spheres` by link)."""
+    lines = ["collision_spheres:"]
+    for link, shapes in SHAPES.items():
+        lines.append(f"  {link}:")
+        for center, radius in covering_spheres(shapes):
+            row = ", ".join(f"{value:.4f}" for value in center + 0.0)
+            lines.append(f"    - {{center: [{row}], radius: {radius:.4f}}}")
+    return "\n".join(lines) + "\n"
+
+
+def covering_spheres(shapes: tuple[Capsule | Block, ...], spacing: float = 0.042) -> list[tuple[Float64, float]]:
+    """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
+
+    Along a segment with steps h, a radius of sqrt(R^2 + (h/2)^2) covers the tube of radius R; for a box, R is half
+    the diagonal of the section across its longest side. A sphere that lies inside another one is left out.
+    """
+    spheres: list[tuple[Float64, float]] = []
+    for shape in shapes:
+        start, end, radius = _spine(shape)
+        steps = int(np.ceil(np.linalg.norm(end - start) / spacing - 1e-9))
+        step = float(np.linalg.norm(end - start)) / steps
+        grown = float(np.ceil(np.hypot(radius, step / 2) * 1e4) / 1e4)
+        spheres += [(start + (end - start) * (i / steps), grown) for i in range(steps + 1)]
+    kept: list[tuple[Float64, float]] = []
+    for center, radius in sorted(spheres, key=lambda sphere: -sphere[1]):
+        if not any(np.linalg.norm(center - other) + radius <= big + 5e-4 for other, big in kept):
+            kept.append((center, radius))
+    return kept
+
+
+def _spine(shape: Capsule | Block) -> tuple[Float64, Float64, float]:
+    """The segment (start, end) and the tube radius whose round-ended tube holds the shape, up to a box's corners."""
+    if isinstance(shape, Capsule):
+        return np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius
+    size = np.array(shape.size)
+    longest = int(np.argmax(size))
+    across = np.delete(size, longest)
+    radius = float(np.hypot(*across)) / 2
+    half = np.zeros(3)
+    # Ends drawn in by a third of the section: the end spheres still reach past the corners.
+    half[longest] = size[longest] / 2 - min(0.33 * float(across.min()), size[longest] / 4)
+    return np.array(shape.middle) - half, np.array(shape.middle) + half, radius
+
+
+def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]]:
+    """(geometry, origin) elements of URDF text; capsules as a cylinder and a sphere at either end, once each."""
+    balls: set[tuple[tuple[float, float, float], float]] = set()
+    for shape in shapes:
+        if isinstance(shape, Block):
+            yield f'<box size="{_words(shape.size)}"/>', f'<origin xyz="{_words(shape.middle)}" rpy="0 0 0"/>'
+            continue
+        start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
+        length = float(np.linalg.norm(end - start))
+        x, y, z = (end - start) / length
+        pitch, yaw = float(np.arctan2(np.hypot(x, y), z)), float(np.arctan2(y, x)) if x or y else 0.0
+        middle = _words((start + end) / 2)
+        yield (
+            f'<cylinder radius="{shape.radius}" length="{length:.9g}"/>',
+            f'<origin xyz="{middle}" rpy="{_words((0, pitch, yaw))}"/>',
+        )
+        for point in (shape.start, shape.end):
+            if (point, shape.radius) not in balls:
+                balls.add((point, shape.radius))
+                yield f'<sphere radius="{shape.radius}"/>', f'<origin xyz="{_words(point)}" rpy="0 0 0"/>'
+
+
+def _words(values: object) -> str:
+    return " ".join(f"{value + 0.0:.12g}" for value in np.asarray(values, dtype=float))

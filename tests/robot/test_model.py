@@ -1,0 +1,204 @@
+"""RobotModel: kinematics against published poses and finite differences, files that must and must not load."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import look_at
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+
+READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
+T_WORLD_BASE = look_at([0.3, -0.2, 0.1], [1.0, 2.0, 3.0])
+PRISMATIC = """<robot name="rail"><link name="a"><collision><geometry><sphere radius="0.1"/></geometry></collision>
+</link><link name="b"><collision><geometry><sphere radius="0.2"/></geometry></collision></link>
+<joint name="turn" type="continuous"><parent link="a"/><child link="m"/><axis xyz="0 0 1"/></joint><link name="m"/>
+<joint name="slide" type="prismatic"><origin xyz="0 0 1"/><parent link="m"/><child link="b"/><axis xyz="1 0 0"/>
+<limit lower="-0.5" upper="2" velocity="1" effort="1"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def arm_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("arm")
+    (folder / "robot.urdf").write_text(arm_urdf())
+    (folder / "robot_spheres.yaml").write_text(arm_spheres_yaml())
+    return folder / "robot.urdf", folder / "robot_spheres.yaml"
+
+
+@pytest.fixture(scope="module")
+def arm(arm_files: tuple[Path, Path]) -> RobotModel:
+    return RobotModel.from_urdf(*arm_files, T_world_base=T_WORLD_BASE)
+
+
+def written(folder: Path, text: str, name: str = "robot.urdf") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_ready_posture_puts_the_flange_where_the_maker_publishes_it(arm_files: tuple[Path, Path]) -> None:
+    pose = RobotModel.from_urdf(*arm_files).frame_pose(READY, "hand")
+    np.testing.assert_allclose(pose[:3, 3], [0.30689, 0.0, 0.59028], atol=1e-5)
+    np.testing.assert_allclose(pose[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-9)
+
+
+def test_sphere_jacobians_agree_with_finite_differences(arm: RobotModel) -> None:
+    q, step = READY + 0.1, 1e-6
+    numeric = np.stack(
+        [(arm.sphere_centers(q + step * e) - arm.sphere_centers(q - step * e)) / (2 * step) for e in np.eye(7)], -1
+    )
+    np.testing.assert_allclose(arm.sphere_jacobians(q), numeric, atol=1e-8)
+
+
+def test_frame_jacobian_agrees_with_finite_differences(arm: RobotModel) -> None:
+    q, step = READY - 0.1, 1e-6
+    jacobian, pose = arm.frame_jacobian(q, "hand"), arm.frame_pose(q, "hand")
+    for joint, e in enumerate(np.eye(7)):
+        rate = (arm.frame_pose(q + step * e, "hand") - arm.frame_pose(q - step * e, "hand")) / (2 * step)
+        spin = rate[:3, :3] @ pose[:3, :3].T
+        np.testing.assert_allclose(jacobian[:3, joint], rate[:3, 3], atol=1e-8)
+        np.testing.assert_allclose(jacobian[3:, joint], [spin[2, 1], spin[0, 2], spin[1, 0]], atol=1e-8)
+
+
+def test_the_base_pose_moves_every_sphere_rigidly(arm: RobotModel, arm_files: tuple[Path, Path]) -> None:
+    at_origin = RobotModel.from_urdf(*arm_files).sphere_centers(READY)
+    np.testing.assert_allclose(
+        arm.sphere_centers(READY), at_origin @ T_WORLD_BASE[:3, :3].T + T_WORLD_BASE[:3, 3], atol=1e-12
+    )
+    np.testing.assert_allclose(arm.base_position, [0.3, -0.2, 0.1])
+
+
+def test_batch_equals_one_posture_at_a_time(arm: RobotModel) -> None:
+    q = np.stack([READY, READY + 0.2])
+    np.testing.assert_array_equal(
+        arm.sphere_centers_batch(q), [arm.sphere_centers(READY), arm.sphere_centers(READY + 0.2)]
+    )
+    assert arm.sphere_centers_batch(np.zeros((0, 7))).shape == (0, len(arm.sphere_set.radii), 3)
+
+
+def test_spheres_of_the_base_and_on_the_first_axis_do_not_move(arm: RobotModel) -> None:
+    links = np.array(arm.sphere_set.links)
+    centers = arm.sphere_set.centers
+    on_axis = (links == "link1") & (np.linalg.norm(centers[:, :2], axis=1) < 1e-12)
+    at_shoulder = (links == "link2") & (np.linalg.norm(centers, axis=1) < 1e-12)
+    assert on_axis.any()
+    np.testing.assert_array_equal(arm.moving_spheres, (links != "link0") & ~on_axis & ~at_shoulder)
+
+
+def test_no_posture_leaves_the_reach(arm: RobotModel) -> None:
+    rng = np.random.default_rng(0)
+    postures = rng.uniform(arm.lower, arm.upper, (200, 7))
+    far = np.linalg.norm(arm.sphere_centers_batch(postures) - arm.base_position, axis=2) + arm.sphere_set.radii
+    assert 0.7 * arm.reach() < far.max() <= arm.reach()
+
+
+def test_self_pairs_are_apart_on_bodies_that_are_not_neighbours(arm: RobotModel) -> None:
+    pairs = arm.self_pairs(READY, touching=0.01)
+    body = np.array([8 if link == "hand" else int(link[4:]) for link in arm.sphere_set.links])
+    body[body == 8] = 7
+    steps = np.abs(body[pairs[:, 0]] - body[pairs[:, 1]])
+    centers, radii = arm.sphere_centers(READY), arm.sphere_set.radii
+    gap = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1) - radii[pairs].sum(axis=1)
+    assert len(pairs) > 100
+    assert steps.min() == 2
+    assert gap.min() > 0.01
+
+
+def test_joint_order_sorts_a_log_into_the_model(arm: RobotModel) -> None:
+    log = ["gripper", *reversed(arm.joint_names)]
+    np.testing.assert_array_equal(np.array(log)[arm.joint_order(log)], arm.joint_names)
+
+
+def test_joint_order_names_the_joints_a_log_lacks(arm: RobotModel) -> None:
+    with pytest.raises(InputError, match=r"joints not in the log: joint7; the log has: joint1, "):
+        arm.joint_order(arm.joint_names[:6])
+
+
+def test_continuous_and_prismatic_joints_take_one_number_each(tmp_path: Path) -> None:
+    rail = RobotModel.from_urdf(written(tmp_path, PRISMATIC))
+    assert rail.joint_names == ("turn", "slide")
+    np.testing.assert_array_equal(rail.lower, [-np.inf, -0.5])
+    np.testing.assert_allclose(rail.sphere_centers(np.array([np.pi / 2, 1.5]))[1], [0, 1.5, 1], atol=1e-12)
+    assert rail.reach() == pytest.approx(1 + 2 + 0.2)
+
+
+def test_a_locked_joint_stays_where_it_was_put(tmp_path: Path) -> None:
+    rail = RobotModel.from_urdf(written(tmp_path, PRISMATIC), locked={"slide": 0.25})
+    assert rail.joint_names == ("turn",)
+    np.testing.assert_allclose(rail.sphere_centers(np.array([0.0]))[1], [0.25, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("locked", "message"), [({"elbow": 0.0}, "no joint 'elbow' to lock"), ({"turn": 0, "slide": 0}, "every joint")]
+)
+def test_locking_the_wrong_joints_is_refused(tmp_path: Path, locked: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        RobotModel.from_urdf(written(tmp_path, PRISMATIC), locked=locked)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("no xml", "broken XML"),
+        ("<sdf/>", "expected a URDF with root <robot>, got <sdf>"),
+        ('<robot name="x"><link name="a"/></robot>', "expected movable joints, got none; an unexpanded xacro"),
+        (PRISMATIC.replace('child link="b"', 'child link="c"'), "joint 'slide': child link 'c' does not exist"),
+        (PRISMATIC.replace('<link name="m"/>', '<link name="m"/><link name="z"/>'), "one root link, got a, z"),
+        (PRISMATIC.replace('radius="0.2"', 'radius="-1"'), "link 'b': sphere: expected sizes above 0"),
+        (PRISMATIC.replace('radius="0.2"', 'radius="wide"'), "link 'b': sphere: expected 1 number, got 'wide'"),
+        ('<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>', "broken XML"),
+        (arm_urdf(), "expected collision geometry of spheres only, got 18 other shapes; give a spheres YAML"),
+    ],
+)
+def test_unusable_urdfs_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        RobotModel.from_urdf(written(tmp_path, text))
+    assert "robot.urdf" in str(caught.value)
+
+
+def test_a_missing_urdf_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="No such file"):
+        RobotModel.from_urdf(tmp_path / "none.urdf")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: [", "not valid YAML"),
+        ("links: {}", "expected the layout collision_spheres"),
+        ("collision_spheres: {hand: [{center: [0, 0], radius: 1}]}", "link 'hand': sphere 0: expected"),
+        ("collision_spheres: {hand: [{center: [0, 0, 0], radius: -1}]}", "expected collision spheres, got none"),
+        ("collision_spheres: {wing: [{center: [0, 0, 0], radius: 1}]}", "none of its links is in"),
+    ],
+)
+def test_unusable_sphere_files_are_refused_by_name(
+    tmp_path: Path, arm_files: tuple[Path, Path], text: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        RobotModel.from_urdf(arm_files[0], written(tmp_path, text, "spheres.yaml"))
+    assert "spheres.yaml" in str(caught.value)
+
+
+def test_postures_of_the_wrong_length_and_unknown_frames_are_refused(arm: RobotModel) -> None:
+    with pytest.raises(InputError, match=r"joint positions: expected shape \(7,\), got \(6,\)"):
+        arm.sphere_centers(np.zeros(6))
+    with pytest.raises(InputError, match="no frame 'tool'; frames there: link0, "):
+        arm.frame_pose(READY, "tool")
+
+
+def test_a_real_spherized_urdf_brings_its_own_spheres(real_data: Path) -> None:
+    panda = RobotModel.from_urdf(real_data / "vamp_panda/resources/panda/panda_spherized.urdf")
+    assert len(panda.sphere_set.radii) == 59
+    np.testing.assert_allclose(panda.frame_pose(READY, "panda_hand")[:3, 3], [0.30689, 0, 0.59028], atol=1e-5)
+
+
+def test_a_sphere_set_for_a_sister_robot_fits_by_link_number(real_data: Path) -> None:
+    yaml = real_data / "robot_spheres/curobo/curobo/content/configs/robot/franka.yml"
+    fr3 = RobotModel.from_urdf(real_data / "franka_description/expanded/fr3.urdf", yaml)
+    assert set(fr3.sphere_set.links) == {f"fr3_link{i}" for i in range(8)}
+    assert fr3.left_out == ("panda_hand", "panda_leftfinger", "panda_rightfinger")
+    fingers = {"fr3_finger_joint1": 0.04, "fr3_finger_joint2": 0.04}
+    hand = RobotModel.from_urdf(real_data / "franka_description/expanded/fr3_hand.urdf", yaml, locked=fingers)
+    assert (hand.num_joints, hand.left_out, len(hand.sphere_set.radii)) == (7, (), 61)
