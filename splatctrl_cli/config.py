@@ -59,6 +59,7 @@ class FieldConfig:
     kernel: str = "matern"  # eq. 7
     length_scale: float = 0.02  # [m] l, IV-C
     noise: float = 1e-6  # epsilon of eq. 8
+    truncation: float = 16.0  # terms below e^-16 of the largest are left out: at most 11 um at 5,000 splats, l = 2 cm
     voxel: float = 0.02  # [m], IV-B
     padding: float = 0.20  # [m] around the splats where no workspace is given
 
@@ -80,7 +81,7 @@ class ControlConfig:
     posture_weight: float = 1e-3  # lambda on joint velocity; without it 7 joints on a 6-D task are undetermined
     posture_gain: float = 0.5  # [1/s] pull towards the home posture, under posture_weight
     pose_gain: float = 2.0  # [1/s] pose error to end-effector velocity
-    max_linear_speed: float = 0.25  # [m/s] cap of the reference, the collaborative speed of ISO 10218
+    max_linear_speed: float = 0.25  # [m/s] cap of the reference: a usual speed beside people
     max_angular_speed: float = 1.0  # [rad/s]
     max_residual: float = 1e-5  # a solution whose relative KKT residual exceeds this is not used
     slack_tolerance: float = 1e-4  # [m/s] slack above which a row counts as relaxed

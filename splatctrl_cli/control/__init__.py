@@ -1,1 +1,1 @@
-"""III-E: barriers, QP inverse kinematics, replay loop."""
+"""QP inverse kinematics with control barrier functions, and the replay of logged motion (paper, III-E)."""

@@ -1,0 +1,61 @@
+"""What the controller asks of a robot: the one seam between control and kinematics."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.records import Bool, Float64, SphereSet
+
+
+class ArmModel(Protocol):
+    """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` is one.
+
+    J joints, S spheres; positions [m] and poses in world.
+    """
+
+    @property
+    def joint_names(self) -> Sequence[str]: ...
+
+    @property
+    def lower(self) -> Float64: ...
+
+    @property
+    def upper(self) -> Float64: ...
+
+    @property
+    def velocity_limit(self) -> Float64: ...
+
+    @property
+    def sphere_set(self) -> SphereSet: ...
+
+    @property
+    def moving_spheres(self) -> Bool: ...
+
+    @property
+    def base_position(self) -> Float64: ...
+
+    def sphere_centers(self, q: Float64) -> Float64: ...
+
+    def sphere_centers_batch(self, q: Float64) -> Float64: ...
+
+    def sphere_jacobians(self, q: Float64) -> Float64: ...
+
+    def frame_pose(self, q: Float64, frame: str) -> Float64: ...
+
+    def frame_jacobian(self, q: Float64, frame: str) -> Float64: ...
+
+    def self_pairs(self) -> NDArray[np.integer]: ...
+
+    def reach(self) -> float: ...
+
+
+def sphere_names(spheres: SphereSet) -> tuple[str, ...]:
+    """A name for every sphere: its link and its place among that link's spheres, ``panda_hand[2]``."""
+    seen: dict[str, int] = {}
+    names = []
+    for link in spheres.links:
+        seen[link] = seen.get(link, -1) + 1
+        names.append(f"{link}[{seen[link]}]")
+    return tuple(names)

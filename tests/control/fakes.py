@@ -1,0 +1,102 @@
+"""A planar two-link arm in plain NumPy and two distance fields, all with known answers."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatctrl_cli.records import Bool, Float64, SphereSet
+
+
+class PlanarArm:
+    """Two unit-ish links in the plane z = 0, about z at the base; spheres along the links and one on the base."""
+
+    def __init__(self, lengths: tuple[float, float] = (0.5, 0.4), radius: float = 0.04) -> None:
+        self.lengths = lengths
+        self.joint_names: Sequence[str] = ("shoulder", "elbow")
+        self.lower, self.upper = np.array([-2.9, -2.6]), np.array([2.9, 2.6])
+        self.velocity_limit = np.array([1.5, 1.5])
+        along = [0.25, 0.5, 0.2, 0.4]
+        self.sphere_set = SphereSet(
+            links=("base", "upper", "upper", "fore", "fore"),
+            centers=np.array([[0.0, 0, 0]] + [[x, 0, 0] for x in along]),
+            radii=np.array([0.06] + [radius] * 4),
+        )
+        self.moving_spheres: Bool = np.array([False, True, True, True, True])
+        self.base_position: Float64 = np.zeros(3)
+        self.pairs = np.array([[0, 3], [0, 4]])
+
+    def sphere_centers(self, q: Float64) -> Float64:
+        elbow = self.lengths[0] * _unit(q[0])
+        local = self.sphere_set.centers[:, 0]
+        rows = [np.zeros(3), *[x * _unit(q[0]) for x in local[1:3]], *[elbow + x * _unit(q.sum()) for x in local[3:]]]
+        return np.array(rows)
+
+    def sphere_centers_batch(self, q: Float64) -> Float64:
+        return np.array([self.sphere_centers(row) for row in q])
+
+    def sphere_jacobians(self, q: Float64) -> Float64:
+        centers, elbow = self.sphere_centers(q), self.lengths[0] * _unit(q[0])
+        J = np.zeros((len(centers), 3, 2))
+        J[1:, :, 0] = [_turned(c) for c in centers[1:]]
+        J[3:, :, 1] = [_turned(c - elbow) for c in centers[3:]]
+        return J
+
+    def frame_pose(self, q: Float64, frame: str) -> Float64:
+        T = np.eye(4)
+        c, s = np.cos(q.sum()), np.sin(q.sum())
+        T[:2, :2] = [[c, -s], [s, c]]
+        T[:3, 3] = self.lengths[0] * _unit(q[0]) + self.lengths[1] * _unit(q.sum())
+        return T
+
+    def frame_jacobian(self, q: Float64, frame: str) -> Float64:
+        tip, elbow = self.frame_pose(q, frame)[:3, 3], self.lengths[0] * _unit(q[0])
+        J = np.zeros((6, 2))
+        J[:3, 0], J[:3, 1], J[5] = _turned(tip), _turned(tip - elbow), 1.0
+        return J
+
+    def self_pairs(self) -> "np.ndarray":
+        return self.pairs
+
+    def reach(self) -> float:
+        return sum(self.lengths)
+
+
+class Balls:
+    """Exact distance to balls: ``min_i |x - c_i| - r_i``, and its gradient."""
+
+    def __init__(self, centers: Sequence[Sequence[float]], radii: Sequence[float]) -> None:
+        self.centers, self.radii = np.array(centers, dtype=float), np.array(radii, dtype=float)
+        self.num_queries = 0
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        self.num_queries += 1
+        offset = points[:, None, :] - self.centers[None]
+        length = np.linalg.norm(offset, axis=2)
+        nearest = np.argmin(length - self.radii, axis=1)
+        rows = np.arange(len(points))
+        distance = length[rows, nearest]
+        return distance - self.radii[nearest], offset[rows, nearest] / np.maximum(distance, 1e-12)[:, None]
+
+
+class Plane:
+    """Distance to the half space ``n . x <= offset``, scaled: the gradient is `scale` long, not 1."""
+
+    def __init__(self, normal: Sequence[float], offset: float, scale: float = 1.0) -> None:
+        self.normal, self.offset, self.scale = np.array(normal, dtype=float), offset, scale
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        distance = self.scale * (points @ self.normal - self.offset)
+        return distance, np.broadcast_to(self.scale * self.normal, points.shape)
+
+
+def far_away() -> Balls:
+    """A field with nothing near the arm."""
+    return Balls([[50.0, 0, 0]], [1.0])
+
+
+def _unit(angle: float) -> Float64:
+    return np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+def _turned(vector: Float64) -> Float64:
+    return np.array([-vector[1], vector[0], 0.0])

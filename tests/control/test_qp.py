@@ -1,0 +1,103 @@
+"""The program, its elimination and its solver."""
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.control.barriers import Barrier, can_bind
+from splatctrl_cli.control.problem import assemble
+from splatctrl_cli.control.qp import ClarabelSolver, QuadraticProgram, residuals
+from splatctrl_cli.control.tasks import Cost, eliminated_weight, posture_task, velocity_task
+from splatctrl_cli.records import Float64
+from tests.reference.control import literal_program
+
+
+def barrier(G: Float64, h: Float64) -> Barrier:
+    return Barrier(index=np.arange(len(h)), G=G, h=h, distance=h, slack_cost=1e3, slack_weight=100.0)
+
+
+def seven_joint_costs(rng: np.random.Generator) -> tuple[Float64, Float64, Float64, Float64, list[Cost]]:
+    J, u, Q, R = rng.normal(size=(6, 7)), 0.3 * rng.normal(size=6), rng.uniform(1, 9, 6), rng.uniform(1, 9, 6)
+    costs = [velocity_task(J, u, eliminated_weight(Q, R)), posture_task(0.1 * np.ones(7), 1e-3)]
+    return J, u, Q, R, costs
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_eliminating_the_end_effector_velocity_leaves_the_literal_solution(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    J, u, Q, R, costs = seven_joint_costs(rng)
+    G, h = rng.normal(size=(9, 7)), rng.uniform(-0.3, 0.3, 9)
+    reduced = ClarabelSolver().solve(assemble(costs, np.full(7, -2.0), np.full(7, 2.0), [barrier(G, h)]))
+    literal = ClarabelSolver().solve(literal_program(J, u, Q, R, (0.1 * np.ones(7), 1e-3), (G, h), (1e3, 100.0)))
+    assert reduced.is_solved and literal.is_solved
+    np.testing.assert_allclose(reduced.z[:7], literal.z[:7], atol=2e-5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_culled_rows_leave_the_solution_as_it_was(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    *_, costs = seven_joint_costs(rng)
+    G, h = 0.3 * rng.normal(size=(60, 7)), rng.uniform(-0.1, 2.0, 60)
+    box = np.full(7, -0.5), np.full(7, 0.5)
+    keep = can_bind(G, h, *box)
+    assert 5 < keep.sum() < 55
+    whole = ClarabelSolver().solve(assemble(costs, *box, [barrier(G, h)]))
+    culled = ClarabelSolver().solve(assemble(costs, *box, [barrier(G[keep], h[keep])]))
+    assert whole.is_solved and culled.is_solved
+    np.testing.assert_allclose(whole.z[:7], culled.z[:7], atol=2e-6)
+    np.testing.assert_allclose(whole.z[7:][~keep], 0.0, atol=1e-6)
+
+
+def test_the_slack_is_exact_where_the_rows_can_hold() -> None:
+    rng = np.random.default_rng(3)
+    *_, costs = seven_joint_costs(rng)
+    G = rng.normal(size=(4, 7))
+    solution = ClarabelSolver().solve(
+        assemble(costs, np.full(7, -2.0), np.full(7, 2.0), [barrier(G, np.full(4, -0.05))])
+    )
+    assert solution.is_solved
+    assert np.max(solution.z[7:]) < 1e-7
+    assert np.all(G @ solution.z[:7] <= -0.05 + 1e-6)
+
+
+def test_rows_that_contradict_each_other_give_way_by_what_is_missing() -> None:
+    G, h = np.array([[1.0], [-1.0]]), np.array([-0.1, -0.3])
+    solution = ClarabelSolver().solve(
+        assemble([posture_task(np.zeros(1), 1e-3)], np.array([-1.0]), np.array([1.0]), [barrier(G, h)])
+    )
+    assert solution.is_solved
+    assert solution.z[1] + solution.z[2] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_a_degenerate_box_is_solved() -> None:
+    solution = ClarabelSolver().solve(
+        assemble([posture_task(np.zeros(2), 1.0)], np.array([-1.5, -1.0]), np.array([-1.5, 1.0]), [])
+    )
+    assert solution.is_solved
+    np.testing.assert_allclose(solution.z, [-1.5, 0.0], atol=1e-6)
+
+
+def test_residuals_vanish_at_the_optimum_and_nowhere_else() -> None:
+    program = QuadraticProgram(
+        H=np.array([[2.0]]), c=np.array([-4.0]), G=np.array([[1.0]]), h=np.array([1.0])
+    )  # min v^2 - 4 v, v <= 1: v = 1, multiplier 2
+    assert residuals(program, np.array([1.0]), np.array([2.0])).worst == pytest.approx(0.0, abs=1e-15)
+    assert residuals(program, np.array([1.5]), np.array([1.0])).primal == pytest.approx(0.5)
+    assert residuals(program, np.array([1.0]), np.array([1.0])).dual > 0.1
+    assert residuals(program, np.array([0.0]), np.array([4.0])).gap > 0.1
+    assert residuals(program, np.array([2.0]), np.array([-1.0])).dual > 0.1
+    assert residuals(program, np.array([np.nan]), np.array([2.0])).worst == np.inf
+
+
+@pytest.mark.parametrize("h", [np.array([-1.0, -1.0]), np.array([np.nan, 1.0])])
+def test_an_infeasible_or_broken_program_is_not_solved(h: Float64) -> None:
+    program = QuadraticProgram(H=np.eye(1), c=np.zeros(1), G=np.array([[1.0], [-1.0]]), h=h)
+    solution = ClarabelSolver().solve(program)
+    assert not solution.is_solved
+    assert solution.status
+
+
+def test_the_same_program_gives_the_same_bits() -> None:
+    *_, costs = seven_joint_costs(np.random.default_rng(1))
+    program = assemble(costs, np.full(7, -0.1), np.full(7, 0.1), [])
+    first, second = (ClarabelSolver().solve(program) for _ in range(2))
+    assert first.z.tobytes() == second.z.tobytes()

@@ -1,0 +1,217 @@
+"""One controller step: the ladder, the check after solving, and what is said about it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
+from splatctrl_cli.control.step import QpIkController, Rung, is_usable, middle_posture
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.records import DistanceField, Float64
+from tests.control.fakes import Balls, PlanarArm, Plane, far_away
+
+CONFIG = ControlConfig()
+Q = np.array([0.3, 0.6])
+
+
+def controller(field: DistanceField, config: ControlConfig = CONFIG, **options: object) -> QpIkController:
+    return QpIkController(PlanarArm(), config, field, frame="tip", **options)  # type: ignore[arg-type]
+
+
+def goal(q: Float64) -> Float64:
+    return PlanarArm().frame_pose(q, "tip")
+
+
+class Scripted:
+    """A solver that answers the first `num_bad` programs with `bad`, then honestly."""
+
+    def __init__(self, num_bad: int, status: str = "AlmostSolved", residual: float = 0.0) -> None:
+        self.num_bad, self.status, self.residual = num_bad, status, residual
+        self.honest = ClarabelSolver()
+
+    def solve(self, program: QuadraticProgram) -> QpSolution:
+        solution = self.honest.solve(program)
+        if self.num_bad == 0:
+            return solution
+        self.num_bad -= 1
+        residuals = Residuals(primal=self.residual, dual=0.0, gap=0.0)
+        return replace(solution, status=self.status, is_solved=self.status == "Solved", residuals=residuals)
+
+
+def test_a_free_step_moves_the_frame_towards_its_goal() -> None:
+    step = controller(far_away()).step(Q, goal(np.array([0.5, 0.4])))
+    moved = PlanarArm().frame_jacobian(Q, "tip") @ step.velocity
+    assert step.rung is Rung.SOLVED and step.scale == 1.0
+    assert moved @ step.pose_error > 0
+    assert step.num_rows == 0 and step.relaxed == () and step.violated_fixed == ()
+    assert step.residual < CONFIG.max_residual and step.status == "Solved"
+
+
+def test_at_the_goal_only_the_pull_home_is_left() -> None:
+    step = controller(far_away(), home=Q).step(Q, goal(Q))
+    np.testing.assert_allclose(step.velocity, 0.0, atol=1e-7)
+
+
+def test_a_step_never_approaches_faster_than_its_row_allows() -> None:
+    wall = Plane([-1.0, 0.0, 0.0], -0.93)  # free where x < 0.93; the outermost sphere ends at 0.9 + 0.04
+    q = np.array([0.1, 0.1])
+    step = controller(wall).step(q, goal(np.zeros(2)))
+    arm = PlanarArm()
+    centers, jacobians = arm.sphere_centers(q), arm.sphere_jacobians(q)
+    distance, gradient = wall.query(centers)
+    clearance = (distance - arm.sphere_set.radii)[1:]
+    rate = np.einsum("si,sij,j->s", gradient, jacobians, step.velocity)[1:]
+    slack = {row.name: row.slack for row in step.relaxed}
+    assert np.all(rate >= -CONFIG.barrier_gain * (clearance - CONFIG.margin) - sum(slack.values()) - 1e-5)
+    assert "fore[1]" in step.intervening
+    assert step.clearance == pytest.approx(clearance.min()) and step.nearest == "fore[1]"
+
+
+def test_a_sphere_within_the_margin_is_pushed_back_out() -> None:
+    wall = Plane([0.0, -1.0, 0.0], -0.25)
+    q = np.array([0.2, 0.1])
+    ahead = PlanarArm().sphere_centers(q)[4, 1] + 0.04
+    wall.offset = -(ahead + 0.005)  # 5 mm of clearance, 15 mm short of the margin
+    step = controller(wall).step(q, goal(np.array([0.6, 0.6])))
+    assert step.rung is Rung.SOLVED
+    lifted = PlanarArm().sphere_jacobians(q)[4, 1] @ step.velocity
+    assert lifted == pytest.approx(-CONFIG.barrier_gain * 0.015, abs=1e-4)
+
+
+def test_a_rate_of_change_of_the_field_enters_the_rows() -> None:
+    wall = Plane([0.0, -1.0, 0.0], -0.55)
+    target = goal(Q)
+    still = controller(wall, home=Q).step(Q, target)
+    coming = controller(wall, home=Q).step(Q, target, distance_rate=-2.0)
+    np.testing.assert_allclose(still.velocity, 0.0, atol=1e-6)
+    assert PlanarArm().sphere_jacobians(Q)[4, 1] @ coming.velocity < -0.1
+
+
+def test_rows_that_cannot_all_hold_are_relaxed_and_named() -> None:
+    q = np.array([0.3, 0.0])
+    tip = PlanarArm().sphere_centers(q)[4]
+    squeeze = Balls([tip + np.array([0, 0.09, 0]), tip - np.array([0, 0.09, 0])], [0.05, 0.05])
+    narrow = replace(CONFIG, margin=0.2, self_margin=0.0)
+    step = controller(squeeze, narrow).step(q, goal(q))
+    assert step.rung is Rung.RELAXED or step.rung is Rung.HOLD
+    assert {row.name for row in step.relaxed} & {"fore[0]", "fore[1]"}
+    assert all(row.slack > CONFIG.slack_tolerance for row in step.relaxed)
+
+
+def test_spheres_that_no_joint_moves_stay_out_of_the_program_and_are_reported() -> None:
+    buried_base = Balls([[0.0, 0.0, 0.0]], [0.1])
+    own = controller(buried_base)
+    step = own.step(Q, goal(np.array([0.35, 0.55])))
+    assert step.rung is Rung.SOLVED
+    (violation,) = own.static_violations(Q)
+    assert violation.sphere == "base[0]"
+    assert violation.clearance == pytest.approx(-0.1 - 0.06)
+
+
+def test_a_flat_field_cannot_be_acted_on_and_is_named() -> None:
+    flat = Plane([0.0, 0.0, 1.0], 0.0, scale=1.0)  # the arm moves within the plane: no row can help
+    step = controller(flat).step(Q, goal(Q))
+    assert set(step.violated_fixed) == {"upper[0]", "upper[1]", "fore[0]", "fore[1]"}
+
+
+@pytest.mark.parametrize(("status", "residual"), [("AlmostSolved", 0.0), ("Solved", 1e-3), ("MaxIterations", 0.0)])
+def test_an_unchecked_solution_is_never_used(status: str, residual: float) -> None:
+    step = controller(far_away(), solver=Scripted(1, status, residual)).step(Q, goal(np.zeros(2)))
+    assert step.rung is Rung.MINIMUM_VIOLATION
+    np.testing.assert_allclose(step.velocity, 0.0, atol=1e-6)
+    step = controller(far_away(), solver=Scripted(2, status, residual)).step(Q, goal(np.zeros(2)))
+    assert step.rung is Rung.HOLD and step.scale == 0.0
+    assert np.all(step.velocity == 0.0)
+
+
+def test_usable_needs_the_status_and_the_residual() -> None:
+    program = QuadraticProgram(H=np.eye(1), c=np.zeros(1), G=np.eye(1), h=np.ones(1))
+    good = ClarabelSolver().solve(program)
+    assert is_usable(good, 1e-6)
+    assert not is_usable(good, 0.0)
+    assert not is_usable(unsolved(program, "x"), np.inf)
+
+
+class Cliff:
+    """A field that lies about what comes next: distance 0.1 up to x = wall, then far below."""
+
+    def __init__(self, wall: float, depth: float = -0.5) -> None:
+        self.wall, self.depth = wall, depth
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        return np.where(points[:, 0] > self.wall, self.depth, 0.3), np.zeros_like(points)
+
+
+def test_a_step_that_turns_out_worse_than_promised_is_scaled_back() -> None:
+    q = np.array([0.5, -0.5])
+    tip = PlanarArm().sphere_centers(q)[4, 0]
+    target = goal(np.zeros(2))
+    free = controller(far_away()).step(q, target)
+    reach = PlanarArm().sphere_centers(q + CONFIG.period * free.velocity)[4, 0] - tip
+    assert reach > 0
+    step = controller(Cliff(tip + 0.3 * reach)).step(q, target)
+    assert step.scale == 0.25
+    np.testing.assert_allclose(step.velocity, 0.25 * free.velocity, atol=1e-5)
+    blocked = controller(Cliff(tip + 1e-9)).step(q, target)
+    assert blocked.rung is Rung.HOLD and np.all(blocked.velocity == 0.0)
+    no_distance = controller(Cliff(tip + 1e-9, np.nan)).step(q, target)
+    assert no_distance.rung is Rung.HOLD
+
+
+def test_a_self_collision_row_holds_the_links_apart() -> None:
+    q = np.array([0.0, 2.3])  # the fore arm folds back over the base sphere
+    arm = PlanarArm()
+    own = QpIkController(arm, replace(CONFIG, self_margin=0.2), far_away(), frame="tip")
+    for _ in range(200):
+        step = own.step(q, goal(np.array([0.0, 2.59])))
+        q = q + CONFIG.period * step.velocity
+    assert step.self_clearance >= 0.2 - 1e-4
+    assert "base[0]~fore[1]" in step.intervening
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"period": 0.0}, "control.period"),
+        ({"period": 0.02, "barrier_gain": 51.0}, "gain \\* period"),
+        ({"weight_slack": 0.0}, "control.weight_slack"),
+    ],
+)
+def test_numbers_that_no_controller_can_run_with_are_refused(changes: dict[str, float], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        controller(far_away(), replace(CONFIG, **changes))
+
+
+def test_a_posture_that_is_not_finite_or_has_another_size_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="joint elbow is nan"):
+        controller(far_away()).step(np.array([0.0, np.nan]), goal(Q))
+    with pytest.raises(InputError, match="expected 2 joints"):
+        controller(far_away()).step(np.zeros(3), goal(Q))
+
+
+def test_a_joint_without_a_velocity_limit_is_refused() -> None:
+    arm = PlanarArm()
+    arm.velocity_limit = np.array([1.0, 0.0])
+    with pytest.raises(InputError, match="joint elbow: expected a velocity limit above zero"):
+        QpIkController(arm, CONFIG, far_away(), frame="tip")
+
+
+def test_a_field_without_a_distance_names_the_sphere_and_the_place() -> None:
+    with pytest.raises(NotEvaluableError, match=r"sphere upper\[0\] at"):
+        controller(Cliff(-9.0, np.nan)).step(Q, goal(Q))
+
+
+def test_a_start_outside_the_joint_limits_is_brought_back() -> None:
+    q = np.array([2.95, 0.0])
+    step = controller(far_away()).step(q, goal(q))
+    assert step.rung is Rung.SOLVED
+    assert step.velocity[0] == pytest.approx(-0.5, abs=1e-5)  # gain 10 /s times 0.05 rad
+    assert "shoulder highest" in step.intervening
+
+
+def test_the_middle_posture_is_zero_for_an_unlimited_joint() -> None:
+    arm = PlanarArm()
+    arm.lower, arm.upper = np.array([-np.inf, 0.0]), np.array([np.inf, 1.0])
+    np.testing.assert_allclose(middle_posture(arm), [0.0, 0.5])
