@@ -1,0 +1,172 @@
+"""Images of sensor_msgs messages as arrays: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m]."""
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.io.decoder import IMAGE, UndecodableMessageError, stamp_ns
+from splatctrl_cli.records import Float32, UInt8
+
+MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
+DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+COLOR_CONVERSIONS = {
+    "rgb8": None,
+    "8UC3": cv2.COLOR_BGR2RGB,  # OpenCV's order
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+    "8UC4": cv2.COLOR_BGRA2RGB,
+    "mono8": cv2.COLOR_GRAY2RGB,
+    "8UC1": cv2.COLOR_GRAY2RGB,
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
+    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
+    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+}
+_LAYOUT = {  # channels and dtype by encoding
+    **dict.fromkeys(["rgb8", "bgr8", "8UC3"], (3, "u1")),
+    **dict.fromkeys(["rgba8", "bgra8", "8UC4"], (4, "u1")),
+    **dict.fromkeys(["mono8", "8UC1"], (1, "u1")),
+    **dict.fromkeys(["yuv422", "uyvy", "yuv422_yuy2", "yuyv"], (2, "u1")),
+    **dict.fromkeys(["16UC1", "mono16"], (1, "u2")),
+    "32FC1": (1, "f4"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageMessage:
+    """An image as recorded.
+
+    pixels (H, W[, channels]) in `encoding`; compressed is the image file's bytes where the message held one
+    (JPEG, PNG), which decode to `pixels` in OpenCV's BGR order.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    encoding: str
+    pixels: NDArray[Any]
+    compressed: bytes | None = None
+
+    @property
+    def width(self) -> int:
+        """Columns [px]."""
+        return int(self.pixels.shape[1])
+
+    @property
+    def height(self) -> int:
+        """Rows [px]."""
+        return int(self.pixels.shape[0])
+
+    @property
+    def kind(self) -> str:
+        """``color``, ``depth`` or ``other``."""
+        if self.encoding in DEPTH_ENCODINGS:
+            return "depth"
+        return "color" if self.encoding in COLOR_CONVERSIONS else "other"
+
+    @property
+    def is_gray(self) -> bool:
+        """Whether a colour image has one channel only."""
+        return self.encoding in {"mono8", "8UC1"}
+
+
+def read_image(message: Any, type_name: str) -> ImageMessage:
+    """The image of a decoded sensor_msgs/Image or CompressedImage. Raises UndecodableMessageError."""
+    if type_name == IMAGE:
+        pixels, encoding, compressed = _raw_pixels(message), message.encoding, None
+    else:
+        pixels, encoding, compressed = _compressed_pixels(message.format, bytes(message.data))
+    return ImageMessage(
+        stamp_ns=stamp_ns(message.header),
+        frame_id=message.header.frame_id.strip("/"),
+        encoding=encoding,
+        pixels=pixels,
+        compressed=compressed,
+    )
+
+
+def color_of(image: ImageMessage) -> UInt8:
+    """Colour (H, W, 3) uint8 RGB."""
+    if image.compressed is not None:
+        code: int | None = cv2.COLOR_GRAY2RGB if image.is_gray else cv2.COLOR_BGR2RGB
+    else:
+        code = COLOR_CONVERSIONS[image.encoding]
+    pixels = image.pixels if code is None else cv2.cvtColor(np.ascontiguousarray(image.pixels), code)
+    return np.ascontiguousarray(pixels, dtype=np.uint8)
+
+
+def depth_of(image: ImageMessage, scale: float | None) -> Float32:
+    """Depth (H, W) float32 [m]; 0, negative and non-finite values (REP 118: no measurement) become 0 = none.
+
+    `scale` [m per count]: default 1 mm for integers, 1 for floats.
+    """
+    if image.pixels.dtype.kind == "u":
+        return metres(image.pixels, MILLIMETRE if scale is None else scale)
+    values = image.pixels * np.float32(1.0 if scale is None else scale)
+    return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+
+
+def metres(counts: NDArray[Any], scale: float) -> Float32:
+    """Integer depth counts (H, W) as float32 [m]; the one formula, so that re-reading gives the same bits."""
+    return counts.astype(np.float32) * np.float32(scale)
+
+
+def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
+    """Pixels of a JPEG, PNG, ... file as OpenCV reads it (BGR), its orientation tag ignored; None if it is none."""
+    flags = cv2.IMREAD_COLOR if color else cv2.IMREAD_UNCHANGED
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    if buffer.size == 0:
+        return None
+    try:
+        pixels = cv2.imdecode(buffer, flags | cv2.IMREAD_IGNORE_ORIENTATION if color else flags)
+    except cv2.error:
+        return None
+    return None if pixels is None else np.asarray(pixels)
+
+
+def _raw_pixels(message: Any) -> NDArray[Any]:
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    name = f"image {width}x{height} {message.encoding}"
+    if message.encoding not in _LAYOUT:
+        return np.zeros((height, width, 0), dtype=np.uint8)  # kind "other": described, never used
+    channels, code = _LAYOUT[message.encoding]
+    dtype = np.dtype((">" if message.is_bigendian else "<") + code)
+    row = width * channels * dtype.itemsize
+    data = np.asarray(message.data, dtype=np.uint8)
+    if width == 0 or height == 0 or step < row or data.size < step * (height - 1) + row:
+        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    padded = np.zeros(step * height, dtype=np.uint8)
+    padded[: min(data.size, padded.size)] = data[: padded.size]
+    rows = np.ascontiguousarray(padded.reshape(height, step)[:, :row])
+    pixels = rows.view(dtype).astype(dtype.newbyteorder("="), copy=False)
+    return pixels.reshape(height, width) if channels == 1 else pixels.reshape(height, width, channels)
+
+
+def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes]:
+    if "compressedDepth" in form:
+        return _compressed_depth(form, data)
+    pixels = decode_file(data, color=False)
+    if pixels is None:
+        raise UndecodableMessageError(f"compressed image ({form}): {len(data)} bytes that are no image file")
+    if pixels.ndim == 2 and pixels.dtype == np.uint16:
+        return pixels, "16UC1", data
+    color = decode_file(data, color=pixels.ndim != 2)
+    assert color is not None
+    return color, "mono8" if color.ndim == 2 else "bgr8", data
+
+
+def _compressed_depth(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes]:
+    """compressed_depth_image_transport: 12 bytes (int32, two float32 A, B), then a PNG; 32FC1 is A / (count - B)."""
+    counts = decode_file(data[12:], color=False)
+    if counts is None or counts.ndim != 2:
+        raise UndecodableMessageError(f"compressed depth ({form}): {len(data)} bytes that hold no depth PNG")
+    if not form.strip().startswith("32FC1"):
+        return counts, "16UC1", data[12:]
+    _, a, b = struct.unpack_from("<iff", data)
+    with np.errstate(divide="ignore"):
+        depth = np.where(counts > 0, a / (counts.astype(np.float64) - b), 0.0)
+    return depth.astype(np.float32), "32FC1", data[12:]

@@ -1,0 +1,38 @@
+"""How a source is to be read."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraTopics:
+    """The topics of one RGB-D camera; an empty info or depth_info means that none was found."""
+
+    name: str
+    color: str
+    depth: str
+    info: str = ""
+    depth_info: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions:
+    """What a person may say about an input; every field has a default that fits a well-formed log.
+
+    world_frame: frame of poses (default: the root of the tf tree). cameras: only these (default: all).
+    camera_topics: topics by camera name, instead of those found. camera_poses: T_world_camera of fixed cameras as
+    x, y, z, qx, qy, qz, qw, instead of tf. depth_scale: [m per count] of depth images. root: folder of an image
+    folder's files. holdout: frames (index or name) of an image folder that become camera `holdout`.
+    """
+
+    world_frame: str | None = None
+    cameras: tuple[str, ...] | None = None
+    camera_topics: tuple[CameraTopics, ...] = ()
+    camera_poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    depth_scale: float | None = None
+    pairing_tolerance_s: float = 0.020
+    pose_tolerance_s: float = 0.020
+    joint_topic: str | None = None
+    root: Path | None = None
+    holdout: tuple[str, ...] | None = None

@@ -1,0 +1,69 @@
+"""Recorded messages as bytes, in the order of the file, whatever the container; damage is counted, not raised."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topic:
+    """One channel of a log.
+
+    type_name is ``package/msg/Type`` for ROS messages; encoding is ``cdr``, ``ros1`` or what the file says (json,
+    protobuf, ...); definition is the type's text as the file holds it ("" = none), in definition_format
+    ``msg`` or ``idl``.
+    """
+
+    name: str
+    type_name: str
+    encoding: str
+    definition: str = ""
+    definition_format: str = "msg"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawMessage:
+    """One message: its topic, the time it was logged [ns] and its bytes."""
+
+    topic: Topic
+    log_time_ns: int
+    data: bytes
+
+
+@dataclass(kw_only=True)
+class Damage:
+    """What one pass over a log could not read."""
+
+    count: int = 0
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, note: str) -> None:
+        """Count one damaged part and say which."""
+        self.count += 1
+        self.notes.append(note)
+
+
+class RawLog(Protocol):
+    """A log that can be read from its start any number of times."""
+
+    @property
+    def path(self) -> Path: ...
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files the log consists of."""
+        ...
+
+    @property
+    def container(self) -> str:
+        """What the file is, in words (``MCAP``, ``ROS 1 bag``, ``ROS 2 bag (sqlite3)``)."""
+        ...
+
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics that the log's index names, also those without messages; empty where there is no index."""
+        ...
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield the messages of topics `names` (all, if None) in file order; what is damaged goes to `damage`."""
+        ...

@@ -1,0 +1,231 @@
+"""A ROS log as records: cameras found, colour and depth paired, poses from tf, joints in one order.
+
+Two passes: the first takes all but the images (transforms may follow the images that need them) and plans every
+frame; the second decodes only planned images and holds no more of them than the log's disorder demands.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.io.joints import joint_records
+from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, read_image
+from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.output import sha256
+from splatctrl_cli.io.pairing import pair_by_stamp
+from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
+from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
+from splatctrl_cli.io.shot import Shot, check_depth, merged
+from splatctrl_cli.io.survey import Survey, survey
+from splatctrl_cli.records import Float64, JointState, LossReport, Record, RgbdFrame
+
+_SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Planned:
+    """A frame to be: message numbers within the colour and depth topics, and the pose."""
+
+    stamp_ns: int
+    camera: Camera
+    color_index: int
+    depth_index: int
+    T_world_camera: Float64
+
+
+class RosLogSource:
+    """Records of an MCAP, ROS 1 bag or ROS 2 bag."""
+
+    has_clock = True
+
+    def __init__(self, log: RawLog, options: SourceOptions) -> None:
+        self.name = log.path.name
+        self._log = log
+        self._options = options
+        found = survey(log)
+        _check_not_empty(log, found)
+        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
+        self._rig = build_cameras(log, found, options)
+        self.cameras = tuple(camera.name for camera in self._rig)
+        self.world_frame = self._rig[0].world_frame
+        self.joint_names, self._joints = joint_records(found, options, self._loss)
+        self._plan = self._planned(found)
+        self._damage = Damage()
+
+    @property
+    def loss(self) -> LossReport:
+        """What did not become records; images that do not decode are added while `records` is read."""
+        loss = self._loss
+        return replace(loss, damaged=loss.damaged + self._damage.count, notes=[*loss.notes, *self._damage.notes])
+
+    def records(self) -> Iterator[Record]:
+        """Joint states and frames by stamp."""
+        for item in self.shots():
+            yield item.frame if isinstance(item, Shot) else item
+
+    def shots(self) -> Iterator[Shot | JointState]:
+        """Joint states and shots by stamp."""
+        self._damage = Damage()
+        return merged(self._joints, self._shots())
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the log's files."""
+        return dict(self._digests)
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
+        return {file.name: sha256(file) for file in self._log.files}
+
+    def _planned(self, found: Survey) -> list[_Planned]:
+        plan: list[_Planned] = []
+        for camera in self._rig:
+            color_ns = found.topics[camera.color_topic].stamps_ns
+            depth_ns = found.topics[camera.depth_topic].stamps_ns
+            tolerance_ns = round(self._options.pairing_tolerance_s * _SECOND)
+            pairs = pair_by_stamp(color_ns, depth_ns, tolerance_ns)
+            if not pairs:
+                gap = nearest_gap_ns(color_ns, depth_ns) / _SECOND
+                raise InputError(
+                    f"{self._log.path}: camera {camera.name}: no colour and depth image within"
+                    f" {tolerance_ns / 1e6:g} ms of each other, the closest are {gap * 1e3:.4g} ms apart",
+                    remedy=f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right",
+                )
+            self._loss.unpaired_color += len(color_ns) - len(pairs)
+            self._loss.unpaired_depth += len(depth_ns) - len(pairs)
+            plan.extend(self._with_pose(found, camera, pairs))
+        return sorted(plan, key=lambda planned: (planned.stamp_ns, planned.camera.name, planned.color_index))
+
+    def _with_pose(self, found: Survey, camera: Camera, pairs: list[tuple[int, int]]) -> list[_Planned]:
+        tolerance_ns = round(self._options.pose_tolerance_s * _SECOND)
+        color_ns = found.topics[camera.color_topic].stamps_ns
+        planned = []
+        for color_index, depth_index in pairs:
+            stamp_ns = color_ns[color_index]
+            T = camera.pose_at(found.tf, stamp_ns, tolerance_ns)
+            if T is not None:
+                planned.append(
+                    _Planned(
+                        stamp_ns=stamp_ns,
+                        camera=camera,
+                        color_index=color_index,
+                        depth_index=depth_index,
+                        T_world_camera=T,
+                    )
+                )
+        if not planned:
+            raise InputError(
+                f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
+                f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
+                remedy="check the clocks of the recording, or give --camera-pose",
+            )
+        self._loss.without_pose += len(pairs) - len(planned)
+        return planned
+
+    def _shots(self) -> Iterator[Shot]:
+        images = _PlannedImages(self._log, self._plan)
+        checked: set[str] = set()
+        for planned, color, depth in images.pairs(self._damage):
+            shot = _shot(planned, color, depth, self._options.depth_scale)
+            camera = planned.camera
+            if camera.name not in checked:
+                scale = _scale(depth, self._options.depth_scale)
+                if check_depth(shot.frame.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
+                    checked.add(camera.name)
+            yield shot
+
+
+class _PlannedImages:
+    """The second pass: brings the two images of each planned frame together, in the plan's order."""
+
+    def __init__(self, log: RawLog, plan: list[_Planned]) -> None:
+        self._log = log
+        self._plan = plan
+        self._held: dict[tuple[str, int], RawMessage] = {}
+        self._uses: dict[tuple[str, int], int] = {}
+        for planned in plan:
+            for key in _keys(planned):
+                self._uses[key] = self._uses.get(key, 0) + 1
+
+    def pairs(self, damage: Damage) -> Iterator[tuple[_Planned, ImageMessage, ImageMessage]]:
+        """Yield each planned frame with its images; one that does not decode goes to `damage`."""
+        topics = {key[0] for key in self._uses}
+        numbers = dict.fromkeys(topics, 0)
+        decoder = MessageDecoder()
+        position = 0
+        for message in self._log.messages(Damage(), topics):  # the survey has counted this damage
+            key = (message.topic.name, numbers[message.topic.name])
+            numbers[message.topic.name] += 1
+            if key not in self._uses:
+                continue
+            self._held[key] = message
+            while position < len(self._plan) and all(key in self._held for key in _keys(self._plan[position])):
+                planned = self._plan[position]
+                position += 1
+                color, depth = (self._take(key) for key in _keys(planned))
+                try:
+                    images = [read_image(decoder.decode(m), m.topic.type_name) for m in (color, depth)]
+                except UndecodableMessageError as error:
+                    damage.add(f"camera {planned.camera.name} at {planned.stamp_ns} ns: {error}")
+                    continue
+                yield planned, images[0], images[1]
+
+    def _take(self, key: tuple[str, int]) -> RawMessage:
+        self._uses[key] -= 1
+        return self._held[key] if self._uses[key] else self._held.pop(key)
+
+
+def _keys(planned: _Planned) -> tuple[tuple[str, int], tuple[str, int]]:
+    camera = planned.camera
+    return (camera.color_topic, planned.color_index), (camera.depth_topic, planned.depth_index)
+
+
+def _shot(planned: _Planned, color: ImageMessage, depth: ImageMessage, scale: float | None) -> Shot:
+    camera = planned.camera
+    pixels, metres = color_of(color), depth_of(depth, scale)
+    is_counts = depth.pixels.dtype.kind == "u"
+    if camera.undistortion is not None:
+        pixels = camera.undistortion.color(pixels)
+        if camera.depth_to_color is None:
+            metres = camera.undistortion.depth(metres)
+    if camera.depth_to_color is not None:
+        metres = camera.depth_to_color.warp(metres)
+        is_counts = False
+    frame = RgbdFrame(
+        stamp_ns=planned.stamp_ns,
+        camera=camera.name,
+        color=pixels,
+        depth=metres,
+        intrinsics=camera.intrinsics,
+        T_world_camera=planned.T_world_camera,
+    )
+    return Shot(
+        frame=frame,
+        color_file=color.compressed if camera.undistortion is None else None,
+        depth_unit=_scale(depth, scale) if is_counts else None,
+        origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
+    )
+
+
+def _scale(depth: ImageMessage, scale: float | None) -> float:
+    if scale is not None:
+        return scale
+    return MILLIMETRE if depth.pixels.dtype.kind == "u" else 1.0
+
+
+def _check_not_empty(log: RawLog, found: Survey) -> None:
+    if found.num_messages:
+        return
+    if found.damage.count:
+        raise InputError(
+            f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})", remedy="copy the file again"
+        )
+    raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
+
+
+def _times(found: Survey, camera: Camera) -> str:
+    stamps = found.topics[camera.color_topic].stamps_ns
+    images = f"images {min(stamps) / 1e9:.3f} to {max(stamps) / 1e9:.3f} s"
+    span = found.tf.span_ns(camera.frame_id)
+    return images if span is None else f"{images}, tf {span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"

@@ -1,0 +1,67 @@
+"""A frame together with how its source stored it, so that `ingest` can keep what is lossless."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float32, JointState, RecordSource, RgbdFrame
+
+PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """A frame and its source.
+
+    color_file: the bytes of a JPEG or PNG that decode to exactly `frame.color`, None where there are none;
+    depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
+    origin: where it came from, in words.
+    """
+
+    frame: RgbdFrame
+    color_file: bytes | None
+    depth_unit: float | None
+    origin: str
+
+
+class ShotSource(RecordSource, Protocol):
+    """A record source that also says how its frames were stored."""
+
+    def shots(self) -> Iterator[Shot | JointState]:
+        """As `records`, with the frames as shots."""
+        ...
+
+
+def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot | JointState]:
+    """Joint states (sorted) and shots (sorted) by stamp, joint states first."""
+    position = 0
+    for shot in shots:
+        while position < len(joints) and joints[position].stamp_ns <= shot.frame.stamp_ns:
+            yield joints[position]
+            position += 1
+        yield shot
+    yield from joints[position:]
+
+
+def check_depth(depth: Float32, where: str, scale: float) -> bool:
+    """Whether a depth image [m] holds any depth; raises InputError when its median is implausible.
+
+    `scale` [m per count] is what turned counts into metres.
+    """
+    valid = depth[depth > 0]
+    if valid.size == 0:
+        return False
+    median = float(np.median(valid))
+    low, high = PLAUSIBLE_DEPTH
+    if not low <= median <= high:
+        counts = median / scale
+        fits = [s for s in (1e-3, 1e-4, 1.0, 1e-2, 1e-5, 1e-6) if 0.15 <= counts * s <= 8.0]
+        remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
+        raise InputError(
+            f"{where}: median depth {median:.4g} m is implausible (expected {low:g} to {high:g} m)",
+            remedy=f"is the depth scale {scale:g} m per count wrong? {remedy}",
+        )
+    return True

@@ -1,0 +1,27 @@
+"""Opens any recorded input as records in time order."""
+
+from pathlib import Path
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.io.options import CameraTopics, SourceOptions
+from splatctrl_cli.io.ros_log import RosLogSource
+from splatctrl_cli.io.shot import ShotSource
+
+__all__ = ["CameraTopics", "SourceOptions", "open_source"]
+
+
+def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
+    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, or image folder's TOML description.
+
+    Raises InputError where there is nothing, or nothing that can be used.
+    """
+    options = options or SourceOptions()
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if path.is_dir() and not is_bag_folder(path):
+        raise InputError(
+            f"{path}: a folder that is neither a capture nor a ROS 2 bag",
+            remedy="expected capture.json or metadata.yaml in it; for images give the .toml that describes them",
+        )
+    return RosLogSource(open_raw_log(path), options)

@@ -1,0 +1,153 @@
+"""A first pass over a log: topics, stamps, frames, calibrations, joints; of images the first of each topic."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.io.decoder import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    JOINT_STATE,
+    TRANSFORMS,
+    MessageDecoder,
+    UndecodableMessageError,
+    header_stamp_ns,
+    is_ros,
+    stamp_ns,
+)
+from splatctrl_cli.io.messages import ImageMessage, read_image
+from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.io.tf_tree import TfTree
+from splatctrl_cli.records import Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """What a CameraInfo says: size [px], K (3, 3), distortion model and coefficients, frame."""
+
+    width: int
+    height: int
+    K: Float64
+    distortion_model: str
+    distortion: Float64
+    frame_id: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawJoints:
+    """One JointState as recorded; velocity may be empty."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: Float64
+    velocity: Float64
+
+
+@dataclass(kw_only=True)
+class TopicSurvey:
+    """What a log holds of one topic; stamps_ns (image topics only) are header stamps in file order."""
+
+    topic: Topic
+    count: int = 0
+    first_log_ns: int = 0
+    last_log_ns: int = 0
+    stamps_ns: list[int] = field(default_factory=list)
+    first_image: ImageMessage | None = None
+    calibration: Calibration | None = None
+    joints: list[RawJoints] = field(default_factory=list)
+
+
+@dataclass(kw_only=True)
+class Survey:
+    """Everything of a log but its images."""
+
+    topics: dict[str, TopicSurvey] = field(default_factory=dict)
+    tf: TfTree = field(default_factory=TfTree)
+    damage: Damage = field(default_factory=Damage)
+
+    @property
+    def num_messages(self) -> int:
+        """Messages of all topics."""
+        return sum(topic.count for topic in self.topics.values())
+
+    def of_type(self, *types: str) -> list[TopicSurvey]:
+        """Topics of these types that hold messages, by name."""
+        found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
+        return sorted(found, key=lambda t: t.topic.name)
+
+
+def survey(log: RawLog) -> Survey:
+    """Read `log` once; a message that does not decode is counted as damage."""
+    result = Survey()
+    decoder = MessageDecoder()
+    for topic in log.topics():
+        result.topics.setdefault(topic.name, TopicSurvey(topic=topic))
+    for message in log.messages(result.damage):
+        entry = result.topics.setdefault(message.topic.name, TopicSurvey(topic=message.topic))
+        if entry.count == 0:
+            entry.topic = message.topic
+            entry.first_log_ns = entry.last_log_ns = message.log_time_ns
+        entry.count += 1
+        entry.first_log_ns = min(entry.first_log_ns, message.log_time_ns)
+        entry.last_log_ns = max(entry.last_log_ns, message.log_time_ns)
+        if is_ros(message.topic):
+            try:
+                _take(result, entry, decoder, message)
+            except (UndecodableMessageError, ValueError) as error:
+                result.damage.add(str(error))
+    return result
+
+
+def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: RawMessage) -> None:
+    kind = message.topic.type_name
+    if kind in {IMAGE, COMPRESSED_IMAGE}:
+        entry.stamps_ns.append(header_stamp_ns(message) if len(message.data) >= 12 else -1)
+        if entry.first_image is None:
+            entry.first_image = read_image(decoder.decode(message), kind)
+    elif kind == CAMERA_INFO and entry.calibration is None:
+        entry.calibration = _calibration(decoder.decode(message))
+    elif kind == JOINT_STATE:
+        entry.joints.append(_joints(decoder.decode(message)))
+    elif kind in TRANSFORMS:
+        _add_transforms(result.tf, decoder.decode(message), static=message.topic.name.endswith("tf_static"))
+
+
+def _calibration(message: Any) -> Calibration | None:
+    fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
+    K = np.asarray(fields["k"], dtype=np.float64).reshape(3, 3)
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        return None  # an uncalibrated driver publishes zeros
+    return Calibration(
+        width=int(message.width),
+        height=int(message.height),
+        K=K,
+        distortion_model=str(message.distortion_model),
+        distortion=np.asarray(fields["d"], dtype=np.float64),
+        frame_id=message.header.frame_id.strip("/"),
+    )
+
+
+def _joints(message: Any) -> RawJoints:
+    names = tuple(str(name) for name in message.name)
+    position = np.asarray(message.position, dtype=np.float64)
+    velocity = np.asarray(message.velocity, dtype=np.float64)
+    if len(position) != len(names) or len(velocity) not in {0, len(names)}:
+        raise UndecodableMessageError(
+            f"a JointState with {len(names)} names, {len(position)} positions and {len(velocity)} velocities"
+        )
+    return RawJoints(stamp_ns=stamp_ns(message.header), names=names, position=position, velocity=velocity)
+
+
+def _add_transforms(tree: TfTree, message: Any, *, static: bool) -> None:
+    for item in message.transforms:
+        t, r = item.transform.translation, item.transform.rotation
+        tree.add(
+            item.header.frame_id,
+            item.child_frame_id,
+            stamp_ns(item.header),
+            np.array([t.x, t.y, t.z], dtype=np.float64),
+            np.array([r.x, r.y, r.z, r.w], dtype=np.float64),
+            static=static,
+        )
