@@ -17,4 +17,5 @@ NB_MODULE(SPLATCTRL_MODULE, m) {
   m.def("runs_x86_64_v3", &runs_x86_64_v3, "True where this processor has AVX2, FMA and BMI2.");
   splatctrl::bind_raster(m);
   splatctrl::bind_field(m);
+  splatctrl::bind_occupancy(m);
 }

@@ -14,5 +14,6 @@ using Array = nb::ndarray<Scalar, nb::c_contig, nb::device::cpu, Extra...>;
 
 void bind_raster(nb::module_& m);
 void bind_field(nb::module_& m);
+void bind_occupancy(nb::module_& m);
 
 }  // namespace splatctrl

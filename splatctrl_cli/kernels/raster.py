@@ -1,0 +1,165 @@
+"""The splat rasteriser, image loss and optimiser of the compiled module, with shapes checked and outputs allocated.
+
+Shapes: N splats, (H, W) pixels. `planes` are (5, H, W) float32: red, green, blue, depth [m], accumulated opacity.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.kernels import native
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+def pack_camera(
+    fx: float, fy: float, cx: float, cy: float, width: int, height: int, T_camera_world: Float64
+) -> Float64:
+    """A camera as the kernels take it: (18,) float64."""
+    return np.concatenate(
+        [[fx, fy, cx, cy, width, height], T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]]
+    ).astype(np.float64)
+
+
+class Rasteriser:
+    """Renders one view at a time and differentiates it; keeps its buffers between calls."""
+
+    def __init__(self, num_threads: int) -> None:
+        self.num_threads = num_threads
+        self.native: Any = native.Rasteriser()
+        self._inputs: tuple[Float32, ...] = ()
+        self._shape = (0, 0)
+
+    def prepare(self, camera: Float64, centers: Float32, radii: Float32, opacities: Float32, colors: Float32) -> None:
+        """Project (eq. 1), sort and bin the splats for a `pack_camera` camera; arrays as in `SplatSet`."""
+        self._inputs = (centers, radii, opacities, colors)  # the kernel keeps pointers until the next call
+        self._shape = (int(camera[5]), int(camera[4]))
+        self.native.prepare(camera, centers, radii, opacities, colors, self.num_threads)
+
+    def forward(self, out: Float32 | None = None) -> Float32:
+        """Planes (5, H, W) of the prepared view (eq. 2 and 3)."""
+        planes = np.empty((5, *self._shape), np.float32) if out is None else out
+        self.native.forward(planes, self.num_threads)
+        return planes
+
+    def backward(self, planes: Float32, plane_gradients: Float32, out: Float32 | None = None) -> Float32:
+        """Gradients (N, 10): u, v, conic a, b, c, depth, opacity, red, green, blue."""
+        gradients = np.empty((len(self._inputs[1]), 10), np.float32) if out is None else out
+        self.native.backward(planes, plane_gradients, gradients, self.num_threads)
+        return gradients
+
+    def project_backward(self, gradients: Float32) -> tuple[Float32, Float32]:
+        """Gradients of the centres (N, 3), world, and the radii (N,) from those of the footprints (N, 10)."""
+        centers, radii = self._inputs[:2]
+        out = np.empty((len(radii), 4), np.float32)
+        self.native.project_backward(centers, radii, gradients, out)
+        return out[:, :3].copy(), out[:, 3].copy()
+
+    def visible(self) -> NDArray[np.bool_]:
+        """(N,) True for splats on some tile's list."""
+        out = np.empty(len(self._inputs[1]), np.uint8)
+        self.native.visible(out)
+        return out.astype(bool)
+
+    def splats_per_tile(self) -> float:
+        """Mean length of the tile lists of the prepared view."""
+        return float(self.native.splats_per_tile())
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossTerms:
+    """Means over one image: |colour error|, 1 - SSIM, |depth error| [m], squared colour error."""
+
+    l1: float
+    dssim: float
+    depth: float
+    squared: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossWeights:
+    """Weights of eq. 4; `normalised` compares depth divided by accumulated opacity."""
+
+    dssim: float
+    color: float
+    depth: float
+    normalised: bool
+
+
+class ImageLoss:
+    """Value and gradient of the image part of eq. 4."""
+
+    def __init__(self, num_threads: int) -> None:
+        self.num_threads = num_threads
+        self._native: Any = native.ImageLoss()
+
+    def evaluate(
+        self, planes: Float32, color: Float32, depth: Float32, weights: LossWeights, out: Float32
+    ) -> LossTerms:
+        """planes (5, H, W), color (3, H, W) in [0, 1], depth (H, W) [m], 0 = none; writes out (5, H, W)."""
+        height, width = depth.shape
+        l1, dssim, error, squared = self._native.evaluate(
+            planes, color, depth, width, height, weights.dssim, weights.color, weights.depth, weights.normalised,
+            out, self.num_threads,
+        )  # fmt: skip
+        return LossTerms(l1=l1, dssim=dssim, depth=error, squared=squared)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimiserSettings:
+    """Learning rates and limits of one step; see `SceneConfig`."""
+
+    lr_center: float
+    lr_log_radius: float
+    lr_color: float
+    lr_logit_opacity: float
+    regulariser: float
+    noise: float
+    min_opacity: float
+    min_radius: float
+    max_radius: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moments:
+    """Adam's state: first and second (N, 8) float32, num_steps (N,) uint32 since a slot was filled."""
+
+    first: Float32
+    second: Float32
+    num_steps: NDArray[np.uint32]
+
+
+def optimiser_step(
+    raster: Rasteriser,
+    gradients: Float32,
+    parameters: Float32,
+    moments: Moments,
+    settings: OptimiserSettings,
+    seed: int,
+) -> None:
+    """One Adam step on parameters (N, 8), in place, for the splats of the prepared view.
+
+    Parameters are centre (3) [m], log radius, colour (3), logit opacity.
+    """
+    values = np.array(
+        [
+            settings.lr_center, settings.lr_log_radius, settings.lr_color, settings.lr_logit_opacity,
+            settings.regulariser, settings.noise, settings.min_opacity, settings.min_radius, settings.max_radius,
+        ]
+    )  # fmt: skip
+    native.optimiser_step(
+        raster.native, gradients, parameters, moments.first, moments.second, moments.num_steps, values, seed,
+        raster.num_threads,
+    )  # fmt: skip
+
+
+def unpack_parameters(parameters: Float32, num_threads: int) -> tuple[Float32, Float32, Float32, Float32]:
+    """centers (N, 3), radii (N,), colors (N, 3), opacities (N,) of parameters (N, 8)."""
+    count = len(parameters)
+    centers, colors = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    radii, opacities = np.empty(count, np.float32), np.empty(count, np.float32)
+    native.unpack_parameters(parameters, centers, radii, colors, opacities, num_threads)
+    return centers, radii, colors, opacities

@@ -1,0 +1,35 @@
+// The image part of the paper's loss (eq. 4): L1 + D-SSIM on colour, L1 on depth; value and gradient together.
+#pragma once
+
+#include <vector>
+
+namespace splatctrl {
+
+struct LossWeights {
+  float dssim;       // lambda: share of D-SSIM in the colour loss
+  float color;       // lambda_color
+  float depth;       // lambda_depth
+  bool normalised;   // compare depth divided by accumulated opacity instead of eq. 3 as printed
+};
+
+struct LossTerms {
+  double l1 = 0.0;     // mean |C - C_gt| over pixels and channels
+  double dssim = 0.0;  // mean 1 - SSIM
+  double depth = 0.0;  // mean |D - D_gt| over pixels with depth [m]
+  double squared = 0.0;  // mean squared colour error, for PSNR
+};
+
+// SSIM with an 11 x 11 Gaussian window of sigma 1.5, zero beyond the border, C1 = 0.01^2, C2 = 0.03^2.
+class ImageLoss {
+ public:
+  // planes (5, H, W) as the rasteriser writes them; color (3, H, W) in [0, 1]; depth (H, W) [m], 0 = none.
+  // Writes plane_gradients (5, H, W).
+  LossTerms evaluate(const float* planes, const float* color, const float* depth, int width, int height,
+                     const LossWeights& weights, float* plane_gradients, int num_threads);
+
+ private:
+  std::vector<float> maps_;  // (3 channels, 3 maps, H, W): dSSIM/d(mean, second moment, cross moment)
+  std::vector<double> rows_; // (H, 4) partial sums
+};
+
+}  // namespace splatctrl

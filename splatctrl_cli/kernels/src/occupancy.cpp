@@ -1,0 +1,137 @@
+#include "occupancy.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <limits>
+
+#include "parallel.h"
+
+namespace splatctrl {
+namespace {
+
+constexpr std::uint8_t kMiss = 1, kHit = 2;
+
+void set_bit(std::uint8_t* voxel, std::uint8_t bit) {
+  if (!(__atomic_load_n(voxel, __ATOMIC_RELAXED) & bit)) __atomic_fetch_or(voxel, bit, __ATOMIC_RELAXED);
+}
+
+std::size_t index_of(const VoxelGrid& grid, const int* cell) {
+  return (static_cast<std::size_t>(cell[0]) * grid.size[1] + cell[1]) * grid.size[2] + cell[2];
+}
+
+// A segment in grid coordinates (voxel units, voxel i spans [i, i + 1)), cut to the grid.
+struct Segment {
+  double from[3], direction[3];
+  double enter = 0.0, leave = 1.0;
+  bool clip(const VoxelGrid& grid) {
+    for (int axis = 0; axis < 3; ++axis) {
+      const double size = grid.size[axis];
+      if (direction[axis] == 0.0) {
+        if (from[axis] < 0.0 || from[axis] >= size) return false;
+        continue;
+      }
+      const double a = -from[axis] / direction[axis], b = (size - from[axis]) / direction[axis];
+      enter = std::max(enter, std::min(a, b));
+      leave = std::min(leave, std::max(a, b));
+    }
+    return enter < leave;
+  }
+};
+
+// Amanatides and Woo's walk: marks every voxel the segment passes, up to but not including the end voxel.
+void walk(const VoxelGrid& grid, const Segment& s, const int* end, std::uint8_t* marks) {
+  int cell[3], step[3];
+  double next[3], delta[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const double start = s.from[axis] + s.enter * s.direction[axis];
+    cell[axis] = std::clamp(static_cast<int>(std::floor(start)), 0, grid.size[axis] - 1);
+    step[axis] = s.direction[axis] > 0.0 ? 1 : -1;
+    if (s.direction[axis] == 0.0) {
+      next[axis] = delta[axis] = std::numeric_limits<double>::infinity();
+    } else {
+      const double border = cell[axis] + (step[axis] > 0 ? 1.0 : 0.0);
+      next[axis] = (border - s.from[axis]) / s.direction[axis];
+      delta[axis] = std::abs(1.0 / s.direction[axis]);
+    }
+  }
+  for (;;) {
+    if (cell[0] == end[0] && cell[1] == end[1] && cell[2] == end[2]) return;
+    set_bit(marks + index_of(grid, cell), kMiss);
+    const int axis = next[0] < next[1] ? (next[0] < next[2] ? 0 : 2) : (next[1] < next[2] ? 1 : 2);
+    if (next[axis] > s.leave) return;
+    cell[axis] += step[axis];
+    if (cell[axis] < 0 || cell[axis] >= grid.size[axis]) return;
+    next[axis] += delta[axis];
+  }
+}
+
+}  // namespace
+
+void integrate_depth(const VoxelGrid& grid, float* log_odds, std::uint16_t* num_updates, std::uint8_t* marks,
+                     const Camera& camera, const double* T, const float* depth, const OccupancySettings& settings,
+                     int num_threads) {
+  const double scale = 1.0 / grid.voxel;
+  double eye[3];
+  for (int axis = 0; axis < 3; ++axis) eye[axis] = (T[4 * axis + 3] - grid.origin[axis]) * scale + 0.5;
+  constexpr int kRows = 8;
+  parallel_for((camera.height + kRows - 1) / kRows, num_threads, [&](int chunk) {
+    for (int v = chunk * kRows; v < std::min(camera.height, (chunk + 1) * kRows); ++v) {
+      for (int u = 0; u < camera.width; ++u) {
+        const double z = depth[static_cast<std::size_t>(v) * camera.width + u];
+        if (!(z > 0.0) || !(z <= settings.max_range)) continue;
+        const double p[3] = {(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z};
+        Segment s;
+        int end[3];
+        bool ends_inside = true;
+        for (int axis = 0; axis < 3; ++axis) {
+          s.from[axis] = eye[axis];
+          s.direction[axis] = (T[4 * axis] * p[0] + T[4 * axis + 1] * p[1] + T[4 * axis + 2] * p[2]) * scale;
+          end[axis] = static_cast<int>(std::floor(s.from[axis] + s.direction[axis]));
+          ends_inside = ends_inside && end[axis] >= 0 && end[axis] < grid.size[axis];
+        }
+        if (ends_inside) set_bit(marks + index_of(grid, end), kHit);
+        if (u % settings.stride == 0 && v % settings.stride == 0 && s.clip(grid)) walk(grid, s, end, marks);
+      }
+    }
+  });
+  const std::size_t slab = static_cast<std::size_t>(grid.size[1]) * grid.size[2];
+  parallel_for(grid.size[0], num_threads, [&](int i) {
+    for (std::size_t k = i * slab; k < (i + 1) * slab; ++k) {
+      if (!marks[k]) continue;
+      const float change = marks[k] & kHit ? settings.hit : settings.miss;
+      log_odds[k] = std::clamp(log_odds[k] + change, -settings.limit, settings.limit);
+      if (num_updates[k] < 65535) ++num_updates[k];
+      marks[k] = 0;
+    }
+  });
+}
+
+void mark_spheres(const VoxelGrid& grid, std::uint8_t* entity, const double* centers, const double* radii,
+                  int num_spheres, std::uint8_t bit, int num_threads) {
+  const double half_diagonal = 0.5 * std::sqrt(3.0) * grid.voxel;
+  parallel_for(num_spheres, num_threads, [&](int sphere) {
+    const double* center = centers + 3 * sphere;
+    const double reach = radii[sphere] + half_diagonal;
+    int low[3], high[3], cell[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      low[axis] = std::max(0, static_cast<int>(std::ceil((center[axis] - reach - grid.origin[axis]) / grid.voxel)));
+      high[axis] = std::min(grid.size[axis] - 1,
+                            static_cast<int>(std::floor((center[axis] + reach - grid.origin[axis]) / grid.voxel)));
+    }
+    for (cell[0] = low[0]; cell[0] <= high[0]; ++cell[0]) {
+      for (cell[1] = low[1]; cell[1] <= high[1]; ++cell[1]) {
+        for (cell[2] = low[2]; cell[2] <= high[2]; ++cell[2]) {
+          double squared = 0.0;
+          for (int axis = 0; axis < 3; ++axis) {
+            const double d = grid.origin[axis] + grid.voxel * cell[axis] - center[axis];
+            squared += d * d;
+          }
+          if (squared <= reach * reach) set_bit(entity + index_of(grid, cell), bit);
+        }
+      }
+    }
+  });
+}
+
+}  // namespace splatctrl

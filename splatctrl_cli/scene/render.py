@@ -1,0 +1,52 @@
+"""Renders a splat set from a camera: eq. 1 to 3 of the paper."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.kernels import num_threads
+from splatctrl_cli.kernels.raster import Rasteriser, pack_camera
+from splatctrl_cli.records import Float32, Float64, Intrinsics, SplatSet
+
+OPAQUE_ENOUGH = 0.5  # accumulated opacity from which a pixel has a depth of its own
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendering:
+    """One view: color (H, W, 3) float32, depth (H, W) float32 [m] as eq. 3 blends it, opacity (H, W) float32."""
+
+    color: Float32
+    depth: Float32
+    opacity: Float32
+
+    def normalised_depth(self) -> Float32:
+        """Depth divided by accumulated opacity (H, W) [m]; 0 where the opacity is below one half."""
+        return normalised_depth(self.depth, self.opacity)
+
+
+def normalised_depth(depth: Float32, opacity: Float32) -> Float32:
+    """depth / opacity (H, W) [m] where opacity >= 0.5, else 0."""
+    is_opaque = opacity >= OPAQUE_ENOUGH
+    return np.where(is_opaque, depth / np.where(is_opaque, opacity, 1.0), 0.0).astype(np.float32)
+
+
+def camera_array(intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:
+    """The (18,) float64 camera that the kernels take."""
+    k = intrinsics
+    return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, invert_transform(T_world_camera))
+
+
+def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0) -> Rendering:
+    """Render `splats` from a pinhole camera at T_world_camera (4, 4); black where nothing is."""
+    raster = Rasteriser(num_threads(threads))
+    raster.prepare(
+        camera_array(intrinsics, T_world_camera),
+        np.ascontiguousarray(splats.centers, np.float32),
+        np.ascontiguousarray(splats.radii, np.float32),
+        np.ascontiguousarray(splats.opacities, np.float32),
+        np.ascontiguousarray(splats.colors, np.float32),
+    )
+    planes = raster.forward()
+    color = np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2))
+    return Rendering(color=color, depth=planes[3].copy(), opacity=planes[4].copy())
