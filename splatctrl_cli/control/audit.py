@@ -1,0 +1,146 @@
+"""The clearance of logged joint states: what each field says of every state, and how much of it is known space."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.barriers import pair_distance
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import DistanceField, Float64, JointState
+
+Stamps = NDArray[np.int64]
+Channel = NDArray[np.uint8]
+
+FieldsAt = Callable[[int], Mapping[str, DistanceField]]
+"""The fields known at a stamp [ns], by name; the same object for the same scene, so that states share a query."""
+
+Observed = Callable[[Float64], Channel]
+"""points (Q, 3) [m], world -> the observed channel (Q,) uint8: 0 = never seen."""
+
+CHUNK = 256  # states per field query
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clearance:
+    """distance (T,) [m] of the nearest moving sphere's surface, NaN where the field has none; sphere (T,) its index.
+
+    For self-collision, of the nearest pair; sphere is then the pair's index, -1 without pairs.
+    """
+
+    distance: Float64
+    sphere: NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditTrace:
+    """T states: stamp_ns (T,), position (T, J) [rad], clearance by field name, limit_margin (T,) [rad] to the nearest
+    position limit (negative outside) at limit_joint (T,), self_clearance (T,) [m] (inf without pairs) at self_pair
+    (T,), unknown_share (T,) of sphere centres in never-seen space (NaN where nobody asked).
+    """
+
+    stamp_ns: Stamps
+    position: Float64
+    clearance: Mapping[str, Clearance]
+    limit_margin: Float64
+    limit_joint: NDArray[np.int64]
+    self_clearance: Float64
+    self_pair: NDArray[np.int64]
+    unknown_share: Float64
+
+
+def checked_states(model: ArmModel, states: Sequence[JointState]) -> tuple[Stamps, Float64]:
+    """Stamps (T,) [ns] and positions (T, J) [rad] of states in the model's joint order.
+
+    Raises InputError when there are none, a state is not finite or has other joints, or the stamps go back.
+    """
+    if not states:
+        raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
+    J = len(model.joint_names)
+    for index, state in enumerate(states):
+        if np.shape(state.position) != (J,):
+            raise InputError(f"joint state {index}: expected {J} joints, got {np.size(state.position)}")
+    stamps = np.array([state.stamp_ns for state in states], dtype=np.int64)
+    positions = np.array([state.position for state in states], dtype=np.float64)
+    if np.any(np.diff(stamps) < 0):
+        index = int(np.argmax(np.diff(stamps) < 0)) + 1
+        raise InputError(
+            f"joint state {index}: expected a stamp not before {stamps[index - 1]} ns, got {stamps[index]} ns",
+            remedy="sort the states by stamp",
+        )
+    if not np.all(np.isfinite(positions)):
+        index, joint = (int(i[0]) for i in np.nonzero(~np.isfinite(positions)))
+        raise InputError(
+            f"joint state {index}: joint {model.joint_names[joint]} is {positions[index, joint]}, "
+            "expected a finite angle"
+        )
+    return stamps, positions
+
+
+def moving_clearance(model: ArmModel, centers: Float64, field: DistanceField) -> Clearance:
+    """The smallest sphere clearance of every state, from the centres (T, S, 3) [m] of all spheres."""
+    moving = np.flatnonzero(model.moving_spheres)
+    points = np.ascontiguousarray(centers[:, moving].reshape(-1, 3))
+    distance = field.query(points)[0].reshape(len(centers), len(moving)) - model.sphere_set.radii[moving]
+    nearest = np.argmin(distance, axis=1)
+    return Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=moving[nearest])
+
+
+def audit(
+    model: ArmModel, states: Sequence[JointState], fields_at: FieldsAt, *, observed: Observed | None = None
+) -> AuditTrace:
+    """The clearances of every logged state, each by the fields that were known at its stamp."""
+    stamps, positions = checked_states(model, states)
+    parts: dict[str, list[Clearance]] = {}
+    self_parts, unknown_parts = [], []
+    for first, last in _runs(stamps, fields_at):
+        centers = model.sphere_centers_batch(positions[first:last])
+        for name, field in fields_at(int(stamps[first])).items():
+            parts.setdefault(name, []).append(moving_clearance(model, centers, field))
+        self_parts.append(_self_clearance(model, centers))
+        unknown_parts.append(_unknown_share(model, centers, observed))
+    limit = np.minimum(model.upper - positions, positions - model.lower)
+    return AuditTrace(
+        stamp_ns=stamps,
+        position=positions,
+        clearance={name: _joined(several) for name, several in parts.items()},
+        limit_margin=limit.min(axis=1),
+        limit_joint=limit.argmin(axis=1),
+        self_clearance=_joined(self_parts).distance,
+        self_pair=_joined(self_parts).sphere,
+        unknown_share=np.concatenate(unknown_parts),
+    )
+
+
+def _runs(stamps: Stamps, fields_at: FieldsAt) -> list[tuple[int, int]]:
+    """Ranges of at most CHUNK consecutive states that see the same fields."""
+    known = [fields_at(int(stamp)) for stamp in stamps]
+    starts = [i for i in range(len(stamps)) if i == 0 or known[i] is not known[i - 1]]
+    cuts = [c for a, b in zip(starts, [*starts[1:], len(stamps)], strict=True) for c in range(a, b, CHUNK)]
+    return list(zip(cuts, [*cuts[1:], len(stamps)], strict=True))
+
+
+def _self_clearance(model: ArmModel, centers: Float64) -> Clearance:
+    pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
+    if not len(pairs):
+        nothing = np.full(len(centers), -1, dtype=np.int64)
+        return Clearance(distance=np.full(len(centers), np.inf), sphere=nothing)
+    distance = np.array([pair_distance(c, model.sphere_set.radii, pairs)[0] for c in centers])
+    nearest = distance.argmin(axis=1)
+    return Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=nearest)
+
+
+def _unknown_share(model: ArmModel, centers: Float64, observed: Observed | None) -> Float64:
+    if observed is None:
+        return np.full(len(centers), np.nan)
+    moving = centers[:, np.flatnonzero(model.moving_spheres)]
+    never = observed(np.ascontiguousarray(moving.reshape(-1, 3))) == 0
+    return np.asarray(never.reshape(moving.shape[:2]).mean(axis=1))
+
+
+def _joined(several: list[Clearance]) -> Clearance:
+    return Clearance(
+        distance=np.concatenate([c.distance for c in several]), sphere=np.concatenate([c.sphere for c in several])
+    )
