@@ -1,0 +1,290 @@
+"""Pictures a person can look at: renders beside photos, slices of a distance field, clearance over time.
+
+Matplotlib is imported when a picture is drawn, and drawn through its Figure (Agg): nothing global is touched. Colours
+are those of Okabe and Ito or maps that stay readable without red and green.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.records import DistanceGrid, Float32, Float64, UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDTH = 12.0  # inches; at DPI 100 the width is 1200 pixels
+DPI = 100
+MAX_DEPTH_ERROR = 0.05  # [m] top of the depth error's colour bar
+MAX_DISTANCE = 0.20  # [m] both ends of the distance's colour bar
+CONTOURS = (0.0, 0.02, 0.05, 0.10)  # [m]
+CURVE_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+NEVER_SEEN = 0  # of the grid's `observed` channel
+INK = "#222222"
+SPHERE_FILL, SPHERE_EDGE = "#e69f00b0", "#8a5a00"
+STYLE: Any = {  # matplotlib types its keys as one long literal
+    "font.family": "DejaVu Sans",
+    "font.size": 11,
+    "axes.titlesize": 12,
+    "axes.titlelocation": "left",
+    "axes.edgecolor": "#888888",
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "hatch.linewidth": 0.6,
+    "hatch.color": "#a8a8a8",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonRow:
+    """One view: photo (H, W, 3) uint8, render (H, W, 3) in [0, 1], depths (H, W) [m], 0 = none.
+
+    `title` names the view, `figures` is a few words on how good the render is.
+    """
+
+    title: str
+    figures: str = ""
+    photo: UInt8
+    render: Float32
+    photo_depth: Float32
+    render_depth: Float32
+
+
+def comparison_picture(path: Path, rows: Sequence[ComparisonRow]) -> None:
+    """Write photo | render | depth error [cm], one row per view."""
+    if not rows:
+        raise NotEvaluableError(f"{path}: no view to draw: expected at least one, got 0")
+    height, width = rows[0].photo.shape[:2]
+    row_height = (WIDTH - 1.2) / 3 * height / width + 0.42
+    with _figure(len(rows) * row_height + 0.15) as figure:
+        grid = figure.subplots(
+            len(rows), 4, squeeze=False, gridspec_kw={"width_ratios": [1, 1, 1, 0.035], "wspace": 0.04}
+        )
+        for row, axes in zip(rows, grid, strict=True):
+            _draw_comparison(figure, axes, row)
+        _save(figure, path)
+
+
+def field_slice_picture(
+    path: Path,
+    grid: DistanceGrid,
+    axis: int,
+    value: float,
+    spheres: tuple[Float64, Float64] | None = None,
+    title: str = "",
+) -> None:
+    """Write a slice of the grid's `sdf` channel across `axis` (0, 1, 2 = x, y, z) nearest to `value` [m].
+
+    Contour lines at 0, 2, 5 and 10 cm; never-seen space is hatched; `spheres` (centres (S, 3), radii (S,)) [m] that
+    the plane cuts are drawn as the circles of the cut. Raises NotEvaluableError where the plane misses the grid.
+    """
+    index = round((value - grid.origin[axis]) / grid.voxel)
+    count = grid.channels["sdf"].shape[axis]
+    if not 0 <= index < count:
+        last = grid.origin[axis] + grid.voxel * (count - 1)
+        raise NotEvaluableError(
+            f"{path}: slice {'xyz'[axis]} = {value:g} m: expected {grid.origin[axis]:.3f} to {last:.3f} m"
+        )
+    first, second = (other for other in range(3) if other != axis)
+    plane = float(grid.origin[axis] + grid.voxel * index)
+    distance = np.take(grid.channels["sdf"], index, axis=axis).astype(np.float64).T
+    coordinates = [grid.origin[i] + grid.voxel * np.arange(grid.channels["sdf"].shape[i]) for i in (first, second)]
+    spans = [float(np.ptp(c)) + grid.voxel for c in coordinates]
+    height = float(np.clip((WIDTH - 2.6) * spans[1] / spans[0] + 1.5, 4.5, 12.0))
+    with _figure(height) as figure:
+        axes = figure.subplots()
+        _draw_distance(figure, axes, coordinates, distance, grid.voxel)
+        if "observed" in grid.channels:
+            never_seen = np.take(grid.channels["observed"], index, axis=axis).T == NEVER_SEEN
+            _hatch(axes, coordinates, never_seen, grid.voxel)
+        if spheres is not None:
+            _draw_cut_spheres(axes, spheres, axis, plane)
+        _explain(axes, has_spheres=spheres is not None, has_observed="observed" in grid.channels)
+        axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]", aspect="equal")
+        axes.set_title(f"{title or 'Distance field'}   {'xyz'[axis]} = {plane:.2f} m", pad=12)
+        _save(figure, path)
+
+
+def clearance_picture(
+    path: Path,
+    seconds: Float64,
+    curves: Mapping[str, NDArray[np.floating]],
+    margin: float,
+    title: str = "Clearance",
+    *,
+    events: Mapping[str, float] | None = None,
+) -> None:
+    """Write clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] as a line.
+
+    Gaps (nan) stay gaps; below the margin is shaded, and each curve's smallest value is marked. `events` are named
+    moments [s], drawn as thin vertical lines.
+    """
+    with _figure(5.2) as figure:
+        axes = figure.subplots()
+        lowest = 0.0
+        for color, (name, values) in zip(cycle(CURVE_COLORS), curves.items(), strict=False):
+            centimetres = 100.0 * np.asarray(values, dtype=np.float64)
+            if not np.isfinite(centimetres).any():
+                axes.plot([], [], color=color, label=f"{name}  no value")
+                continue
+            at = int(np.nanargmin(centimetres))
+            lowest = min(lowest, float(centimetres[at]))
+            axes.plot(seconds, centimetres, color=color, linewidth=1.8, label=f"{name}  min {centimetres[at]:.1f} cm")
+            axes.plot(
+                seconds[at], centimetres[at], "o", color=color, markersize=7, markeredgecolor="white", clip_on=False
+            )
+        bottom = lowest * 1.15 - 0.2 if lowest < 0 else 0.0
+        axes.axhspan(bottom, 100 * margin, color="#000000", alpha=0.06, linewidth=0)
+        axes.axhline(100 * margin, color=INK, linewidth=1.2, linestyle=(0, (6, 3)))
+        axes.annotate(
+            f"margin {100 * margin:g} cm",
+            (1.0, 100 * margin),
+            xycoords=("axes fraction", "data"),
+            xytext=(6, 0),
+            textcoords="offset points",
+            va="center",
+            color=INK,
+            annotation_clip=False,
+        )
+        for name, moment in (events or {}).items():
+            axes.axvline(moment, color="#888888", linewidth=0.8)
+            axes.annotate(
+                name,
+                (moment, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(4, -4),
+                textcoords="offset points",
+                va="top",
+                color="#555555",
+                fontsize=10,
+            )
+        axes.set(xlabel="time [s]", ylabel="clearance [cm]", xlim=(float(seconds[0]), float(seconds[-1])))
+        axes.set_ylim(bottom=bottom)
+        axes.set_title(title, pad=12)
+        axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(len(curves), 3))
+        _save(figure, path)
+
+
+@contextmanager
+def _figure(height: float) -> Iterator["Figure"]:
+    """A figure of the house style, 1200 pixels wide."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08))
+        FigureCanvasAgg(figure)
+        yield figure
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": "splatctrl"})
+
+
+def _draw_comparison(figure: "Figure", axes: Sequence[Any], row: ComparisonRow) -> None:
+    photo, render, error, bar = axes
+    photo.imshow(row.photo, interpolation="nearest")
+    render.imshow(np.clip(row.render, 0.0, 1.0), interpolation="nearest")
+    both = (row.photo_depth > 0) & (row.render_depth > 0)
+    centimetres = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
+    error.set_facecolor("#d9d9d9")
+    image = error.imshow(centimetres, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_DEPTH_ERROR, interpolation="nearest")
+    figure.colorbar(image, cax=bar, extend="max")
+    median = f"median {np.nanmedian(centimetres):.2f} cm" if both.any() else "no pixel has both depths"
+    titles = (f"photo   {row.title}", f"render   {row.figures}", f"depth error [cm]   {median}, grey: no depth")
+    for panel, text in zip((photo, render, error), titles, strict=True):
+        panel.set_title(text, fontsize=10, pad=5)
+        panel.set(xticks=[], yticks=[])
+        panel.spines[:].set_visible(False)
+
+
+def _draw_distance(
+    figure: "Figure", axes: Any, coordinates: Sequence[Float64], distance: Float64, voxel: float
+) -> None:
+    """The distance as colour, [cm], and its contour lines."""
+    finite = distance[np.isfinite(distance)]
+    limit = 100.0 * MAX_DISTANCE
+    image = axes.imshow(
+        100.0 * distance,
+        origin="lower",
+        extent=_extent(coordinates, voxel),
+        cmap=_pale_red_to_blue(),
+        vmin=-limit,
+        vmax=limit,
+        interpolation="nearest",
+    )
+    figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
+    with_lines = [level for level in CONTOURS if finite.size and finite.min() < level < finite.max()]
+    if with_lines and min(distance.shape) > 1:
+        lines = axes.contour(
+            *coordinates,
+            distance,
+            levels=with_lines,
+            colors=INK,
+            linewidths=[2.0 if level == 0 else 1.0 for level in with_lines],
+            linestyles="solid",
+        )
+        axes.clabel(lines, fmt=lambda level: f"{100 * level:g} cm", fontsize=9)
+
+
+def _pale_red_to_blue() -> Any:
+    """Red inside, blue outside, white on the surface, pale enough for lines and circles on top."""
+    from matplotlib import colormaps
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("pale_red_blue", colormaps["RdBu"](np.linspace(0.18, 0.80, 63)))
+
+
+def _hatch(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
+    if not never_seen.any():
+        return
+    veil = np.zeros((*never_seen.shape, 4))
+    veil[never_seen] = (0.93, 0.93, 0.93, 0.72)
+    axes.imshow(veil, origin="lower", extent=_extent(coordinates, voxel), interpolation="nearest")
+    if min(never_seen.shape) > 1:
+        axes.contourf(*coordinates, never_seen.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+
+
+def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
+    """A legend under the picture for what has no axis of its own."""
+    from matplotlib.patches import Patch
+
+    entries = []
+    if has_spheres:
+        entries.append(Patch(facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, label="robot spheres, cut by the plane"))
+    if has_observed:
+        entries.append(Patch(facecolor="#eeeeee", edgecolor="#a8a8a8", hatch="////", label="never seen"))
+    if entries:
+        axes.legend(handles=entries, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2)
+
+
+def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, plane: float) -> None:
+    """The circles in which the plane cuts the spheres."""
+    from matplotlib.patches import Circle
+
+    centers, radii = spheres
+    first, second = (other for other in range(3) if other != axis)
+    squared = np.square(radii) - np.square(centers[:, axis] - plane)
+    for center, cut in zip(centers[squared > 0], np.sqrt(squared[squared > 0]), strict=True):
+        axes.add_patch(
+            Circle((center[first], center[second]), cut, facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, linewidth=1.2)
+        )
+
+
+def _extent(coordinates: Sequence[Float64], voxel: float) -> tuple[float, float, float, float]:
+    (left, right), (bottom, top) = ((c[0] - voxel / 2, c[-1] + voxel / 2) for c in coordinates)
+    return float(left), float(right), float(bottom), float(top)

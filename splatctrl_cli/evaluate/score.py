@@ -1,0 +1,111 @@
+"""Scores of rendered views against recorded ones, over all pixels and over those that a training camera saw."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, psnr, ssim_map
+from splatctrl_cli.records import Bool, Float32, RgbdFrame
+
+PROTOCOL = {
+    "average": "mean over views of each view's own figure; a view without a pixel of the region is left out",
+    "all": "every pixel of the view",
+    "seen": "pixels whose reference depth, back-projected, lies within 2 cm of a depth that the newest frame of some "
+    "training camera measured (any training frame where the recording has no clock)",
+    "mask": "only pixels of the region enter a sum or a share; nothing is zero-filled",
+    "psnr": "-10 log10(mean squared error over pixels and RGB), colours in [0, 1], render clipped to [0, 1]",
+    "ssim": "11x11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, border mirrored, mean of the map over "
+    "pixels of the region and RGB",
+    "depth": "absolute difference of the normalised depth (blended depth / accumulated opacity, where that opacity "
+    "is at least 0.5) and the reference depth, over pixels of the region that have both [m]; depth_coverage is their "
+    "share of the region's pixels that have a reference depth",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionScore:
+    """Figures over one region of a view: `share` of the view's pixels; psnr [dB]; nan where the region is empty."""
+
+    share: float
+    psnr: float
+    ssim: float
+    depth: DepthErrors
+    depth_coverage: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewScore:
+    """One view: `valid_share` of its pixels have a reference depth; `all` and `seen` are its regions."""
+
+    view: str
+    camera: str
+    stamp_ns: int
+    valid_share: float
+    seen: RegionScore
+    all: RegionScore
+
+    def figures(self) -> dict[str, float]:
+        """The view's figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
+        figures = {"valid_share": self.valid_share, "seen_share": self.seen.share}
+        for name, region in (("seen", self.seen), ("all", self.all)):
+            figures |= {f"psnr_{name}": region.psnr, f"ssim_{name}": region.ssim}
+            depth = asdict(region.depth)
+            figures[f"depth_pixels_{name}"] = depth.pop("num_pixels")
+            figures |= {f"depth_{key}_{name}": value for key, value in depth.items()}
+            figures[f"depth_coverage_{name}"] = region.depth_coverage
+        return figures
+
+
+def score_view(*, view: str, color: Float32, depth: Float32, frame: RgbdFrame, seen: Bool) -> ViewScore:
+    """The scores of a rendering against `frame`.
+
+    color (H, W, 3) in [0, 1], depth (H, W) [m] normalised by accumulated opacity, 0 = none; seen (H, W): pixels
+    that a training camera saw. `PROTOCOL` says what each figure means.
+    """
+    rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
+    photo = frame.color.astype(np.float64) / 255.0
+    similarity = ssim_map(rendered, photo).mean(axis=-1)
+
+    def score_region(mask: Bool) -> RegionScore:
+        errors = depth_errors(depth, frame.depth, mask)
+        num_reference = int(np.count_nonzero(mask & (frame.depth > 0)))
+        return RegionScore(
+            share=float(mask.mean()),
+            psnr=psnr(rendered, photo, mask),
+            ssim=float(similarity[mask].mean()) if mask.any() else math.nan,
+            depth=errors,
+            depth_coverage=errors.num_pixels / num_reference if num_reference else math.nan,
+        )
+
+    return ViewScore(
+        view=view,
+        camera=frame.camera,
+        stamp_ns=frame.stamp_ns,
+        valid_share=float(np.mean(frame.depth > 0)),
+        seen=score_region(seen),
+        all=score_region(np.ones(frame.depth.shape, dtype=np.bool_)),
+    )
+
+
+def total_score(views: Sequence[ViewScore]) -> dict[str, float]:
+    """Each figure's mean over the views that have it, by name; nan where no view has.
+
+    Raises NotEvaluableError when there is no view.
+    """
+    if not views:
+        raise NotEvaluableError("no view was scored: expected at least one, got 0")
+    rows = [view.figures() for view in views]
+    totals: dict[str, float] = {"num_views": len(views)}
+    for name in rows[0]:
+        values = [row[name] for row in rows if not math.isnan(row[name])]
+        totals[name] = float(np.mean(values)) if values else math.nan
+    return totals
+
+
+def as_json(figures: dict[str, float]) -> dict[str, Any]:
+    """The same figures with None for what is not a finite number, which JSON cannot hold."""
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}

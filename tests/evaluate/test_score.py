@@ -1,0 +1,117 @@
+"""View scores with known answers, and how they are averaged."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.evaluate.score import PROTOCOL, ViewScore, as_json, score_view, total_score
+from splatctrl_cli.records import Bool, Float32, Intrinsics, RgbdFrame
+
+H, W = 20, 30
+NONE = np.zeros((H, W), dtype=bool)
+
+
+def left_half() -> Bool:
+    mask = NONE.copy()
+    mask[:, : W // 2] = True
+    return mask
+
+
+def photo() -> RgbdFrame:
+    color = np.random.default_rng(0).integers(51, 153, (H, W, 3)).astype(np.uint8)
+    depth = np.full((H, W), 1.0, np.float32)
+    depth[:5] = 0.0
+    return RgbdFrame(
+        stamp_ns=7,
+        camera="cam3",
+        color=color,
+        depth=depth,
+        intrinsics=Intrinsics(fx=30.0, fy=30.0, cx=14.5, cy=9.5, width=W, height=H),
+        T_world_camera=np.eye(4),
+    )
+
+
+def perfect() -> Float32:
+    return (photo().color / 255.0).astype(np.float32)
+
+
+def score(color: Float32, depth: Float32, seen: Bool) -> ViewScore:
+    return score_view(view="cam3-0000", color=color, depth=depth, frame=photo(), seen=seen)
+
+
+def test_regions_are_scored_apart_and_none_is_zero_filled() -> None:
+    color, depth = perfect(), np.full((H, W), 1.004, np.float32)
+    color[left_half()] += 0.1
+    color[~left_half()] += 0.2
+    depth[~left_half()] = 1.03
+    result = score(color, depth, left_half() & (photo().depth > 0))
+    assert result.seen.psnr == pytest.approx(20.0, abs=1e-3)
+    assert result.all.psnr == pytest.approx(-10 * math.log10((0.01 + 0.04) / 2), abs=1e-3)
+    assert result.seen.depth.median == pytest.approx(0.004, abs=1e-6)
+    assert result.all.depth.mean == pytest.approx(0.017, abs=1e-6)
+    assert result.all.depth.within_1cm == 0.5
+    assert result.valid_share == 0.75
+    assert result.seen.share == 0.375
+    assert result.all.share == 1.0
+
+
+def test_pixels_without_reference_depth_count_for_colour_but_not_for_depth() -> None:
+    color, depth = perfect(), np.full((H, W), 1.0, np.float32)
+    color[:5] += 0.1
+    depth[:5] = 9.0
+    result = score(color, depth, NONE)
+    assert result.all.psnr == pytest.approx(20.0 + 10 * math.log10(4), abs=1e-3)
+    assert result.all.depth.num_pixels == 15 * W
+    assert result.all.depth.median == 0.0
+
+
+def test_holes_in_the_render_lower_the_depth_coverage_and_nothing_else_of_depth() -> None:
+    depth = np.full((H, W), 1.0, np.float32)
+    depth[:, :3] = 0.0
+    result = score(perfect(), depth, photo().depth > 0)
+    assert result.seen.depth_coverage == pytest.approx(0.9)
+    assert result.seen.depth.mean == 0.0
+
+
+def test_a_render_beyond_0_to_1_is_scored_as_a_screen_shows_it() -> None:
+    white = replace(photo(), color=np.full((H, W, 3), 255, np.uint8))
+    color = np.full((H, W, 3), 1.5, np.float32)
+    result = score_view(view="v", color=color, depth=white.depth, frame=white, seen=NONE)
+    assert result.all.psnr == math.inf
+    assert result.all.ssim == pytest.approx(1.0)
+
+
+def test_an_empty_region_has_no_figures_and_is_left_out_of_the_mean() -> None:
+    depth = np.full((H, W), 1.0, np.float32)
+    blind = score(perfect() + np.float32(0.1), depth, NONE)
+    sharp = score(perfect() + np.float32(0.1), depth, ~NONE)
+    assert math.isnan(blind.seen.psnr)
+    assert math.isnan(blind.seen.ssim)
+    totals = total_score([blind, sharp])
+    assert totals["psnr_seen"] == pytest.approx(20.0, abs=1e-3)
+    assert totals["seen_share"] == 0.5
+    assert totals["num_views"] == 2
+
+
+def test_totals_are_means_over_views() -> None:
+    depth = np.full((H, W), 1.0, np.float32)
+    views = [score(perfect() + np.float32(offset), depth + np.float32(offset / 10), ~NONE) for offset in (0.1, 0.01)]
+    totals = total_score(views)
+    assert totals["psnr_all"] == pytest.approx((20.0 + 40.0) / 2, abs=1e-2)
+    assert totals["depth_median_all"] == pytest.approx((0.01 + 0.001) / 2, abs=1e-6)
+
+
+def test_totals_of_no_view_cannot_be_evaluated() -> None:
+    with pytest.raises(NotEvaluableError, match="no view was scored"):
+        total_score([])
+
+
+def test_json_holds_none_for_what_is_no_number() -> None:
+    assert as_json({"a": math.nan, "b": math.inf, "c": 1.5}) == {"a": None, "b": None, "c": 1.5}
+
+
+def test_the_protocol_names_every_kind_of_figure() -> None:
+    assert {"average", "all", "seen", "mask", "psnr", "ssim", "depth"} <= set(PROTOCOL)
