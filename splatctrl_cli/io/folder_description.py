@@ -1,0 +1,195 @@
+"""The TOML file that describes a folder of colour and depth images (docs/input.md)."""
+
+import difflib
+import tomllib
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.poses import AXES, CONVENTIONS, FORMATS
+from splatctrl_cli.records import Float64, Intrinsics
+
+DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraTable:
+    """``[camera]`` or ``[depth_camera]``; pixel_center is the coordinate of the first pixel's centre (0 or 0.5)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    pixel_center: float = 0.0
+    name: str = "camera"
+    distortion: list[float] = field(default_factory=list)
+    distortion_model: str = "plumb_bob"
+    depth_to_color: list[list[float]] = field(default_factory=list)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """With pixel (0, 0) centred at u = v = 0."""
+        return Intrinsics(
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx - self.pixel_center,
+            cy=self.cy - self.pixel_center,
+            width=self.width,
+            height=self.height,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesTable:
+    """``[frames]``: globs with one ``*``; colour and depth with the same text for it belong together."""
+
+    color: str
+    depth: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthTable:
+    """``[depth]``: how depth is stored, and metres per count."""
+
+    encoding: str = "uint16"
+    scale: float = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosesTable:
+    """``[poses]``; heading selects the blocks of `matrix-blocks`."""
+
+    format: str
+    file: str
+    convention: str = "camera_to_world"
+    axes: str = "opencv"
+    heading: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StampsTable:
+    """``[stamps]``: rate [1/s] of the frame numbers, or `names`: file names are seconds."""
+
+    rate: float | None = None
+    names: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitTable:
+    """``[split]``: frames (position or name) that become camera `holdout`."""
+
+    holdout: list[int | str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """A whole description; camera and frames may be left to a transforms.json."""
+
+    path: Path
+    root: Path
+    poses: PosesTable
+    camera: CameraTable | None
+    depth_camera: CameraTable | None
+    frames: FramesTable | None
+    depth: DepthTable
+    stamps: StampsTable
+    split: SplitTable
+
+    @property
+    def T_color_depth(self) -> Float64:
+        """``depth_to_color`` (4, 4): maps depth-camera to colour-camera coordinates."""
+        rows = self.depth_camera.depth_to_color if self.depth_camera is not None else []
+        matrix = np.array(rows, dtype=np.float64) if rows else np.eye(4)
+        if matrix.shape != (4, 4):
+            raise InputError(f"{self.path}: depth_camera.depth_to_color: expected a 4x4 matrix, got {matrix.shape}")
+        return matrix
+
+
+T = TypeVar("T")
+
+
+def read_description(path: Path, root: Path | None = None) -> Description:
+    """Parse a description. Raises InputError naming the key that is unknown, missing or wrong."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not TOML: {error}", remedy="see docs/input.md") from None
+    known = {f.name for f in fields(Description)} - {"path"}
+    _check_keys(content, known, str(path), "")
+    folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
+    if not folder.is_dir():
+        raise InputError(f"{path}: root {folder}: no such folder", remedy="correct `root`, or give --root")
+    description = Description(
+        path=path,
+        root=folder,
+        poses=_required(PosesTable, content, "poses", path),
+        camera=_optional(CameraTable, content, "camera", path),
+        depth_camera=_optional(CameraTable, content, "depth_camera", path),
+        frames=_optional(FramesTable, content, "frames", path),
+        depth=_optional(DepthTable, content, "depth", path) or DepthTable(),
+        stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
+        split=_optional(SplitTable, content, "split", path) or SplitTable(),
+    )
+    _check_choice(path, "poses.format", description.poses.format, FORMATS)
+    _check_choice(path, "poses.convention", description.poses.convention, CONVENTIONS)
+    _check_choice(path, "poses.axes", description.poses.axes, AXES)
+    _check_choice(path, "depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    if description.poses.format != "nerfstudio":
+        for name in ("camera", "frames"):
+            if getattr(description, name) is None:
+                raise InputError(f"{path}: [{name}] is missing", remedy="see docs/input.md")
+    return description
+
+
+def _required(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T:
+    table = _optional(kind, content, name, path)
+    if table is None:
+        raise InputError(f"{path}: [{name}] is missing", remedy="see docs/input.md")
+    return table
+
+
+def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T | None:
+    if name not in content:
+        return None
+    table = content[name]
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: {name}: expected a table [{name}], got {table!r}")
+    declared = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
+    _check_keys(table, set(declared), str(path), f"{name}.")
+    for key, f in declared.items():
+        if key not in table and f.default is MISSING and f.default_factory is MISSING:
+            raise InputError(f"{path}: {name}.{key} is missing", remedy="see docs/input.md")
+    values = {key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()}
+    return kind(**values)
+
+
+def _typed(value: Any, hint: Any, where: str) -> Any:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    good = {
+        int: isinstance(value, int) and is_number,
+        float: is_number,
+        str: isinstance(value, str),
+        bool: isinstance(value, bool),
+        float | None: is_number,
+    }.get(hint, isinstance(value, list))
+    if not good:
+        raise InputError(f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
+    return float(value) if hint in (float, float | None) else value
+
+
+def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str) -> None:
+    for key in table:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
+            remedy = f"did you mean {prefix}{near[0]}?" if near else f"known here: {', '.join(sorted(known))}"
+            raise InputError(f"{where}: unknown key {prefix}{key}", remedy=remedy)
+
+
+def _check_choice(path: Path, key: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise InputError(f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}")

@@ -1,0 +1,123 @@
+"""Camera poses from text and JSON files, as T_world_camera of optical cameras (z forward)."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import invert_transform, transform_from
+from splatctrl_cli.records import Float64
+
+FORMATS = ("matrix-blocks", "trajectory-log", "tum", "nerfstudio", "matrix-files")
+CONVENTIONS = ("camera_to_world", "world_to_camera")
+AXES = ("opencv", "opengl")
+OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
+
+
+def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
+    """T_world_camera (4, 4), optical, of a matrix as written in a file.
+
+    The rotation is replaced by the nearest one, which undoes the rounding of text; raises InputError where it is
+    none (scale, shear, mirror, NaN).
+    """
+    if not np.isfinite(matrix).all() or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
+        raise InputError(f"{where}: expected a rigid transform, got one with scale, shear or NaN")
+    U, _, Vt = np.linalg.svd(matrix[:3, :3])
+    if np.linalg.det(U @ Vt) < 0:
+        raise InputError(f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes")
+    T = np.eye(4)
+    T[:3, :3] = U @ Vt
+    T[:3, 3] = matrix[:3, 3]
+    if convention == "world_to_camera":
+        T = invert_transform(T)
+    return T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+
+
+def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:
+    """4x4 blocks under ``# heading ... NUMBER`` lines, by that number; other headings are passed over."""
+    poses: dict[str, Float64] = {}
+    lines = _lines(path)
+    for index, line in enumerate(lines):
+        number = re.search(r"(\d+)\s*$", line)
+        if line.startswith("#") and heading in line and number:
+            poses[str(int(number[1]))] = _matrix(lines[index + 1 : index + 5], f"{path}:{index + 2}")
+    return poses
+
+
+def read_trajectory_log(path: Path) -> dict[str, Float64]:
+    """Open3D's .log: a line of three numbers, the first of which is the frame's, then a 4x4 matrix."""
+    poses: dict[str, Float64] = {}
+    lines = [line for line in _lines(path) if line]
+    for index in range(0, len(lines), 5):
+        where = f"{path}: pose {index // 5}"
+        head = lines[index].split()
+        if len(head) != 3 or not head[0].isdigit():
+            raise InputError(f"{where}: expected three integers, got {lines[index]!r}")
+        poses[str(int(head[0]))] = _matrix(lines[index + 1 : index + 5], where)
+    return poses
+
+
+def read_tum(path: Path) -> dict[str, Float64]:
+    """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written."""
+    poses: dict[str, Float64] = {}
+    for index, line in enumerate(_lines(path)):
+        if line and not line.startswith("#"):
+            words = line.split()
+            values = _numbers(words, f"{path}:{index + 1}")
+            if len(values) != 8 or np.linalg.norm(values[4:]) == 0:
+                raise InputError(f"{path}:{index + 1}: expected 'stamp tx ty tz qx qy qz qw', got {line!r}")
+            poses[words[0]] = transform_from(values[1:4], values[4:8])
+    return poses
+
+
+def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
+    """The whole transforms.json, and its matrices by file_path."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a transforms.json: {error}") from None
+    for name, matrix in matrices.items():
+        if matrix.shape != (4, 4):
+            raise InputError(f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}")
+    return content, matrices
+
+
+def read_matrix_file(path: Path) -> Float64:
+    """A 4x4 matrix alone in a text file."""
+    return _matrix([line for line in _lines(path) if line and not line.startswith("#")][:4], str(path))
+
+
+READERS: dict[str, Callable[[Path], dict[str, Float64]]] = {
+    "trajectory-log": read_trajectory_log,
+    "tum": read_tum,
+    "nerfstudio": lambda path: read_nerfstudio(path)[1],
+}
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}", remedy="check [poses] file and root") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file", remedy="check [poses] file") from None
+
+
+def _matrix(lines: list[str], where: str) -> Float64:
+    rows = [_numbers(line.split(), where) for line in lines]
+    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+        raise InputError(f"{where}: expected a 4x4 matrix")
+    return np.array(rows)
+
+
+def _numbers(words: list[str], where: str) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise InputError(f"{where}: expected numbers, got {' '.join(words)!r}") from None
