@@ -18,23 +18,32 @@ class SceneConfig:
 
     max_splats: int = 5000  # IV-C
     initial_opacity: float = 0.5  # III-C
+    min_radius: float = 0.002  # [m]
     max_radius: float = 0.02  # [m] r_max; the paper gives none, one voxel
     lambda_dssim: float = 0.2  # III-C, eq. 4
     lambda_color: float = 1.0
     lambda_depth: float = 1.0
     lambda_reg: float = 0.02
+    depth_loss: str = "printed"  # eq. 3 as printed, or "normalised" by accumulated opacity
     lambda_mde: float = 50.0  # III-C eq. 5 gives none; its source (SplaTAM) uses 50
     min_depth_error: float = 0.02  # [m] floor of lambda_mde * MDE, so that a perfect map is not re-seeded
+    max_depth_error: float = 0.04  # [m] ceiling of it: above, a box on a table would never be added
     hole_opacity: float = 0.5  # accumulated opacity below which a pixel is a hole in the map
     min_opacity: float = 0.1  # III-C, alpha_min
-    iterations_per_step: int = 5  # K optimiser steps per time step
-    first_iterations: int = 150  # optimiser steps on the first time step
-    lr_center: float = 2e-4
-    lr_log_radius: float = 5e-3
-    lr_color: float = 5e-3
+    fill: float = 0.85  # share of the budget that the first time step may use; the rest is for what comes later
+    iterations_per_step: int = 30  # K optimiser steps per time step
+    first_iterations: int = 300  # optimiser steps on the first time step
+    refine_iterations: int = 1500  # more of them, with annealed rates, where nothing moves (an image folder)
+    lr_center: float = 5e-4  # [m]
+    lr_log_radius: float = 1e-2
+    lr_color: float = 1e-2
     lr_logit_opacity: float = 2e-2
+    final_rate: float = 0.1  # share of the learning rates left at the end of refining
     noise: float = 5e5  # lambda_noise of 3DGS-MCMC; a step is capped at half a radius
-    window: int = 6  # keyframes kept beside the newest frame of each camera
+    window: int = 12  # keyframes kept beside the newest frame of each camera
+    keyframe_distance: float = 0.05  # [m] a camera that moved further than this makes a keyframe
+    keyframe_angle: float = 5.0  # [deg] or turned further than this
+    snapshot_every: int = 1  # time steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +53,13 @@ class OccupancyConfig:
     voxel: float = 0.02  # [m], at least the largest radius
     free_below: float = 0.3  # III-C
     occupied_above: float = 0.7  # III-C
+    rule: str = "observed"  # or "literal": all below occupied_above goes, seen or not
     log_odds_hit: float = 0.85
     log_odds_miss: float = -0.4
-    log_odds_limit: float = 3.5
+    log_odds_limit: float = 2.0  # three cameras turn a full voxel free in two time steps
     max_range: float = 3.0  # [m]
-    uncertain_patience: int = 10  # time steps a splat may stand in an uncertain voxel
+    ray_stride: int = 2  # every second pixel and row carves free space
+    uncertain_patience: int = 10  # time steps a splat may stand in uncertain voxels
     robot_margin: float = 0.015  # [m] beyond the robot's spheres that still counts as robot
 
 
@@ -59,7 +70,7 @@ class FieldConfig:
     kernel: str = "matern"  # eq. 7
     length_scale: float = 0.02  # [m] l, IV-C
     noise: float = 1e-6  # epsilon of eq. 8
-    truncation: float = 16.0  # terms below e^-16 of the largest are left out: at most 11 um at 5,000 splats, l = 2 cm
+    truncation: float = 1e-3  # share of the kernel sum that may be left out; raises the distance by at most l / 1000
     voxel: float = 0.02  # [m], IV-B
     padding: float = 0.20  # [m] around the splats where no workspace is given
 

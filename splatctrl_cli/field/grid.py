@@ -1,0 +1,53 @@
+"""A baked field as a distance field again."""
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.field.distance import checked_points
+from splatctrl_cli.kernels import field as native
+from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64
+
+
+class GridField:
+    """Trilinear interpolation between cell centres, and the gradient of that very interpolant.
+
+    Outside the box of the cell centres it reads the value at the nearest point of the box less the distance to it:
+    a lower bound of a distance, so that a robot that leaves the grid is told of less clearance, never of more.
+    """
+
+    def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
+        """Raises InputError where the channel is not there or the grid has a single cell along an axis."""
+        if channel not in grid.channels:
+            raise InputError(f"distance grid: no channel {channel!r}", remedy=f"it has: {', '.join(grid.channels)}")
+        self._values = np.ascontiguousarray(grid.channels[channel], dtype=np.float32)
+        if self._values.ndim != 3 or min(self._values.shape) < 2:
+            raise InputError(
+                f"distance grid: expected at least 2 cells along each axis, got {self._values.shape}",
+                remedy="bake a larger box or a smaller voxel",
+            )
+        self._hard = np.ascontiguousarray(grid.channels["hard"], dtype=np.float32)
+        self._origin = np.ascontiguousarray(grid.origin, dtype=np.float64)
+        self._voxel = grid.voxel
+        upper = self._origin + grid.voxel * (np.array(self._values.shape) - 1)
+        self.box = Box(lower=self._origin, upper=upper)
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3), not normalised."""
+        return native.interpolate(self._values, self._origin, self._voxel, checked_points(points))
+
+    def certified(self, points: Float64) -> Float64:
+        """A distance (Q,) [m] that the exact distance to the splats is not below.
+
+        ``max over the corners of (hard(corner) - |x - corner|)``, less a micrometre for rounding: hard is
+        1-Lipschitz, so this holds whatever interpolation does in between. It certifies the
+        distance to the splats, not to objects.
+        """
+        lowest = native.lipschitz_bound(self._hard, self._origin, self._voxel, checked_points(points))
+        return np.asarray(lowest - ROUNDING)
+
+    def contains(self, points: Float64) -> Bool:
+        """(Q,) True where a point lies in the box of the cell centres."""
+        return self.box.contains(points)
+
+
+ROUNDING = 1e-6  # [m] float32 values a metre or two from their origin

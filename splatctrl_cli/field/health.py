@@ -1,0 +1,88 @@
+"""Is a splat set dense and thick enough for the field made of it?"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_INFLATION = (
+    0.01  # [m] of the kernel field's zero level beyond the radius; 1 cm is what the issue of accuracy allows
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldHealth:
+    """Ratios that decide how good the field can be, and warnings where they are outside their range.
+
+    spacing: median distance to the nearest other splat [m] (0 for a single splat); radius: median [m];
+    planar_zero_level: height [m] at which the kernel field of a dense plane of such splats reads zero.
+    """
+
+    spacing: float
+    radius: float
+    spacing_per_length: float
+    radius_per_spacing: float | None
+    radius_per_length: float
+    planar_zero_level: float
+    warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for a header."""
+        return asdict(self)
+
+
+def field_health(centers: NDArray[np.floating], radii: NDArray[np.floating], length: float) -> FieldHealth:
+    """Health of splats (N, 3), (N,) [m] under a length scale [m]."""
+    spacing, radius = median_spacing(centers), float(np.median(radii))
+    zero_level = planar_zero_level(radius, length)
+    return FieldHealth(
+        spacing=spacing,
+        radius=radius,
+        spacing_per_length=spacing / length,
+        radius_per_spacing=radius / spacing if spacing > 0 else None,
+        radius_per_length=radius / length,
+        planar_zero_level=zero_level,
+        warnings=tuple(_warnings(spacing, radius, length, zero_level)),
+    )
+
+
+def _warnings(spacing: float, radius: float, length: float, zero_level: float) -> Iterable[str]:
+    if radius < spacing / np.sqrt(2):
+        yield (
+            f"radius {radius * 1e3:.1f} mm is below spacing / sqrt 2 = {spacing / np.sqrt(2) * 1e3:.1f} mm: "
+            "the exact field's surface has holes between splats"
+        )
+    if spacing > length:
+        yield (
+            f"spacing {spacing * 1e3:.1f} mm exceeds the length scale {length * 1e3:.1f} mm: "
+            "the kernel field does not join neighbouring splats"
+        )
+    if zero_level - radius > MAX_INFLATION:
+        yield (
+            f"the kernel field's surface stands {zero_level * 1e3:.1f} mm before a dense plane of splats, "
+            f"{(zero_level - radius) * 1e3:.1f} mm beyond their radius; a smaller length scale brings it closer"
+        )
+
+
+def median_spacing(centers: NDArray[np.floating]) -> float:
+    """Median distance from a splat (N, 3) [m] to the nearest other one; 0 for fewer than two."""
+    from scipy.spatial import cKDTree
+
+    if len(centers) < 2:
+        return 0.0
+    points = np.asarray(centers, dtype=np.float64)
+    distance = np.asarray(cKDTree(points).query(points, k=2)[0])
+    return float(np.median(distance[:, 1]))
+
+
+def planar_zero_level(radius: float, length: float) -> float:
+    """The height z [m] over a dense plane of splats where the Matern row-sum field is zero.
+
+    There the field reads ``z - l log(1 + z / l) - r`` (the integral of ``e^(-d/l)`` over a plane is
+    ``2 pi l (z + l) e^(-z/l)``, the row sum ``2 pi l^2``); Newton's method from above, where it is convex.
+    """
+    z = radius + length * (1.0 + np.sqrt(2.0 * radius / length))
+    for _ in range(50):
+        z -= (z - length * float(np.log1p(z / length)) - radius) / max(z / (length + z), 1e-12)
+    return float(max(z, 0.0))
