@@ -1,0 +1,113 @@
+"""How far a distance field is from the true distance, by band of true distance."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Bool, Float64
+
+BANDS: tuple[tuple[float, float], ...] = ((0.0, 0.02), (0.02, 0.05), (0.05, 0.10), (0.10, 0.20))  # [m], true distance
+ALLOWANCE = 0.01  # [m] beyond the median radius that the exact field may over-estimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandAccuracy:
+    """Errors field - truth [m] over the cells of one band of true distance: positive = over-estimate = unsafe.
+
+    None where the band has no cell.
+    """
+
+    lower: float
+    upper: float
+    count: int
+    mean: float | None
+    rmse: float | None
+    median: float | None
+    over_95: float | None
+    over_max: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverEstimate:
+    """The share of cells where a field exceeds the truth by more than `allowance` [m], and by how much more."""
+
+    allowance: float
+    count: int
+    count_beyond: int
+    share_beyond: float | None
+    median_beyond: float | None
+    max_error: float | None
+
+    @property
+    def holds(self) -> bool:
+        """True where no cell exceeds the allowance, over at least one cell."""
+        return self.count > 0 and self.count_beyond == 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldAccuracy:
+    """Accuracy of several fields at the same points: bands by field name, over all points and over the seen ones."""
+
+    everywhere: Mapping[str, tuple[BandAccuracy, ...]]
+    seen: Mapping[str, tuple[BandAccuracy, ...]]
+    over_estimate: OverEstimate
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values, as written to ``accuracy.json``."""
+        return {**asdict(self), "holds": self.over_estimate.holds}
+
+
+def field_accuracy(
+    distances: Mapping[str, NDArray[np.floating]], truth: Float64, seen: Bool, *, median_radius: float
+) -> FieldAccuracy:
+    """Compare fields with the truth at points outside the objects.
+
+    distances: name -> (Q,) [m], `hard` among them; truth (Q,) [m], >= 0 counts; seen (Q,) True where a training
+    camera saw the nearest true surface point. The over-estimate is that of `hard` at seen points up to 20 cm, against
+    1 cm + `median_radius` [m]. Raises InputError for arrays of different lengths, or without `hard`.
+    """
+    if "hard" not in distances:
+        raise InputError(f"distances: expected one named hard, got {', '.join(distances) or 'none'}")
+    for name, values in {**distances, "seen": seen}.items():
+        if values.shape != truth.shape:
+            raise InputError(f"{name}: expected {truth.shape} values, as the truth has, got {values.shape}")
+    errors = {name: values.astype(np.float64) - truth for name, values in distances.items()}
+    is_near = (truth >= BANDS[0][0]) & (truth < BANDS[-1][1])
+    return FieldAccuracy(
+        everywhere={name: _bands(error, truth, np.ones_like(seen)) for name, error in errors.items()},
+        seen={name: _bands(error, truth, seen) for name, error in errors.items()},
+        over_estimate=_over_estimate(errors["hard"][is_near & seen], ALLOWANCE + median_radius),
+    )
+
+
+def _bands(error: Float64, truth: Float64, chosen: Bool) -> tuple[BandAccuracy, ...]:
+    return tuple(_band(error[chosen & (truth >= lower) & (truth < upper)], lower, upper) for lower, upper in BANDS)
+
+
+def _band(error: Float64, lower: float, upper: float) -> BandAccuracy:
+    is_empty = not len(error)
+    return BandAccuracy(
+        lower=lower,
+        upper=upper,
+        count=len(error),
+        mean=None if is_empty else float(error.mean()),
+        rmse=None if is_empty else float(np.sqrt(np.mean(error**2))),
+        median=None if is_empty else float(np.median(error)),
+        over_95=None if is_empty else float(np.percentile(error, 95)),
+        over_max=None if is_empty else float(error.max()),
+    )
+
+
+def _over_estimate(error: Float64, allowance: float) -> OverEstimate:
+    beyond = error[error > allowance] - allowance
+    return OverEstimate(
+        allowance=allowance,
+        count=len(error),
+        count_beyond=len(beyond),
+        share_beyond=len(beyond) / len(error) if len(error) else None,
+        median_beyond=float(np.median(beyond)) if len(beyond) else None,
+        max_error=float(error.max()) if len(error) else None,
+    )
