@@ -1,0 +1,261 @@
+"""``splatctrl score`` on scenes and recordings whose scores are known."""
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.geometry import look_at
+from splatctrl_cli.io import scene_folder, source
+from splatctrl_cli.io.splats import write_ply
+from splatctrl_cli.records import Float64, Intrinsics, LossReport, Record, RgbdFrame, SplatSet
+from splatctrl_cli.scene.render import render
+
+INTRINSICS = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
+SECOND = 1_000_000_000
+
+
+def wall(brightness: float = 0.5) -> SplatSet:
+    """A dense wall in the plane x = 1, of one colour."""
+    y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-0.8, 0.8, 0.02), np.arange(-0.8, 0.8, 0.02)))
+    num = len(y)
+    return SplatSet(
+        centers=np.column_stack([np.ones(num), y, z]).astype(np.float32),
+        radii=np.full(num, 0.02, np.float32),
+        colors=np.full((num, 3), brightness, np.float32),
+        opacities=np.full(num, 0.95, np.float32),
+        labels=np.zeros(num, np.uint8),
+        density=np.zeros(num, np.float32),
+    )
+
+
+def frame(stamp_ns: int, camera: str, T_world_camera: Float64, color_offset: float = 0.0) -> RgbdFrame:
+    """What a camera records of the wall; its colour is off by `color_offset`."""
+    rendering = render(wall(), INTRINSICS, T_world_camera, threads=1)
+    color = np.clip(255 * (rendering.color + color_offset), 0, 255)
+    return RgbdFrame(
+        stamp_ns=stamp_ns,
+        camera=camera,
+        color=np.round(color).astype(np.uint8),
+        depth=rendering.normalised_depth(),
+        intrinsics=INTRINSICS,
+        T_world_camera=T_world_camera,
+    )
+
+
+FRONT = look_at([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+SIDE = look_at([0.0, 0.1, 0.0], [1.0, 0.1, 0.0])
+AWAY = look_at([0.0, 0.0, 0.0], [-1.0, 0.0, 0.0])
+
+
+@dataclass(kw_only=True)
+class FakeSource:
+    """A recording from a list of frames."""
+
+    frames: list[RgbdFrame]
+    has_clock: bool = True
+    name: str = "fake"
+    joint_names: tuple[str, ...] = ()
+    loss: LossReport = field(default_factory=LossReport)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(f.camera for f in self.frames))
+
+    def records(self) -> Iterator[Record]:
+        return iter(self.frames)
+
+    def digests(self) -> dict[str, str]:
+        return {"fake": "0"}
+
+
+@dataclass(kw_only=True)
+class FakeSnapshot:
+    """A moment of which the scene knows."""
+
+    stamp_ns: int
+
+
+@dataclass(kw_only=True)
+class FakeScene:
+    """A scene whose wall is dark at first and right from second 2 on."""
+
+    has_clock: bool = True
+    cameras: tuple[str, ...] = ("cam0",)
+    snapshots: tuple[FakeSnapshot, ...] = (FakeSnapshot(stamp_ns=SECOND), FakeSnapshot(stamp_ns=2 * SECOND))
+
+    def splats(self) -> SplatSet:
+        return wall()
+
+    def splats_at(self, stamp_ns: int) -> SplatSet:
+        return wall(0.4 if stamp_ns < 2 * SECOND else 0.5)
+
+
+FRAMES = [
+    *(frame(0, "cam0", FRONT), frame(0, "cam3", SIDE)),
+    *(frame(SECOND, "cam0", FRONT), frame(SECOND, "cam3", SIDE)),
+    *(frame(2 * SECOND, "cam3", SIDE, 0.01), frame(3 * SECOND, "cam3", AWAY)),
+]
+
+
+@pytest.fixture
+def scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a scene, and the recording FRAMES."""
+    (tmp_path / "scene").mkdir()
+    write_ply(tmp_path / "scene" / "splats.ply", wall(), {})
+    set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES))
+    return tmp_path
+
+
+def set_up(monkeypatch: pytest.MonkeyPatch, scene: FakeScene, recording: FakeSource) -> None:
+    monkeypatch.setattr(scene_folder, "open_scene", lambda path: scene)
+    monkeypatch.setattr(source, "open_source", lambda path, options: recording)
+
+
+def run(folder: Path, *arguments: object) -> int:
+    return main(["score", str(folder / "scene"), "--reference", "fake.mcap", *map(str, arguments)])
+
+
+def result_of(capsys: pytest.CaptureFixture[str]) -> Any:
+    return json.loads(capsys.readouterr().out)
+
+
+def test_views_are_rendered_from_the_newest_snapshot_and_early_ones_are_counted(
+    scored: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(scored, "--json") == 0
+    result = result_of(capsys)
+    assert result["cameras"] == ["cam3"]
+    assert result["skipped_views"] == ["cam3-0000"]
+    dark, right, away = result["views"]
+    assert (dark["view"], right["view"], away["view"]) == ("cam3-0001", "cam3-0002", "cam3-0003")
+    assert dark["psnr_all"] == pytest.approx(20.0, abs=0.6), "0.4 instead of 0.5"
+    assert right["psnr_all"] == pytest.approx(40.0, abs=2.5), "off by 0.01, and rounded to 8 bits"
+    assert right["depth_median_all"] < 1e-6
+    assert result["metrics"]["num_views"] == 3
+    assert result["metrics"]["num_skipped"] == 1
+
+
+def test_seen_pixels_are_those_of_the_surface_that_the_training_camera_measured(
+    scored: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(scored, "--json") == 0
+    _, side, away = result_of(capsys)["views"]
+    assert side["seen_share"] == pytest.approx(58 / 64, abs=0.03), "the view is moved by 0.1 m, 6 pixels"
+    assert away["seen_share"] == 0.0
+    assert away["psnr_seen"] is None
+    assert away["depth_median_all"] is None
+
+
+def test_final_splats_serve_all_views_when_asked(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(scored, "--json", "--snapshots", "final") == 0
+    first, *_ = result_of(capsys)["views"]
+    assert first["psnr_all"] > 50
+
+
+def test_without_a_clock_every_view_is_scored_from_the_final_splats(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up(monkeypatch, FakeScene(has_clock=False, snapshots=()), FakeSource(frames=FRAMES, has_clock=False))
+    assert run(scored, "--json") == 0
+    result = result_of(capsys)
+    assert result["snapshots"] == "final"
+    assert result["metrics"]["num_skipped"] == 0
+    assert len(result["views"]) == 4
+
+
+def test_the_table_shows_each_view_and_the_mean(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(scored) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split("  ")[0] == "view"
+    assert [line.split()[0] for line in lines[2:5]] == ["cam3-0001", "cam3-0002", "cam3-0003"]
+    assert lines[6].startswith("mean of 3")
+    assert "3 views scored, 1 before the first snapshot" in lines[-1]
+
+
+def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) -> None:
+    assert run(scored, "-o", scored / "score") == 0
+    names = sorted(path.name for path in (scored / "score").iterdir())
+    assert names == ["cam3_best_worst.png", "run.json", "score.json", "views.csv"]
+    rows = list(csv.DictReader((scored / "score" / "views.csv").read_text().splitlines()))
+    score = json.loads((scored / "score" / "score.json").read_text())
+    assert [row["view"] for row in rows] == [view["view"] for view in score["views"]]
+    assert float(rows[0]["psnr_all"]) == score["views"][0]["psnr_all"]
+    assert rows[2]["psnr_seen"] == ""
+    run_json = json.loads((scored / "score" / "run.json").read_text())
+    assert run_json["metrics"] == score["metrics"]
+    assert set(run_json["inputs"]) == {"fake", "scene/splats.ply"}
+
+
+def test_a_gate_that_fails_leaves_the_scores_and_exits_1(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(scored, "-o", scored / "score", "--require", "psnr_seen>=20", "--require", "psnr_all>=90") == 1
+    assert "psnr_all is" in capsys.readouterr().err
+    assert (scored / "score" / "score.json").is_file()
+
+
+def test_a_perfect_render_passes_a_gate_though_json_cannot_hold_its_psnr(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES[-1:]))
+    assert run(scored, "--json", "--require", "psnr_all>=24") == 0
+    assert result_of(capsys)["metrics"]["psnr_all"] is None
+    assert run(scored, "--json", "--require", "psnr_seen>=24") == 1
+    assert "psnr_seen is unknown" in capsys.readouterr().err
+
+
+def test_damaged_input_exits_3(scored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES, loss=LossReport(damaged=1)))
+    assert run(scored) == 3
+
+
+def test_a_training_camera_is_scored_only_when_allowed(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(scored, "--cameras", "cam0") == 2
+    assert "cam0 trained the scene" in capsys.readouterr().err
+    assert run(scored, "--cameras", "cam0", "--allow-training", "--json") == 0
+    (view,) = result_of(capsys)["views"]
+    assert view["seen_share"] == view["valid_share"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--cameras", "cam9"], 2, "has no camera 'cam9'; known here: cam0, cam3"),
+        (["--cameras", ","], 2, "has no camera ','"),
+        (["--require", "sharpness>=1"], 2, "unknown metric"),
+        (["--scan", "scan1"], 2, "--scan scan1: only with --dtu"),
+        (["--holdout", "3"], 2, "--holdout and --root go with an image folder's TOML"),
+        (["--dtu", "root"], 2, "not allowed with argument"),
+    ],
+)
+def test_bad_usage_names_the_thing_and_the_choices(
+    scored: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, message: str
+) -> None:
+    try:
+        got = run(scored, *arguments)
+    except SystemExit as stop:
+        got = int(stop.code or 0)
+    assert got == code
+    assert message in capsys.readouterr().err
+
+
+def test_a_recording_before_the_first_snapshot_cannot_be_scored(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES[:2]))
+    assert run(scored, "-o", scored / "score") == 5
+    assert "no view of cam3 to score; 1 lie before the first snapshot" in capsys.readouterr().err
+    assert not (scored / "score").exists()
+
+
+def test_a_recording_of_training_cameras_alone_is_refused(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up(monkeypatch, FakeScene(cameras=("cam0", "cam3")), FakeSource(frames=FRAMES))
+    assert run(scored) == 2
+    assert "every camera trained the scene (cam0, cam3)" in capsys.readouterr().err
