@@ -1,15 +1,139 @@
-"""``splatctrl simulate``."""
+"""``splatctrl simulate``: a recorded log with known truth."""
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.cli.common import Subparsers, add_command
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
+
+if TYPE_CHECKING:
+    from splatctrl_cli.simulate.recording import Recording, RecordingOptions
+    from splatctrl_cli.simulate.truth import Truth
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    add_command(subparsers, "simulate", run, summary="simulate")
+    parser = add_command(
+        subparsers, "simulate", run, summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth"
+    )
+    add_output(parser, default="simulated", what="folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the depth noise (default: 0)")
+    parser.add_argument("--duration", type=float, default=7.0, metavar="S", help="length in seconds (default: 7)")
+    parser.add_argument("--fps", type=float, default=5.0, metavar="HZ", help="frames a second (default: 5)")
+    parser.add_argument("--width", type=int, default=320, metavar="PX", help="image width (default: 320)")
+    parser.add_argument("--height", type=int, default=240, metavar="PX", help="image height (default: 240)")
+    parser.add_argument(
+        "--noise", choices=("none", "realsense"), default="realsense", help="depth noise (default: realsense)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    raise NotImplementedError
+    from splatctrl_cli.io.output import Stopwatch, output_path, write_json, write_run
+    from splatctrl_cli.simulate.recording import RecordingOptions
+    from splatctrl_cli.simulate.truth import truth_document
+
+    console = Console(args)
+    options = RecordingOptions(
+        duration_s=args.duration,
+        fps=args.fps,
+        width=args.width,
+        height=args.height,
+        noise=args.noise,
+        seed=args.seed,
+    )
+    stopwatch = Stopwatch()
+    out = args.out or Path("simulated")
+    with output_path(out, force=args.force, is_folder=True) as folder:
+        with stopwatch.stage("log"):
+            truth, num_frames = _record(folder, options, console)
+        write_json(folder / "truth.json", truth_document(truth))
+        metrics = _metrics(truth, num_frames)
+        write_run(
+            folder,
+            command="simulate",
+            config=vars(options),
+            inputs={},
+            metrics=metrics,
+            stopwatch=stopwatch,
+            seed=options.seed,
+        )
+        sizes = {path.name: path.stat().st_size for path in sorted(folder.iterdir())}
+    console.result({"out": str(out), "bytes": sizes, **metrics}, _report(out, truth, num_frames, sizes))
+    return 0
+
+
+def _record(folder: Path, options: "RecordingOptions", console: Console) -> "tuple[Truth, dict[str, int]]":
+    """Write robot files and log; the truth and the number of frames by camera."""
+    from splatctrl_cli.io.mcap_writer import mcap_log
+    from splatctrl_cli.records import JointState
+    from splatctrl_cli.robot.model import RobotModel
+    from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+    from splatctrl_cli.simulate.recording import Recording
+    from splatctrl_cli.simulate.textures import luminance_std
+
+    urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
+    urdf.write_text(arm_urdf(), encoding="utf-8")
+    spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
+    recording = Recording(options, RobotModel.from_urdf(urdf, spheres))
+    contrast: dict[str, float] = {}
+    num_frames = {camera.name: 0 for camera in recording.cameras}
+    with mcap_log(folder / "log.mcap") as log:
+        log.add_transforms(recording.start_ns, recording.static_transforms(), is_static=True)
+        for record in recording.records():
+            if isinstance(record, JointState):
+                log.add_joint_state(record, recording.robot.joint_names)
+                log.add_transforms(record.stamp_ns, recording.link_transforms(record.position), is_static=False)
+                continue
+            log.add_frame(record)
+            contrast[record.camera] = min(contrast.get(record.camera, 1.0), luminance_std(record.color))
+            num_frames[record.camera] += 1
+            if record.camera == recording.cameras[-1].name and num_frames[record.camera] % 10 == 0:
+                console.log(f"simulate: {(record.stamp_ns - recording.start_ns) / 1e9:.1f} s recorded")
+    return _truth(folder, recording, contrast), num_frames
+
+
+def _truth(folder: Path, recording: "Recording", contrast: dict[str, float]) -> "Truth":
+    from splatctrl_cli.simulate.truth import Truth
+
+    stamps, clearance = recording.clearances()
+    return Truth(
+        path=folder / "truth.json",
+        primitives=recording.primitives,
+        cameras=recording.cameras,
+        luminance_std=contrast,
+        joint_names=recording.robot.joint_names,
+        robot_urdf=folder / "robot.urdf",
+        robot_spheres=folder / "robot_spheres.yaml",
+        T_world_base=recording.robot.T_world_base,
+        stamps=stamps,
+        clearance=clearance,
+    )
+
+
+def _metrics(truth: "Truth", num_frames: dict[str, int]) -> dict[str, Any]:
+    training = [camera.name for camera in truth.cameras if camera.is_training]
+    return {
+        "frames": num_frames,
+        "joint_states": len(truth.stamps),
+        "luminance_std": {name: round(value, 4) for name, value in truth.luminance_std.items()},
+        "min_luminance_std": round(min(truth.luminance_std[name] for name in training), 4),
+        "min_clearance": round(float(truth.clearance.min()), 4),
+    }
+
+
+def _report(out: Path, truth: "Truth", num_frames: dict[str, int], sizes: dict[str, int]) -> list[str]:
+    cameras = [
+        (
+            camera.name,
+            "training" if camera.is_training else "scoring",
+            num_frames[camera.name],
+            f"{camera.intrinsics.width}x{camera.intrinsics.height}",
+            f"{truth.luminance_std[camera.name]:.3f}",
+        )
+        for camera in truth.cameras
+    ]
+    lines = [f"{out}", "", *table(("file", "bytes"), list(sizes.items())), ""]
+    lines += table(("camera", "role", "frames", "size", "luminance std"), cameras)
+    lines += ["", f"joint states {len(truth.stamps)}, true clearance at least {truth.clearance.min() * 100:.1f} cm"]
+    return lines

@@ -28,7 +28,7 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class UrdfFile:
-    """The checked text of a URDF, its link names and its collision shapes.
+    """The checked text of a URDF, its link names, (parent, child) links of its joints and its collision shapes.
 
     num_meshes counts the collision meshes, which are not among the shapes.
     """
@@ -36,6 +36,7 @@ class UrdfFile:
     path: Path
     text: str
     links: tuple[str, ...]
+    parents: tuple[tuple[str, str], ...]
     shapes: tuple[Shape, ...]
     num_meshes: int
 
@@ -67,7 +68,8 @@ def read_urdf(path: Path) -> UrdfFile:
                 num_meshes += 1
             else:
                 shapes.append(shape)
-    return UrdfFile(path=path, text=text, links=links, shapes=tuple(shapes), num_meshes=num_meshes)
+    parents = tuple((joint.find("parent").get("link"), joint.find("child").get("link")) for joint in joints)
+    return UrdfFile(path=path, text=text, links=links, parents=parents, shapes=tuple(shapes), num_meshes=num_meshes)
 
 
 def _parse(path: Path) -> tuple[str, Any]:

@@ -1,0 +1,28 @@
+"""Writes everything in sample_data/ anew: ``.venv/bin/python sample_data/make.py``. The same bytes every time."""
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from splatctrl_cli.cli.main import main
+
+HERE = Path(__file__).parent
+FILES = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
+
+
+def make(destination: Path) -> int:
+    """Simulate with the default options and keep what does not change from run to run (not run.json)."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "simulated"
+        code = main(["simulate", "--out", str(out), "--quiet"])
+        if code != 0:
+            return code
+        (destination / "tabletop").mkdir(parents=True, exist_ok=True)
+        for name in FILES:
+            shutil.copyfile(out / name, destination / "tabletop" / name)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(make(HERE if len(sys.argv) < 2 else Path(sys.argv[1])))

@@ -1,0 +1,146 @@
+"""Writes a recorded log as one ROS 2 MCAP of standard messages (CDR, zstd chunks, CRCs on).
+
+Topics: /CAM/color/image_raw/compressed (JPEG), /CAM/color/camera_info, /CAM/depth/image_raw (16UC1 millimetres,
+REP 118, 0 = none, registered to colour), /joint_states, /tf and /tf_static. The bytes hold no wall-clock time.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from splatctrl_cli.geometry import quat_from_rotation
+from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
+
+JPEG_QUALITY = 90
+MILLIMETRES = 1000.0
+CHUNK_BYTES = 4 * 1024 * 1024
+FOREVER = "    sec: 9223372036\n    nsec: 854775807\n"
+LATCHED = (  # rosbag2's form of reliable, transient local, keep the last one
+    f"- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n{FOREVER}  lifespan:\n{FOREVER}"
+    f"  liveliness: 1\n  liveliness_lease_duration:\n{FOREVER}  avoid_ros_namespace_conventions: false"
+)
+
+Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_child (4, 4)
+
+
+@contextmanager
+def mcap_log(path: Path) -> Iterator["McapLog"]:
+    """A log open for writing at `path`; complete and closed after the block."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="splatctrl")
+        yield McapLog(writer)
+        writer.finish()
+
+
+class McapLog:
+    """Adds records to an open MCAP; messages must come in time order."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+
+    def add_joint_state(self, state: JointState, joint_names: Sequence[str]) -> None:
+        """One /joint_states message; effort is left empty."""
+        message = self._new(
+            "sensor_msgs/msg/JointState",
+            header=self._header(state.stamp_ns, ""),
+            name=list(joint_names),
+            position=np.asarray(state.position, dtype=np.float64),
+            velocity=np.asarray(state.velocity, dtype=np.float64),
+            effort=np.zeros(0),
+        )
+        self._add("/joint_states", message, state.stamp_ns)
+
+    def add_transforms(self, stamp_ns: int, transforms: Sequence[Transform], *, is_static: bool) -> None:
+        """One /tf or /tf_static message."""
+        stamped = [
+            self._new(
+                "geometry_msgs/msg/TransformStamped",
+                header=self._header(stamp_ns, parent),
+                child_frame_id=child,
+                transform=self._transform(T),
+            )
+            for parent, child, T in transforms
+        ]
+        message = self._new("tf2_msgs/msg/TFMessage", transforms=stamped)
+        self._add("/tf_static" if is_static else "/tf", message, stamp_ns)
+
+    def add_frame(self, frame: RgbdFrame) -> None:
+        """Colour as JPEG, its CameraInfo and the depth, all of one stamp and one optical frame."""
+        header = self._header(frame.stamp_ns, f"{frame.camera}_optical_frame")
+        jpeg = cv2.imencode(".jpg", frame.color[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+        color = self._new("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=jpeg.reshape(-1))
+        millimetres = np.rint(frame.depth.astype(np.float64) * MILLIMETRES).astype("<u2")
+        depth = self._new(
+            "sensor_msgs/msg/Image",
+            header=header,
+            height=frame.depth.shape[0],
+            width=frame.depth.shape[1],
+            encoding="16UC1",
+            is_bigendian=0,
+            step=2 * frame.depth.shape[1],
+            data=millimetres.reshape(-1).view(np.uint8),
+        )
+        self._add(f"/{frame.camera}/color/camera_info", self._camera_info(header, frame.intrinsics), frame.stamp_ns)
+        self._add(f"/{frame.camera}/color/image_raw/compressed", color, frame.stamp_ns)
+        self._add(f"/{frame.camera}/depth/image_raw", depth, frame.stamp_ns)
+
+    def _camera_info(self, header: Any, k: Intrinsics) -> Any:
+        region = self._new(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self._new(
+            "sensor_msgs/msg/CameraInfo",
+            header=header,
+            height=k.height,
+            width=k.width,
+            distortion_model="plumb_bob",
+            d=np.zeros(5),
+            k=np.array([k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1], dtype=np.float64),
+            r=np.eye(3).reshape(-1),
+            p=np.array([k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0], dtype=np.float64),
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+        )
+
+    def _transform(self, T: Float64) -> Any:
+        x, y, z, w = (float(value) for value in quat_from_rotation(T[:3, :3]))
+        px, py, pz = (float(value) for value in T[:3, 3])
+        return self._new(
+            "geometry_msgs/msg/Transform",
+            translation=self._new("geometry_msgs/msg/Vector3", x=px, y=py, z=pz),
+            rotation=self._new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        stamp = self._new("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return self._new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+    def _new(self, kind: str, **fields: Any) -> Any:
+        return self._store.types[kind](**fields)
+
+    def _add(self, topic: str, message: Any, stamp_ns: int) -> None:
+        kind = message.__msgtype__
+        if kind not in self._schemas:
+            text = self._store.generate_msgdef(kind, ros_version=2)[0]
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+        if topic not in self._channels:
+            qos = {"offered_qos_profiles": LATCHED} if topic == "/tf_static" else {}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
+        sequence = self._sequence.get(topic, 0)
+        self._sequence[topic] = sequence + 1
+        data = bytes(self._store.serialize_cdr(message, kind))
+        self._writer.add_message(
+            self._channels[topic], log_time=stamp_ns, data=data, publish_time=stamp_ns, sequence=sequence
+        )

@@ -1,0 +1,149 @@
+"""A simulated recording: the records of a log in time order, and what is true while it runs."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate import tabletop
+from splatctrl_cli.simulate.noise import DepthNoise
+from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.render import Renderer
+from splatctrl_cli.simulate.truth import distance_to
+
+START_NS = 1_700_000_000_000_000_000
+JOINT_RATE = 50  # [Hz]
+NOISES: dict[str, DepthNoise | None] = {"none": None, "realsense": DepthNoise()}
+OPTICAL_FROM_LINK = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+
+Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_child (4, 4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions:
+    """What to record: duration [s], frames per second of each camera, image size [px], depth noise, its seed."""
+
+    duration_s: float = 7.0
+    fps: float = 5.0
+    width: int = 320
+    height: int = 240
+    noise: str = "realsense"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.5 <= self.duration_s <= 600:
+            raise UsageError(f"--duration: expected 0.5 to 600 s, got {self.duration_s:g}")
+        if not 0 < self.fps <= 60 or self.duration_s * self.fps < 3:
+            raise UsageError(f"--fps: expected up to 60 and at least three frames in all, got {self.fps:g}")
+        for option, value in (("--width", self.width), ("--height", self.height)):
+            if not 16 <= value <= 4096:
+                raise UsageError(f"{option}: expected 16 to 4096 px, got {value}")
+        if self.noise not in NOISES:
+            raise UsageError(f"--noise: expected one of {', '.join(NOISES)}, got {self.noise}")
+        if self.seed < 0:
+            raise UsageError(f"--seed: expected 0 or more, got {self.seed}")
+
+
+class Recording:
+    """The tabletop scene, recorded once; the same options give the same records."""
+
+    def __init__(self, options: RecordingOptions, robot: RobotModel) -> None:
+        self.options = options
+        self.robot = robot
+        span = round(options.duration_s * 1e9)
+        self.start_ns, self.end_ns = START_NS, START_NS + span
+        self.cameras = tabletop.cameras(options.width, options.height)
+        visitor = tabletop.visitor(START_NS + span // 3, START_NS + 2 * span // 3)
+        self.primitives: tuple[Primitive, ...] = (*tabletop.furniture(), *tabletop.things(), visitor)
+        self._temporary = (visitor,)
+        self._motion = tabletop.arm_motion(options.duration_s)
+
+    def joint_states(self) -> Iterator[JointState]:
+        """The arm's states from start to end, 50 a second."""
+        for index in range(int(self.options.duration_s * JOINT_RATE) + 1):
+            position, velocity = self._motion.at(index / JOINT_RATE)
+            stamp_ns = self.start_ns + index * 10**9 // JOINT_RATE
+            yield JointState(stamp_ns=stamp_ns, position=position, velocity=velocity)
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        """The images of every camera in time order, cameras in turn at each stamp."""
+        renderers = [Renderer(camera, self.primitives[: -len(self._temporary)]) for camera in self.cameras]
+        noise = NOISES[self.options.noise]
+        for index in range(int(np.ceil(self.options.duration_s * self.options.fps - 1e-9))):
+            offset_ns = round(index * 1e9 / self.options.fps)
+            moving = self._moving(offset_ns)
+            for number, renderer in enumerate(renderers):
+                color, depth = renderer.image(moving)
+                if noise is not None:
+                    depth = noise.applied(depth, np.random.default_rng([self.options.seed, number, index]))
+                yield RgbdFrame(
+                    stamp_ns=self.start_ns + offset_ns,
+                    camera=renderer.camera.name,
+                    color=color,
+                    depth=depth,
+                    intrinsics=renderer.camera.intrinsics,
+                    T_world_camera=renderer.camera.T_world_camera,
+                )
+
+    def records(self) -> Iterator[Record]:
+        """Joint states and images by stamp; joint states come before images of the same stamp."""
+        states, frames = self.joint_states(), self.frames()
+        state = next(states, None)
+        for frame in frames:
+            while state is not None and state.stamp_ns <= frame.stamp_ns:
+                yield state
+                state = next(states, None)
+            yield frame
+        if state is not None:
+            yield state
+        yield from states
+
+    def link_poses(self, q: Float64) -> dict[str, Float64]:
+        """T_world_link (4, 4) of every link at joint positions q (J,)."""
+        return {link: self.robot.frame_pose(q, link) for link in self.robot.urdf.links}
+
+    def static_transforms(self) -> list[Transform]:
+        """world -> camN_link -> camN_optical_frame of every camera, and world -> the arm's root link."""
+        transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
+        for camera in self.cameras:
+            T_world_link = camera.T_world_camera @ OPTICAL_FROM_LINK.T
+            transforms.append(("world", f"{camera.name}_link", T_world_link))
+            transforms.append((f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK))
+        return transforms
+
+    def link_transforms(self, q: Float64) -> list[Transform]:
+        """Parent link -> link of every link but the root at joint positions q (J,)."""
+        poses = self.link_poses(q)
+        return [
+            (parent, child, invert_transform(poses[parent]) @ poses[child])
+            for parent, child in self.robot.urdf.parents
+        ]
+
+    def clearances(self) -> tuple[np.ndarray, Float64]:
+        """Stamps (T,) int64 [ns] of the joint states and the arm's true clearance (T,) [m] at each.
+
+        The least exact distance of a moving collision sphere to what is there, less the sphere's radius.
+        """
+        states = list(self.joint_states())
+        radii = self.robot.sphere_set.radii[self.robot.moving_spheres]
+        clearance = [
+            np.min(
+                distance_to(
+                    self.primitives,
+                    self.robot.sphere_centers(state.position)[self.robot.moving_spheres],
+                    state.stamp_ns,
+                )
+                - radii
+            )
+            for state in states
+        ]
+        return np.array([state.stamp_ns for state in states], dtype=np.int64), np.array(clearance)
+
+    def _moving(self, offset_ns: int) -> list[Primitive]:
+        q, _ = self._motion.at(offset_ns / 1e9)
+        arm = tabletop.arm_solids(self.robot.urdf.shapes, self.link_poses(q))
+        return arm + [p for p in self._temporary if p.is_present(self.start_ns + offset_ns)]

@@ -1,0 +1,142 @@
+"""The scene: a textured table with things on it, an arm behind them, fixed cameras about it.
+
+World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatctrl_cli.geometry import look_at
+from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.robot.urdf import Shape
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.render import Camera
+from splatctrl_cli.simulate.textures import Texture
+
+PALETTE = {
+    "wood": ((0.16, 0.09, 0.05), (0.98, 0.86, 0.66)),
+    "slate": ((0.05, 0.08, 0.14), (0.80, 0.90, 0.98)),
+    "moss": ((0.04, 0.12, 0.06), (0.85, 0.97, 0.62)),
+    "brick": ((0.22, 0.03, 0.03), (1.00, 0.80, 0.62)),
+    "ocean": ((0.02, 0.07, 0.25), (0.70, 0.94, 1.00)),
+    "grape": ((0.14, 0.03, 0.20), (0.98, 0.82, 0.95)),
+    "sand": ((0.24, 0.17, 0.04), (1.00, 0.95, 0.70)),
+    "shell": ((0.20, 0.21, 0.24), (1.00, 1.00, 0.98)),
+}
+
+# Position [m] of the hand's start and end lies on either side of the things on the table.
+WAYPOINTS = (
+    (-0.80, 0.30, 0.00, -2.00, 0.00, 2.30, 0.00),
+    (-0.10, 0.10, 0.00, -2.00, 0.00, 2.10, 0.69),
+    (0.80, 0.30, 0.00, -2.00, 0.00, 2.30, 1.57),
+)
+
+
+def furniture() -> list[Primitive]:
+    """Table, floor and three walls; they stand for the room and are obstacles like any other."""
+    return [
+        _box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), texture=_texture("noise", 0.10, "wood", 1)),
+        _box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), texture=_texture("noise", 0.15, "slate", 2)),
+        _box("wall_back", (0.05, 4.0, 2.2), (-0.80, 0.0, 0.40), texture=_texture("noise", 0.13, "moss", 3)),
+        _box("wall_left", (4.0, 0.05, 2.2), (1.2, 1.30, 0.40), texture=_texture("noise", 0.13, "brick", 4)),
+        _box("wall_right", (4.0, 0.05, 2.2), (1.2, -1.30, 0.40), texture=_texture("noise", 0.13, "ocean", 7)),
+    ]
+
+
+def things() -> list[Primitive]:
+    """What stands on the table from beginning to end."""
+    return [
+        _box("crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), 20.0, _texture("stripes", 0.06, "ocean", 0)),
+        _box("parcel", (0.22, 0.14, 0.10), (0.66, -0.02, 0.05), -15.0, _texture("noise", 0.055, "brick", 5)),
+        _cylinder("canister", 0.055, 0.19, (0.585, -0.285, 0.095), _texture("stripes", 0.055, "moss", 1)),
+        _cylinder("tin", 0.050, 0.14, (0.78, -0.24, 0.07), _texture("checks", 0.06, "grape", 0)),
+        _sphere("ball", 0.075, (0.36, 0.40, 0.075), _texture("noise", 0.05, "sand", 6)),
+    ]
+
+
+def visitor(from_ns: int, to_ns: int) -> Primitive:
+    """The obstacle that is there for a while only."""
+    return _cylinder(
+        "visitor", 0.06, 0.30, (0.42, 0.08, 0.15), _texture("stripes", 0.06, "grape", 2), from_ns=from_ns, to_ns=to_ns
+    )
+
+
+def cameras(width: int, height: int) -> tuple[Camera, ...]:
+    """Three training cameras and a fourth for scoring between the first two; focal length 0.92 image widths."""
+    scale = width / 320
+    intrinsics = Intrinsics(
+        fx=295.0 * scale,
+        fy=295.0 * scale,
+        cx=(width - 1) / 2 + 3.2 * scale,
+        cy=(height - 1) / 2 - 2.6 * scale,
+        width=width,
+        height=height,
+    )
+    places = (
+        ("cam0", (1.15, -0.15, 0.95), (0.36, 0.0, 0.10), True),
+        ("cam1", (0.15, -0.85, 0.90), (0.40, 0.0, 0.10), True),
+        ("cam2", (0.20, 0.90, 0.95), (0.40, 0.0, 0.10), True),
+        ("cam3", (0.80, -0.70, 0.95), (0.40, 0.0, 0.10), False),
+    )
+    return tuple(
+        Camera(name=name, intrinsics=intrinsics, T_world_camera=look_at(eye, target), is_training=is_training)
+        for name, eye, target, is_training in places
+    )
+
+
+def arm_motion(duration_s: float) -> Motion:
+    """The arm's motion: at rest at first, across the table, at rest at the end."""
+    waypoints = np.array(WAYPOINTS)
+    return Motion(times=np.linspace(0.06, 0.94, len(waypoints)) * duration_s, waypoints=waypoints)
+
+
+def arm_solids(shapes: Sequence[Shape], T_world_links: dict[str, Float64]) -> list[Primitive]:
+    """The arm's shapes as solids at one posture; the pattern is fixed to each link."""
+    colors = ("shell", "ocean")
+    return [
+        Primitive(
+            name=f"{shape.link}.{index}",
+            kind=shape.kind,
+            size=shape.size,
+            T_world_shape=T_world_links[shape.link] @ shape.T_link_shape,
+            texture=_texture("noise", 0.05, colors[sum(shape.link.encode()) % 2], 20),
+        )
+        for index, shape in enumerate(shapes)
+    ]
+
+
+def _texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:
+    dark, bright = PALETTE[palette]
+    return Texture(pattern=pattern, feature=feature, dark=dark, bright=bright, seed=seed)
+
+
+def _placed(position: Sequence[float], yaw_deg: float = 0.0) -> Float64:
+    T = np.eye(4)
+    c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
+    T[:2, :2] = [[c, -s], [s, c]]
+    T[:3, 3] = position
+    return T
+
+
+def _box(
+    name: str,
+    size: tuple[float, float, float],
+    position: Sequence[float],
+    yaw_deg: float = 0.0,
+    texture: Texture | None = None,
+) -> Primitive:
+    assert texture is not None
+    return Primitive(name=name, kind="box", size=size, T_world_shape=_placed(position, yaw_deg), texture=texture)
+
+
+def _cylinder(
+    name: str, radius: float, height: float, position: Sequence[float], texture: Texture, **span: int
+) -> Primitive:
+    size = (radius, height)
+    return Primitive(name=name, kind="cylinder", size=size, T_world_shape=_placed(position), texture=texture, **span)
+
+
+def _sphere(name: str, radius: float, position: Sequence[float], texture: Texture) -> Primitive:
+    return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=_placed(position), texture=texture)

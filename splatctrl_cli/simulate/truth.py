@@ -1,0 +1,179 @@
+"""The truth beside a simulated log: what stands where and when, and the exact distance to it."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, closest_point
+from splatctrl_cli.simulate.render import Camera
+from splatctrl_cli.simulate.textures import Texture
+
+FORMAT, VERSION = "splatctrl-truth", 1
+NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """Obstacles over time, cameras and robot of a simulated log; world frame, metres, nanoseconds.
+
+    stamps (T,) int64 [ns] of the joint states, clearance (T,) [m] of the arm's moving collision spheres at each;
+    luminance_std: the least standard deviation of luminance (0 to 1) over each camera's images.
+    """
+
+    path: Path
+    primitives: tuple[Primitive, ...]
+    cameras: tuple[Camera, ...]
+    luminance_std: Mapping[str, float]
+    joint_names: tuple[str, ...]
+    robot_urdf: Path
+    robot_spheres: Path
+    T_world_base: Float64
+    stamps: NDArray[np.int64]
+    clearance: Float64
+
+    def distance(self, points_world: Float64, stamp_ns: int) -> Float64:
+        """Signed distance (Q,) [m] of points (Q, 3) to everything there at `stamp_ns`, the robot left out."""
+        return distance_to(self.primitives, points_world, stamp_ns)
+
+    def closest(self, points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
+        """Signed distance (Q,) [m] and the surface point (Q, 3) that gives it."""
+        return closest_of(self.primitives, points_world, stamp_ns)
+
+
+def distance_to(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> Float64:
+    """Signed distance (Q,) [m] of points (Q, 3) to the union of what is present; exact outside of everything."""
+    return closest_of(primitives, points_world, stamp_ns)[0]
+
+
+def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
+    """Signed distance (Q,) [m] and surface point (Q, 3) of the nearest present primitive (inf, NaN where none)."""
+    points = np.asarray(points_world, dtype=np.float64)
+    distance = np.full(len(points), np.inf)
+    surface = np.full((len(points), 3), np.nan)
+    for primitive in primitives:
+        if primitive.is_present(stamp_ns):
+            near, where = closest_point(primitive, points)
+            is_nearer = near < distance
+            distance[is_nearer] = near[is_nearer]
+            surface[is_nearer] = where[is_nearer]
+    return distance, surface
+
+
+def truth_document(truth: Truth) -> dict[str, Any]:
+    """The truth as plain JSON values; `load_truth` reads them back unchanged."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "frame": "world",
+        "units": {"length": "m", "time": "ns", "angle": "rad"},
+        "primitives": [_primitive_document(primitive) for primitive in truth.primitives],
+        "cameras": [
+            {
+                "name": camera.name,
+                "role": "training" if camera.is_training else "scoring",
+                "intrinsics": asdict(camera.intrinsics),
+                "T_world_camera": camera.T_world_camera.tolist(),
+                "luminance_std": round(truth.luminance_std[camera.name], 6),
+            }
+            for camera in truth.cameras
+        ],
+        "robot": {
+            "urdf": truth.robot_urdf.name,
+            "spheres": truth.robot_spheres.name,
+            "joint_names": list(truth.joint_names),
+            "T_world_base": truth.T_world_base.tolist(),
+        },
+        "clearance": {
+            "of": "moving collision spheres to everything present but the robot",
+            "min": round(float(np.min(truth.clearance)), 6),
+            "stamps": truth.stamps.tolist(),
+            "distance": [round(value, 6) for value in truth.clearance.tolist()],
+        },
+    }
+
+
+def load_truth(path: Path) -> Truth:
+    """The truth file `path`. Raises InputError when it is missing, no truth file, or lacks a part."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give a truth.json") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not valid JSON: {error}") from None
+    is_ours = isinstance(document, dict) and document.get("format") == FORMAT
+    if not is_ours or document.get("version") != VERSION:
+        raise InputError(
+            f"{path}: expected {FORMAT} version {VERSION}", remedy="give the truth.json that simulate wrote"
+        )
+    try:
+        return _parsed(path, document)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: damaged: {type(error).__name__}: {error}", remedy="write it anew with simulate"
+        ) from None
+
+
+def _parsed(path: Path, document: dict[str, Any]) -> Truth:
+    robot, clearance = document["robot"], document["clearance"]
+    cameras = tuple(
+        Camera(
+            name=entry["name"],
+            intrinsics=Intrinsics(**entry["intrinsics"]),
+            T_world_camera=_pose(entry["T_world_camera"]),
+            is_training=entry["role"] == "training",
+        )
+        for entry in document["cameras"]
+    )
+    return Truth(
+        path=path,
+        primitives=tuple(_primitive(entry) for entry in document["primitives"]),
+        cameras=cameras,
+        luminance_std={entry["name"]: float(entry["luminance_std"]) for entry in document["cameras"]},
+        joint_names=tuple(robot["joint_names"]),
+        robot_urdf=path.parent / robot["urdf"],
+        robot_spheres=path.parent / robot["spheres"],
+        T_world_base=_pose(robot["T_world_base"]),
+        stamps=np.array(clearance["stamps"], dtype=np.int64),
+        clearance=np.array(clearance["distance"], dtype=np.float64),
+    )
+
+
+def _primitive_document(primitive: Primitive) -> dict[str, Any]:
+    return {
+        "name": primitive.name,
+        "kind": primitive.kind,
+        "size": list(primitive.size),
+        "T_world_shape": primitive.T_world_shape.tolist(),
+        "from_ns": None if primitive.from_ns == ALWAYS[0] else primitive.from_ns,
+        "to_ns": None if primitive.to_ns == ALWAYS[1] else primitive.to_ns,
+        "texture": asdict(primitive.texture),
+    }
+
+
+def _primitive(entry: dict[str, Any]) -> Primitive:
+    if len(entry["size"]) != NUM_SIZES[entry["kind"]] or min(entry["size"]) <= 0:
+        raise ValueError(f"size of {entry['name']}: {entry['size']}")
+    texture = entry["texture"]
+    return Primitive(
+        name=entry["name"],
+        kind=entry["kind"],
+        size=tuple(entry["size"]),
+        T_world_shape=_pose(entry["T_world_shape"]),
+        texture=Texture(**{**texture, "dark": tuple(texture["dark"]), "bright": tuple(texture["bright"])}),
+        from_ns=ALWAYS[0] if entry["from_ns"] is None else entry["from_ns"],
+        to_ns=ALWAYS[1] if entry["to_ns"] is None else entry["to_ns"],
+    )
+
+
+def _pose(rows: object) -> Float64:
+    T = np.array(rows, dtype=np.float64)
+    if T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6):
+        raise ValueError(f"not a rigid transform: {rows}")
+    return T
