@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         with output_path(args.out, force=args.force, is_folder=True) as folder:
             _write(folder, args, source, result, scores, stopwatch)
     console.result(result, _lines(result))
-    check_gates(args.require, {name: None if isnan(value) else value for name, value in totals.items()})
+    check_gates(args.require, result["metrics"])
     return DAMAGED if source.loss.damaged else 0
 
 
