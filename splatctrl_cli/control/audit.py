@@ -9,23 +9,26 @@ from numpy.typing import NDArray
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import pair_distance
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import DistanceField, Float64, JointState
+from splatctrl_cli.records import Float64, JointState
 
 Stamps = NDArray[np.int64]
 Channel = NDArray[np.uint8]
 
-FieldsAt = Callable[[int], Mapping[str, DistanceField]]
-"""The fields known at a stamp [ns], by name; the same object for the same scene, so that states share a query."""
+DistanceFunction = Callable[[Float64], Float64]
+"""points (Q, 3) [m], world -> distance (Q,) [m], NaN where there is none."""
+
+DistancesAt = Callable[[int], Mapping[str, DistanceFunction]]
+"""The distances known at a stamp [ns], by name; the same object for the same scene, so that states share a query."""
 
 Observed = Callable[[Float64], Channel]
 """points (Q, 3) [m], world -> the observed channel (Q,) uint8: 0 = never seen."""
 
-CHUNK = 256  # states per field query
+CHUNK = 256  # states per query
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
-    """distance (T,) [m] of the nearest moving sphere's surface, NaN where the field has none; sphere (T,) its index.
+    """distance (T,) [m] of the nearest moving sphere's surface, NaN where there is none; sphere (T,) its index.
 
     For self-collision, of the nearest pair; sphere is then the pair's index, -1 without pairs.
     """
@@ -79,26 +82,26 @@ def checked_states(model: ArmModel, states: Sequence[JointState]) -> tuple[Stamp
     return stamps, positions
 
 
-def moving_clearance(model: ArmModel, centers: Float64, field: DistanceField) -> Clearance:
+def moving_clearance(model: ArmModel, centers: Float64, distance_to: DistanceFunction) -> Clearance:
     """The smallest sphere clearance of every state, from the centres (T, S, 3) [m] of all spheres."""
     moving = np.flatnonzero(model.moving_spheres)
     points = np.ascontiguousarray(centers[:, moving].reshape(-1, 3))
-    distance = field.query(points)[0].reshape(len(centers), len(moving)) - model.sphere_set.radii[moving]
+    distance = distance_to(points).reshape(len(centers), len(moving)) - model.sphere_set.radii[moving]
     nearest = np.argmin(distance, axis=1)
     return Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=moving[nearest])
 
 
 def audit(
-    model: ArmModel, states: Sequence[JointState], fields_at: FieldsAt, *, observed: Observed | None = None
+    model: ArmModel, states: Sequence[JointState], distances_at: DistancesAt, *, observed: Observed | None = None
 ) -> AuditTrace:
-    """The clearances of every logged state, each by the fields that were known at its stamp."""
+    """The clearances of every logged state, each by the distances that were known at its stamp."""
     stamps, positions = checked_states(model, states)
     parts: dict[str, list[Clearance]] = {}
     self_parts, unknown_parts = [], []
-    for first, last in _runs(stamps, fields_at):
+    for first, last in _runs(stamps, distances_at):
         centers = model.sphere_centers_batch(positions[first:last])
-        for name, field in fields_at(int(stamps[first])).items():
-            parts.setdefault(name, []).append(moving_clearance(model, centers, field))
+        for name, distance_to in distances_at(int(stamps[first])).items():
+            parts.setdefault(name, []).append(moving_clearance(model, centers, distance_to))
         self_parts.append(_self_clearance(model, centers))
         unknown_parts.append(_unknown_share(model, centers, observed))
     limit = np.minimum(model.upper - positions, positions - model.lower)
@@ -114,9 +117,22 @@ def audit(
     )
 
 
-def _runs(stamps: Stamps, fields_at: FieldsAt) -> list[tuple[int, int]]:
-    """Ranges of at most CHUNK consecutive states that see the same fields."""
-    known = [fields_at(int(stamp)) for stamp in stamps]
+def observed_lookup(seen: Channel, origin: Float64, voxel: float) -> Observed:
+    """What the voxel nearest to each point says; 0 (never seen) outside. seen (X, Y, Z); origin (3,), voxel [m]."""
+
+    def observed(points: Float64) -> Channel:
+        cell = np.floor((points - origin) / voxel + 0.5).astype(np.int64)
+        is_inside = np.all((cell >= 0) & (cell < seen.shape), axis=1)
+        found = np.zeros(len(points), dtype=np.uint8)
+        found[is_inside] = seen[tuple(cell[is_inside].T)]
+        return found
+
+    return observed
+
+
+def _runs(stamps: Stamps, distances_at: DistancesAt) -> list[tuple[int, int]]:
+    """Ranges of at most CHUNK consecutive states that see the same scene."""
+    known = [distances_at(int(stamp)) for stamp in stamps]
     starts = [i for i in range(len(stamps)) if i == 0 or known[i] is not known[i - 1]]
     cuts = [c for a, b in zip(starts, [*starts[1:], len(stamps)], strict=True) for c in range(a, b, CHUNK)]
     return list(zip(cuts, [*cuts[1:], len(stamps)], strict=True))

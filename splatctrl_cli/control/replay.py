@@ -17,6 +17,7 @@ from splatctrl_cli.control.step import (
     StaticViolation,
     check_config,
     checked_posture,
+    static_violations,
 )
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.records import DistanceField, Float64
@@ -76,7 +77,7 @@ def closed_loop(
     field = field_at(task.stamp_ns)
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
     _check_free(model, field, q)
-    statics = controller.static_violations(q)
+    statics = static_violations(model, config, field, q)
     stamps, positions, steps = [], [], []
     outcome = Outcome.TIMEOUT
     for index in range(max(round(config.max_time / config.period), 1)):

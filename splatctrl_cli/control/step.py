@@ -136,17 +136,6 @@ class QpIkController:
         other.__dict__.update(self.__dict__, _field=field)
         return other
 
-    def static_violations(self, q: Float64) -> tuple[StaticViolation, ...]:
-        """The spheres that no joint moves and that stand within the margin: a matter of mounting, not of control."""
-        still = np.flatnonzero(~np.asarray(self._model.moving_spheres))
-        if not len(still):
-            return ()
-        distance = self._field.query(self._model.sphere_centers(q)[still])[0] - self._radii[still]
-        pairs = zip(still, distance, strict=True)
-        return tuple(
-            StaticViolation(sphere=self._names[s], clearance=float(d)) for s, d in pairs if d < self._config.margin
-        )
-
     def step(self, q: Float64, T_world_goal: Float64, *, distance_rate: float | Float64 = 0.0) -> ControlStep:
         """The joint velocity at q (J,) [rad] towards a goal pose (4, 4) of the controlled frame.
 
@@ -305,6 +294,23 @@ def _where(mask: Bool) -> list[int]:
 
 def _both(rows: _Barriers) -> tuple[Barrier, Barrier]:
     return rows.external, rows.self
+
+
+def static_violations(
+    model: ArmModel, config: ControlConfig, field: DistanceField, q: Float64
+) -> tuple[StaticViolation, ...]:
+    """The spheres that no joint moves and that stand within the margin: a matter of mounting, not of control."""
+    still = np.flatnonzero(~np.asarray(model.moving_spheres))
+    if not len(still):
+        return ()
+    points = np.ascontiguousarray(model.sphere_centers(q)[still])
+    distance = field.query(points)[0] - model.sphere_set.radii[still]
+    names = sphere_names(model.sphere_set)
+    return tuple(
+        StaticViolation(sphere=names[s], clearance=float(d))
+        for s, d in zip(still, distance, strict=True)
+        if d < config.margin
+    )
 
 
 def is_usable(solution: QpSolution, max_residual: float) -> bool:

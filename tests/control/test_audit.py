@@ -5,10 +5,14 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from splatctrl_cli.control.audit import audit
+from splatctrl_cli.control.audit import DistanceFunction, audit, observed_lookup
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import DistanceField, Float64, JointState
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away
+
+
+def known(**fields: DistanceField) -> Mapping[str, DistanceFunction]:
+    return {name: lambda points, field=field: field.query(points)[0] for name, field in fields.items()}
 
 
 def state(stamp_ns: int, *position: float) -> JointState:
@@ -16,21 +20,21 @@ def state(stamp_ns: int, *position: float) -> JointState:
 
 
 def test_the_clearance_is_that_of_the_nearest_moving_sphere() -> None:
-    wall: Mapping[str, DistanceField] = {"exact": Plane([-1.0, 0, 0], -1.2), "half": Plane([-1.0, 0, 0], -1.2, 0.5)}
-    trace = audit(PlanarArm(), [state(0, 0.0, 0.0), state(5, np.pi / 2, 0.0)], lambda _: wall)
+    walls = known(exact=Plane([-1.0, 0, 0], -1.2), half=Plane([-1.0, 0, 0], -1.2, 0.5))
+    trace = audit(PlanarArm(), [state(0, 0.0, 0.0), state(5, np.pi / 2, 0.0)], lambda _: walls)
     np.testing.assert_allclose(trace.clearance["exact"].distance, [1.2 - 0.9 - 0.04, 1.2 - 0.04])
     np.testing.assert_allclose(trace.clearance["half"].distance[0], 0.5 * 0.3 - 0.04)
     assert trace.clearance["exact"].sphere[0] == 4
 
 
 def test_a_sphere_that_no_joint_moves_does_not_count() -> None:
-    trace = audit(PlanarArm(), [state(0, 0.0, 0.0)], lambda _: {"exact": Balls([[0.0, 0, 0]], [0.01])})
+    trace = audit(PlanarArm(), [state(0, 0.0, 0.0)], lambda _: known(exact=Balls([[0.0, 0, 0]], [0.01])))
     assert trace.clearance["exact"].distance[0] == pytest.approx(0.25 - 0.01 - 0.04)
 
 
 def test_each_state_is_measured_in_the_scene_known_at_its_stamp() -> None:
-    before: Mapping[str, DistanceField] = {"exact": Plane([-1.0, 0, 0], -2.0)}
-    after: Mapping[str, DistanceField] = {"exact": Plane([-1.0, 0, 0], -1.5)}
+    before = known(exact=Plane([-1.0, 0, 0], -2.0))
+    after = known(exact=Plane([-1.0, 0, 0], -1.5))
     states = [state(stamp, 0.0, 0.0) for stamp in range(600)]
     trace = audit(PlanarArm(), states, lambda stamp: before if stamp < 300 else after)
     np.testing.assert_allclose(trace.clearance["exact"].distance[:300], 1.06)
@@ -39,17 +43,16 @@ def test_each_state_is_measured_in_the_scene_known_at_its_stamp() -> None:
 
 def test_states_of_one_scene_share_a_query() -> None:
     ball = far_away()
-    known = {"exact": ball}
-    audit(PlanarArm(), [state(stamp, 0.0, 0.1) for stamp in range(200)], lambda _: known)
+    scene = known(exact=ball)
+    audit(PlanarArm(), [state(stamp, 0.0, 0.1) for stamp in range(200)], lambda _: scene)
     assert ball.num_queries == 1
 
 
 def test_a_field_without_a_distance_gives_nan_and_not_a_guess() -> None:
-    class Nowhere:
-        def query(self, points: Float64) -> tuple[Float64, Float64]:
-            return np.where(points[:, 0] > 0.8, np.nan, 1.0), np.zeros_like(points)
+    def half_known(points: Float64) -> Float64:
+        return np.where(points[:, 0] > 0.8, np.nan, 1.0)
 
-    trace = audit(PlanarArm(), [state(0, 0.0, 0.0), state(1, np.pi, 0.0)], lambda _: {"grid": Nowhere()})
+    trace = audit(PlanarArm(), [state(0, 0.0, 0.0), state(1, np.pi, 0.0)], lambda _: {"grid": half_known})
     assert np.isnan(trace.clearance["grid"].distance[0])
     assert trace.clearance["grid"].distance[1] == pytest.approx(0.96)
 
@@ -59,7 +62,7 @@ def test_limits_self_clearance_and_unknown_space_are_reported() -> None:
     trace = audit(
         PlanarArm(),
         states,
-        lambda _: {"exact": far_away()},
+        lambda _: known(exact=far_away()),
         observed=lambda points: (points[:, 0] < 0.3).astype(np.uint8),
     )
     np.testing.assert_allclose(trace.limit_margin, [0.1, -0.1])
@@ -84,4 +87,11 @@ def test_limits_self_clearance_and_unknown_space_are_reported() -> None:
 )
 def test_states_that_cannot_be_audited_are_refused(states: list[JointState], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        audit(PlanarArm(), states, lambda _: {"exact": far_away()})
+        audit(PlanarArm(), states, lambda _: known(exact=far_away()))
+
+
+def test_a_point_takes_the_word_of_its_nearest_voxel() -> None:
+    seen = np.arange(8, dtype=np.uint8).reshape(2, 2, 2)
+    observed = observed_lookup(seen, np.array([1.0, 1, 1]), 0.1)
+    points = np.array([[1.0, 1, 1], [1.04, 1.06, 1.0], [1.1, 1.1, 1.149], [1.1, 1.1, 1.151], [0.9, 1, 1]])
+    assert observed(points).tolist() == [0, 2, 7, 0, 0]

@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
-from splatctrl_cli.control.step import QpIkController, Rung, is_usable, middle_posture
+from splatctrl_cli.control.step import QpIkController, Rung, is_usable, middle_posture, static_violations
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.records import DistanceField, Float64
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away
@@ -102,10 +102,9 @@ def test_rows_that_cannot_all_hold_are_relaxed_and_named() -> None:
 
 def test_spheres_that_no_joint_moves_stay_out_of_the_program_and_are_reported() -> None:
     buried_base = Balls([[0.0, 0.0, 0.0]], [0.1])
-    own = controller(buried_base)
-    step = own.step(Q, goal(np.array([0.35, 0.55])))
+    step = controller(buried_base).step(Q, goal(np.array([0.35, 0.55])))
     assert step.rung is Rung.SOLVED
-    (violation,) = own.static_violations(Q)
+    (violation,) = static_violations(PlanarArm(), CONFIG, buried_base, Q)
     assert violation.sphere == "base[0]"
     assert violation.clearance == pytest.approx(-0.1 - 0.06)
 

@@ -1,0 +1,98 @@
+"""What a row of clearances amounts to: intervals below the margin, and agreement with a known truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.evaluate.visibility import seen_by
+from splatctrl_cli.records import Bool, Float64, RgbdFrame
+
+NEAR = 0.10  # [m] true clearance below which a state takes part in the comparison
+ALLOWANCE = 0.01  # [m] the clearance may be off by this and the median splat radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """A run of states below the margin: first and last stamp [ns], the least clearance [m] and at which state."""
+
+    first_ns: int
+    last_ns: int
+    least: float
+    state: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClearanceAgreement:
+    """Over `num_states` compared states: |clearance - truth| as median, 95 % and largest [m], the largest
+    over-estimate [m], and the share of states within `tolerance` [m].
+    """
+
+    num_states: int
+    median: float | None
+    p95: float | None
+    largest: float | None
+    largest_over: float | None
+    tolerance: float
+    share_within: float | None
+
+
+def intervals_below(stamp_ns: NDArray[np.int64], clearance: Float64, margin: float) -> tuple[Interval, ...]:
+    """The runs of consecutive states with a clearance (T,) below the margin [m]; NaN is not below."""
+    is_below = clearance < margin
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_below, [False]]).astype(np.int8)))
+    intervals = []
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        at = int(first + np.argmin(clearance[first:end]))
+        intervals.append(
+            Interval(
+                first_ns=int(stamp_ns[first]),
+                last_ns=int(stamp_ns[end - 1]),
+                least=float(clearance[at]),
+                state=at,
+            )
+        )
+    return tuple(intervals)
+
+
+def clearance_agreement(
+    clearance: Float64, truth: Float64, is_seen: Bool, median_radius: float
+) -> ClearanceAgreement:
+    """Clearance (T,) against the truth (T,) [m], over states nearer than 10 cm to a surface that was seen (T,)."""
+    tolerance = ALLOWANCE + median_radius
+    compared = (truth < NEAR) & is_seen & np.isfinite(clearance)
+    error = clearance[compared] - truth[compared]
+    if not len(error):
+        return ClearanceAgreement(
+            num_states=0,
+            median=None,
+            p95=None,
+            largest=None,
+            largest_over=None,
+            tolerance=tolerance,
+            share_within=None,
+        )
+    size = np.abs(error)
+    return ClearanceAgreement(
+        num_states=len(error),
+        median=float(np.median(size)),
+        p95=float(np.percentile(size, 95)),
+        largest=float(size.max()),
+        largest_over=float(max(error.max(), 0.0)),
+        tolerance=tolerance,
+        share_within=float(np.mean(size <= tolerance)),
+    )
+
+
+def mark_seen(
+    seen: Bool, points_world: Float64, stamp_ns: NDArray[np.int64], frame: RgbdFrame, *, has_clock: bool = True
+) -> None:
+    """Set `seen` (T,) where a surface point (T, 3) [m], asked for at a stamp (T,), was seen in a frame not later."""
+    asked = np.flatnonzero(~seen & ((stamp_ns >= frame.stamp_ns) | (not has_clock)))
+    seen[asked] = seen_by(points_world[asked], [frame])
+
+
+def least(values: Float64) -> float | None:
+    """The smallest finite value, None without one."""
+    finite = values[np.isfinite(values)]
+    return float(finite.min()) if len(finite) else None
