@@ -6,10 +6,6 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_INFLATION = (
-    0.01  # [m] of the kernel field's zero level beyond the radius; 1 cm is what the issue of accuracy allows
-)
-
 
 @dataclass(frozen=True, kw_only=True)
 class FieldHealth:
@@ -58,7 +54,7 @@ def _warnings(spacing: float, radius: float, length: float, zero_level: float) -
             f"spacing {spacing * 1e3:.1f} mm exceeds the length scale {length * 1e3:.1f} mm: "
             "the kernel field does not join neighbouring splats"
         )
-    if zero_level - radius > MAX_INFLATION:
+    if zero_level - radius > length:
         yield (
             f"the kernel field's surface stands {zero_level * 1e3:.1f} mm before a dense plane of splats, "
             f"{(zero_level - radius) * 1e3:.1f} mm beyond their radius; a smaller length scale brings it closer"

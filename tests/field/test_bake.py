@@ -1,0 +1,136 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field import bake as bake_module
+from splatctrl_cli.field.bake import bake, bounding_box, grid_shape
+from splatctrl_cli.field.distance import GpdfField, SphereField
+from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, OccupancyGrid
+from tests.field.scenes import cloud, splat_set
+from tests.reference import field as reference
+
+BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
+CONFIG = FieldConfig(voxel=0.03)
+
+
+def cell_centers(grid: DistanceGrid) -> Float64:
+    shape = grid.channels["sdf"].shape
+    return grid.origin + grid.voxel * np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1)
+
+
+@pytest.mark.parametrize("length", [1e-9, 0.001, 0.02, 0.3])
+def test_culled_bake_equals_brute_force(length: float) -> None:
+    centers, radii = cloud()
+    centers, radii = centers.astype(np.float32).astype(np.float64), radii.astype(np.float32).astype(np.float64)
+    grid = bake(splat_set(centers, radii), BOX, replace(CONFIG, length_scale=length))
+    points = cell_centers(grid)
+    hard = reference.hard(points, centers, radii)
+    gpdf = reference.gpdf(points, centers, radii, length, CONFIG.noise)
+    np.testing.assert_allclose(grid.channels["hard"].ravel(), hard, atol=2e-7)
+    error = grid.channels["gpdf"].ravel() - gpdf
+    assert error.min() > -3e-7 - 2e-6 * length
+    assert error.max() < length * 1.001e-3 + 4e-7
+    np.testing.assert_array_equal(grid.channels["sdf"], np.minimum(grid.channels["hard"], grid.channels["gpdf"]))
+
+
+def test_baked_gradient_is_that_of_the_smaller_distance() -> None:
+    centers, radii = cloud()
+    grid = bake(splat_set(centers, radii), BOX, CONFIG)
+    points, gradient = cell_centers(grid), grid.channels["gradient"].reshape(-1, 3)
+    is_exact = (grid.channels["hard"] < grid.channels["gpdf"]).ravel()
+    exact, smooth = SphereField(centers, radii), GpdfField(centers, radii, CONFIG.length_scale, truncation=1e-6)
+    assert is_exact.any()
+    np.testing.assert_allclose(gradient[~is_exact], smooth.query(points[~is_exact])[1], atol=2e-3)
+    np.testing.assert_allclose(gradient[is_exact], exact.query(points[is_exact])[1], atol=1e-4)
+
+
+def test_threads_and_repeats_do_not_change_a_bit(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    splats = splat_set(*cloud())
+    for threads in (1, 2, 3):
+        write_npz(tmp_path / f"{threads}.npz", bake(splats, BOX, CONFIG, threads=threads))
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+
+
+def test_grid_covers_its_box_with_cell_centres() -> None:
+    assert grid_shape(Box(lower=np.zeros(3), upper=np.array([1.0, 0.5, 0.05])), 0.1) == (11, 6, 2)
+    assert grid_shape(Box(lower=np.zeros(3), upper=np.array([0.01, 0.3, 0.31])), 0.1) == (2, 4, 5)
+
+
+def test_bounding_box_holds_every_sphere() -> None:
+    box = bounding_box(splat_set(np.array([[0.0, 0, 0], [1, 1, 1]]), np.array([0.1, 0.2])), padding=0.5)
+    np.testing.assert_allclose(box.lower, -0.6, atol=1e-7)
+    np.testing.assert_allclose(box.upper, 1.7, atol=1e-7)
+
+
+def test_robot_splats_are_left_out_unless_asked_for() -> None:
+    robot = splat_set(np.array([[0.0, 0, 0]]), np.array([0.01]), Label.ROBOT)
+    human = splat_set(np.array([[0.3, 0, 0]]), np.array([0.01]), Label.HUMAN)
+    both = replace(
+        robot,
+        **{
+            name: np.concatenate([getattr(robot, name), getattr(human, name)])
+            for name in ("centers", "radii", "colors", "opacities", "labels", "density")
+        },
+    )
+    box = Box(lower=np.full(3, -0.03), upper=np.full(3, 0.03))
+    assert bake(both, box, CONFIG).channels["hard"][1, 1, 1] == pytest.approx(0.29, abs=1e-6)
+    with_robot = bake(both, box, CONFIG, labels=set(Label))
+    assert with_robot.channels["hard"][1, 1, 1] == pytest.approx(-0.01, abs=1e-6)
+    assert with_robot.header["splats_used"] == {"object": 0, "robot": 1, "human": 1}
+    with pytest.raises(NotEvaluableError, match="none of 1 is labelled object, human"):
+        bake(robot, box, CONFIG)
+
+
+def test_observed_comes_from_the_occupancy_voxel_of_the_cell() -> None:
+    shape = (3, 1, 1)
+    occupancy = OccupancyGrid(
+        origin=np.zeros(3),
+        voxel=0.1,
+        log_odds=np.array([-2.0, 2.0, 0.0], np.float32).reshape(shape),
+        num_updates=np.array([1, 1, 1], np.uint16).reshape(shape),
+        entity=np.zeros(shape, np.uint8),
+    )
+    box = Box(lower=np.array([-0.1, 0.0, 0.0]), upper=np.array([0.3, 0.1, 0.1]))
+    config = replace(CONFIG, voxel=0.1)
+    splats = splat_set(*cloud(10))
+    observed = bake(splats, box, config, occupancy=occupancy).channels["observed"]
+    np.testing.assert_array_equal(observed[:, 0, 0], [0, 1, 2, 3, 0])
+    assert not observed[:, 1].any()  # outside the occupancy grid
+    unseen = replace(occupancy, num_updates=np.zeros(shape, np.uint16))
+    assert not bake(splats, box, config, occupancy=unseen).channels["observed"].any()
+    assert not bake(splats, box, config).channels["observed"].any()
+
+
+def test_header_says_what_the_numbers_mean() -> None:
+    header = bake(splat_set(*cloud()), BOX, CONFIG).header
+    wanted = {"sign": "positive outside", "frame": "world", "units": "m", "weights": "rowsum", "kernel": "matern"}
+    assert {name: header[name] for name in wanted} == wanted
+    assert header["truncation_bound"] == pytest.approx(2.0e-5, rel=1e-2)
+
+
+def test_a_grid_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bake_module, "available_memory", lambda: 10**5)
+    with pytest.raises(UsageError, match=r"27 x 27 x 19 cells: needs 0.0 GiB.*larger --voxel"):
+        bake(splat_set(*cloud(10)), BOX, CONFIG)
+    assert bake_module.grid_shape(BOX, CONFIG.voxel) == (27, 27, 19)
+
+
+def test_free_memory_is_some_bytes() -> None:
+    assert bake_module.available_memory() > 2**20
+
+
+def test_bad_boxes_voxels_and_splats_are_named() -> None:
+    splats = splat_set(*cloud(10))
+    with pytest.raises(UsageError, match="lower < upper"):
+        bake(splats, Box(lower=np.zeros(3), upper=np.array([1.0, 0.0, 1.0])), CONFIG)
+    with pytest.raises(UsageError, match="voxel: expected a size above 0"):
+        bake(splats, BOX, replace(CONFIG, voxel=0.0))
+    splats.centers[4] = np.nan
+    with pytest.raises(InputError, match="splat 4"):
+        bake(splats, BOX, CONFIG)
+    with pytest.raises(InputError, match="splat 0: expected a label of 0, 1 or 2, got 3"):
+        bake(replace(splats, labels=np.full(10, 3, np.uint8)), BOX, CONFIG)
