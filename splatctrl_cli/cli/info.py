@@ -1,15 +1,52 @@
-"""``splatctrl info``."""
+"""``splatctrl info``: describes any file the tool reads or writes."""
 
 import argparse
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import Subparsers, add_command
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
+from splatctrl_cli.cli.source_options import add_source, source_options
+
+if TYPE_CHECKING:
+    from splatctrl_cli.io.summary import Summary
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    add_command(subparsers, "info", run, summary="info")
+    parser = add_command(subparsers, "info", run, summary="describe a log, capture, scene, grid, robot or other file")
+    parser.add_argument("path", type=Path, help="file or folder")
+    add_source(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    raise NotImplementedError
+    from splatctrl_cli.io.describe import describe
+
+    summary = describe(args.path, source_options(args))
+    Console(args).result(summary.as_dict(), list(_lines(summary)))
+    return 3 if summary.damaged else 0
+
+
+def _lines(summary: "Summary") -> Iterator[str]:
+    yield f"{summary.path}: {summary.kind}"
+    yield from _facts(summary.facts, "  ")
+    for grid in summary.grids:
+        yield ""
+        yield from table(grid.header, grid.rows) if grid.rows else [f"no {grid.name}"]
+    if summary.missing:
+        yield ""
+        yield from (f"missing for a reconstruction: {item}" for item in summary.missing)
+    yield from (f"note: {note}" for note in summary.notes)
+
+
+def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
+    for key, value in facts.items():
+        name = str(key).replace("_", " ")
+        if isinstance(value, dict):
+            yield f"{indent}{name}:"
+            yield from _facts(value, indent + "  ")
+        elif isinstance(value, list):
+            yield f"{indent}{name}: {', '.join(map(str, value)) or '-'}"
+        else:
+            yield f"{indent}{name}: {f'{value:.6f}'.rstrip('0') if isinstance(value, float) else value}"

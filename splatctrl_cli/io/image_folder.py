@@ -24,7 +24,7 @@ from splatctrl_cli.io.poses import (
     world_camera,
 )
 from splatctrl_cli.io.registration import DepthToColor, Undistortion
-from splatctrl_cli.io.shot import Shot, check_depth
+from splatctrl_cli.io.shot import Shot, check_depth, is_kept
 from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, RgbdFrame
 
 HOLDOUT = "holdout"
@@ -112,6 +112,10 @@ class ImageFolderSource:
                 checked.add(view.camera)
             yield shot
 
+    def count_views(self) -> dict[str, int]:
+        """Views by camera."""
+        return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
+
     def digests(self) -> dict[str, str]:
         """sha256 of the description, the pose file and the images, by path below the root."""
         return dict(self._digests)
@@ -145,7 +149,7 @@ class ImageFolderSource:
             color = self._undistortion.color(np.asarray(color))
             depth = self._undistortion.depth(depth) if self._registration is None else depth
         is_counts = self._registration is None and self._description.depth.encoding != "float32"
-        is_plain = self._undistortion is None and view.color.suffix.lower() in {".png", ".jpg", ".jpeg"}
+        is_plain = self._undistortion is None and is_kept(color_bytes)
         return Shot(
             frame=RgbdFrame(
                 stamp_ns=view.stamp_ns,

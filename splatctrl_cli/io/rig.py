@@ -1,6 +1,6 @@
 """The cameras of a log made ready: intrinsics, world frame, lens and depth registration, or why they cannot be."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,7 @@ class Camera:
 
 def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[Camera, ...]:
     """Every camera to be read, complete. Raises InputError naming the camera, the topic and what it lacks."""
-    found = _given_topics(log, survey, options) or find_cameras(survey)
+    found = camera_topics(log, survey, options)
     if not found:
         raise _no_camera(log, survey)
     known = {camera.name: camera for camera in found}
@@ -64,6 +64,29 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
             remedy="record the transform that joins them, or choose with --cameras",
         )
     return cameras
+
+
+def camera_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
+    """The cameras that the options name, else those found."""
+    return _given_topics(log, survey, options) or find_cameras(survey)
+
+
+def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
+    """What a reconstruction from this log would lack, in words; empty where nothing."""
+    found = camera_topics(log, survey, options)
+    if not found:
+        lacks = [_no_camera(log, survey).message.removeprefix(f"{log.path}: ")]
+        if not survey.of_type(CAMERA_INFO):
+            lacks.append("no CameraInfo topic")
+        return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static)"]
+    lacks = []
+    for topics in found:
+        lacks.extend(_Builder(log, survey, options, topics).problems())
+        stamps = [survey.topics[name].stamps_ns for name in (topics.color, topics.depth)]
+        gap = nearest_gap_ns(*stamps) * 1e-9
+        if gap > options.pairing_tolerance_s:
+            lacks.append(f"camera {topics.name}: colour and depth are never closer than {gap * 1e3:.4g} ms")
+    return lacks
 
 
 def nearest_gap_ns(color_ns: Sequence[int], depth_ns: Sequence[int]) -> int:
@@ -91,34 +114,58 @@ class _Builder:
     """Makes one camera ready."""
 
     def __init__(self, log: RawLog, survey: Survey, options: SourceOptions, topics: CameraTopics) -> None:
+        self._path = log.path
         self._where = f"{log.path}: camera {topics.name}"
         self._survey = survey
         self._options = options
         self._topics = topics
 
     def build(self) -> Camera:
-        topics, survey = self._topics, self._survey
+        """The camera. Raises InputError for the first thing it lacks."""
+        topics = self._topics
         calibration = self._calibration(topics.info, topics.color)
-        image = survey.topics[topics.color].first_image
-        assert image is not None
-        fixed = self._options.camera_poses.get(topics.name)
-        is_fixed = fixed is not None
-        world = self._options.world_frame or ("world" if is_fixed else survey.tf.root_of(image.frame_id))
-        if not is_fixed:
-            self._check_tf(image.frame_id, world)
         intrinsics = intrinsics_of(calibration)
-        is_aligned = is_registered(survey, topics.color, topics.depth, topics.info, topics.depth_info)
+        fixed = self._options.camera_poses.get(topics.name)
+        world = self._check_world()
         return Camera(
             name=topics.name,
             color_topic=topics.color,
             depth_topic=topics.depth,
-            frame_id=image.frame_id,
+            frame_id=self._frame_id,
             world_frame=world,
             intrinsics=intrinsics,
             undistortion=self._undistortion(calibration, intrinsics),
-            depth_to_color=None if is_aligned else self._registration(intrinsics, image.frame_id),
+            depth_to_color=None if self._is_registered else self._registration(intrinsics),
             fixed_pose=None if fixed is None else transform_from(fixed[:3], fixed[3:]),
         )
+
+    def problems(self) -> list[str]:
+        """Everything that the camera lacks, in words; empty where `build` succeeds."""
+        found = []
+        intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
+        steps: list[Callable[[], object]] = [
+            lambda: self._calibration(self._topics.info, self._topics.color),
+            self._check_world,
+            lambda: None if self._is_registered else self._registration(intrinsics),
+            self.build,
+        ]
+        for step in steps:
+            try:
+                step()
+            except InputError as error:
+                found.append(error.message.removeprefix(f"{self._path}: "))
+        return list(dict.fromkeys(found))
+
+    @property
+    def _frame_id(self) -> str:
+        image = self._survey.topics[self._topics.color].first_image
+        assert image is not None
+        return image.frame_id
+
+    @property
+    def _is_registered(self) -> bool:
+        topics = self._topics
+        return is_registered(self._survey, topics.color, topics.depth, topics.info, topics.depth_info)
 
     def _calibration(self, info: str, image_topic: str) -> Calibration:
         calibration = self._survey.topics[info].calibration if info else None
@@ -148,18 +195,24 @@ class _Builder:
             frame_id=calibration.frame_id,
         )
 
-    def _check_tf(self, frame_id: str, world: str) -> None:
-        tf, topic = self._survey.tf, self._topics.color
+    def _check_world(self) -> str:
+        """The world frame, after checking that tf joins the camera to it."""
+        tf, frame_id = self._survey.tf, self._frame_id
+        if self._topics.name in self._options.camera_poses:
+            return self._options.world_frame or "world"
+        world = self._options.world_frame or tf.root_of(frame_id)
         if world not in tf.frames and tf.frames and self._options.world_frame:
             raise InputError(
                 f"{self._where}: tf has no frame {world!r}", remedy=f"--world-frame: use one of {_listed(tf.frames)}"
             )
         if frame_id not in tf.frames or not tf.connects(world, frame_id):
+            target = f" in {world!r}" if world != frame_id else ""
             raise InputError(
-                f"{self._where}: no tf for frame {frame_id!r} of topic {topic} in {world!r};"
+                f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
                 f" frames tf knows: {_listed(tf.frames)}",
                 remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw",
             )
+        return world
 
     def _undistortion(self, calibration: Calibration, intrinsics: Intrinsics) -> Undistortion | None:
         if not np.any(np.abs(calibration.distortion) > 1e-9) or "rect" in self._topics.color.rsplit("/", 2)[-1]:
@@ -171,12 +224,13 @@ class _Builder:
             )
         return Undistortion(intrinsics, calibration.distortion_model, calibration.distortion)
 
-    def _registration(self, color: Intrinsics, color_frame: str) -> DepthToColor:
+    def _registration(self, color: Intrinsics) -> DepthToColor:
         """How raw depth reaches the colour camera. Raises InputError where K or the transform is not known."""
-        topics, tf = self._topics, self._survey.tf
+        topics, tf, color_frame = self._topics, self._survey.tf, self._frame_id
         depth_image = self._survey.topics[topics.depth].first_image
         assert depth_image is not None
-        what = f"{self._where}: depth of {topics.depth} is not registered to colour of {topics.color}"
+        size = f"{depth_image.encoding} {depth_image.width}x{depth_image.height}"
+        what = f"{self._where}: depth {size} of {topics.depth} is not registered to colour of {topics.color}"
         remedy = "record depth aligned to colour"
         if not topics.depth_info:
             raise InputError(f"{what}, and {topics.depth} has no CameraInfo", remedy=f"record it, or {remedy}")

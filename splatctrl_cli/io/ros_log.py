@@ -17,7 +17,7 @@ from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.pairing import pair_by_stamp
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
-from splatctrl_cli.io.shot import Shot, check_depth, merged
+from splatctrl_cli.io.shot import Shot, check_depth, is_kept, merged
 from splatctrl_cli.io.survey import Survey, survey
 from splatctrl_cli.records import Float64, JointState, LossReport, Record, RgbdFrame
 
@@ -202,7 +202,7 @@ def _shot(planned: _Planned, color: ImageMessage, depth: ImageMessage, scale: fl
     )
     return Shot(
         frame=frame,
-        color_file=color.compressed if camera.undistortion is None else None,
+        color_file=color.compressed if camera.undistortion is None and is_kept(color.compressed) else None,
         depth_unit=_scale(depth, scale) if is_counts else None,
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
     )

@@ -30,9 +30,19 @@ class Shot:
 class ShotSource(RecordSource, Protocol):
     """A record source that also says how its frames were stored."""
 
+    @property
+    def world_frame(self) -> str:
+        """The frame of poses, as the source names it."""
+        ...
+
     def shots(self) -> Iterator[Shot | JointState]:
         """As `records`, with the frames as shots."""
         ...
+
+
+def is_kept(data: bytes | None) -> bool:
+    """Whether an image file's bytes are of a kind that captures hold: JPEG or PNG."""
+    return data is not None and data.startswith((b"\x89PNG\r\n", b"\xff\xd8\xff"))
 
 
 def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot | JointState]:

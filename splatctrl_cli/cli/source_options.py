@@ -1,0 +1,84 @@
+"""Options that say how a recorded input is to be read, for every subcommand that reads one."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.io.options import CameraTopics, SourceOptions
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """The options of a source, in a group of their own."""
+    group = parser.add_argument_group("input")
+    group.add_argument("--cameras", metavar="A,B", help="only these cameras")
+    group.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="NAME=COLOR,DEPTH[,INFO]",
+        help="topics of a camera, instead of those found (repeatable)",
+    )
+    group.add_argument(
+        "--camera-pose",
+        action="append",
+        default=[],
+        metavar="NAME=X,Y,Z,QX,QY,QZ,QW",
+        help="pose of a fixed camera in the world, instead of tf (repeatable)",
+    )
+    group.add_argument("--world-frame", metavar="FRAME", help="tf frame of poses (default: root of the tf tree)")
+    group.add_argument("--depth-scale", type=float, metavar="M", help="metres per count of depth (default: 0.001)")
+    group.add_argument(
+        "--pairing-tolerance", type=float, default=0.02, metavar="S", help="colour to depth, seconds (default: 0.02)"
+    )
+    group.add_argument("--joint-topic", metavar="TOPIC", help="JointState topic (default: /joint_states)")
+    group.add_argument("--root", type=Path, metavar="DIR", help="folder of the images that a .toml describes")
+    group.add_argument("--holdout", metavar="0,6", help="frames of an image folder that become camera 'holdout'")
+
+
+def source_options(args: argparse.Namespace) -> "SourceOptions":
+    """What `add_source` parsed. Raises UsageError for a value of the wrong form."""
+    from splatctrl_cli.io.options import SourceOptions
+
+    if args.depth_scale is not None and not args.depth_scale > 0:
+        raise UsageError(f"--depth-scale {args.depth_scale}: expected a positive number")
+    if not args.pairing_tolerance >= 0:
+        raise UsageError(f"--pairing-tolerance {args.pairing_tolerance}: expected seconds")
+    return SourceOptions(
+        world_frame=args.world_frame,
+        cameras=_names(args.cameras),
+        camera_topics=tuple(_topics(text) for text in args.camera),
+        camera_poses=dict(_pose(text) for text in args.camera_pose),
+        depth_scale=args.depth_scale,
+        pairing_tolerance_s=args.pairing_tolerance,
+        joint_topic=args.joint_topic,
+        root=args.root,
+        holdout=_names(args.holdout),
+    )
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(name for name in text.split(",") if name)
+
+
+def _topics(text: str) -> "CameraTopics":
+    from splatctrl_cli.io.options import CameraTopics
+
+    name, equals, rest = text.partition("=")
+    topics = rest.split(",")
+    if not (name and equals and len(topics) in {2, 3} and all(topics)):
+        raise UsageError(f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO")
+    return CameraTopics(name=name, color=topics[0], depth=topics[1], info=topics[2] if len(topics) == 3 else "")
+
+
+def _pose(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, rest = text.partition("=")
+    try:
+        values = tuple(float(value) for value in rest.split(","))
+    except ValueError:
+        values = ()
+    if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
+        raise UsageError(f"--camera-pose {text}: expected NAME=X,Y,Z,QX,QY,QZ,QW with a unit quaternion")
+    return name, values

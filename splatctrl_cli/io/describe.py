@@ -1,0 +1,179 @@
+"""What a file or folder is and holds, for every kind that the tool reads or writes."""
+
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.io.capture import is_capture, read_capture_header
+from splatctrl_cli.io.describe_file import describe_file
+from splatctrl_cli.io.image_folder import ImageFolderSource
+from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.raw_log import RawLog
+from splatctrl_cli.io.rig import camera_topics, missing
+from splatctrl_cli.io.shot import Shot
+from splatctrl_cli.io.summary import Grid, Summary
+from splatctrl_cli.io.survey import Survey, TopicSurvey, survey
+
+_LOG_MAGICS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3")
+_LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
+
+
+def describe(path: Path, options: SourceOptions | None = None) -> Summary:
+    """Describe `path`. Raises InputError where there is nothing, or nothing known."""
+    options = options or SourceOptions()
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if path.is_dir():
+        return _describe_folder(path, options)
+    with path.open("rb") as stream:
+        start = stream.read(16)
+    if start.startswith(_LOG_MAGICS) or path.suffix in _LOG_SUFFIXES:
+        return describe_log(open_raw_log(path), options)
+    if path.suffix == ".toml":
+        return _describe_images(path, options)
+    return describe_file(path)
+
+
+def describe_log(log: RawLog, options: SourceOptions) -> Summary:
+    """Topics, times, frames, cameras, and what a reconstruction would lack."""
+    found = survey(log)
+    with_messages = [t for t in found.topics.values() if t.count]
+    facts: dict[str, object] = {
+        "bytes": sum(file.stat().st_size for file in log.files),
+        "messages": found.num_messages,
+    }
+    if with_messages:
+        first, last = min(t.first_log_ns for t in with_messages), max(t.last_log_ns for t in with_messages)
+        facts |= {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
+    if found.tf.frames:
+        facts |= {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
+    joints = next((t.joints[0].names for t in found.topics.values() if t.joints), ())
+    if joints:
+        facts["joints"] = list(joints)
+    grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=[_topic_row(t) for t in _by_name(found)])]
+    cameras = camera_topics(log, found, options)
+    if cameras:
+        rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
+        grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
+    lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
+    notes = [*found.damage.notes, *found.tf.notes]
+    return Summary(
+        path=str(log.path),
+        kind=log.container,
+        facts=facts,
+        grids=tuple(grids),
+        missing=tuple(lacks),
+        notes=tuple(notes),
+        damaged=found.damage.count,
+    )
+
+
+_TOPIC_COLUMNS = ("topic", "type", "encoding", "count", "hz", "first message")
+
+
+def _by_name(found: Survey) -> list[TopicSurvey]:
+    return [found.topics[name] for name in sorted(found.topics)]
+
+
+def _topic_row(entry: TopicSurvey) -> list[object]:
+    span = (entry.last_log_ns - entry.first_log_ns) * 1e-9
+    rate = f"{(entry.count - 1) / span:.2f}" if entry.count > 1 and span > 0 else "-"
+    return [
+        entry.topic.name,
+        entry.topic.type_name or "-",
+        entry.topic.encoding or "-",
+        entry.count,
+        rate,
+        _first(entry),
+    ]
+
+
+def _first(entry: TopicSurvey) -> str:
+    image, calibration = entry.first_image, entry.calibration
+    if image is not None:
+        wrapped = " compressed" if image.compressed is not None else ""
+        return f"{image.width}x{image.height} {image.encoding}{wrapped} in frame {image.frame_id!r}"
+    if calibration is not None:
+        K = calibration.K
+        return f"{calibration.width}x{calibration.height} fx {K[0, 0]:.1f} cx {K[0, 2]:.1f} cy {K[1, 2]:.1f}"
+    if entry.joints:
+        return f"{len(entry.joints[0].names)} joints"
+    return "-"
+
+
+def _describe_folder(path: Path, options: SourceOptions) -> Summary:
+    if is_capture(path):
+        return _describe_capture(path)
+    if is_bag_folder(path):
+        return describe_log(open_raw_log(path), options)
+    files = sorted(p for p in path.rglob("*") if p.is_file())
+    names = {p.relative_to(path).as_posix() for p in files}
+    is_dtu = any(name.startswith("Cameras/") for name in names) and any(
+        name.startswith("Rectified/") for name in names
+    )
+    if not ("run.json" in names or "splats.ply" in names or is_dtu):
+        raise InputError(
+            f"{path}: a folder of no known kind",
+            remedy="expected a capture, ROS 2 bag, MVSNet scan or output of splatctrl; for images give their .toml",
+        )
+    kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
+    top = sorted(p for p in path.iterdir())
+    rows: list[list[object]] = [[p.name + "/" if p.is_dir() else p.name, _count(p), _size(p)] for p in top]
+    facts: dict[str, object] = {"files": len(files), "bytes": sum(p.stat().st_size for p in files)}
+    if "splats.ply" in names:
+        facts["splats"] = describe_file(path / "splats.ply").facts
+    if "run.json" in names:
+        facts["run"] = describe_file(path / "run.json").facts
+    grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
+
+
+def _describe_capture(path: Path) -> Summary:
+    header = read_capture_header(path)
+    rows = []
+    for name, camera in header["cameras"].items():
+        size = f"{camera['width']}x{camera['height']}"
+        rows.append([name, camera["num_frames"], size, camera["fx"], camera["depth_scale"]])
+    loss: dict[str, Any] = header["loss"]
+    facts: dict[str, object] = {
+        "recorded_from": header["name"],
+        "world_frame": header["world_frame"],
+        "has_clock": header["has_clock"],
+        "joints": header["joint_names"],
+        "loss": {key: value for key, value in loss.items() if key != "notes"},
+        "sources": len(header["sources"]),
+    }
+    grid = Grid(name="cameras", header=("camera", "frames", "size", "fx", "depth_scale"), rows=rows)
+    return Summary(path=str(path), kind="capture", facts=facts, grids=(grid,), notes=tuple(loss["notes"]))
+
+
+def _describe_images(path: Path, options: SourceOptions) -> Summary:
+    source = ImageFolderSource(path, options)
+    first = next((item for item in source.shots() if isinstance(item, Shot)), None)
+    counts = source.count_views()
+    facts: dict[str, object] = {"has_clock": source.has_clock}
+    if first is not None:
+        valid = first.frame.depth > 0
+        intrinsics = first.frame.intrinsics
+        facts |= {
+            "size": f"{intrinsics.width}x{intrinsics.height}",
+            "fx_fy_cx_cy": [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
+            "first_valid_depth_share": round(float(valid.mean()), 4),
+        }
+    loss = source.loss
+    facts["loss"] = {
+        "unpaired_color": loss.unpaired_color,
+        "unpaired_depth": loss.unpaired_depth,
+        "without_pose": loss.without_pose,
+    }
+    grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
+    return Summary(path=str(path), kind="image folder", facts=facts, grids=(grid,), notes=tuple(loss.notes))
+
+
+def _count(path: Path) -> int:
+    return sum(1 for p in path.rglob("*") if p.is_file()) if path.is_dir() else 1
+
+
+def _size(path: Path) -> int:
+    return sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) if path.is_dir() else path.stat().st_size
