@@ -12,15 +12,17 @@ FILES = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
 
 
 def make(destination: Path) -> int:
-    """Simulate with the default options and keep what does not change from run to run (not run.json)."""
+    """Simulate with the default options, a DTU scan too; keep all but run.json, which holds timings."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "simulated"
-        code = main(["simulate", "--out", str(out), "--quiet"])
+        code = main(["simulate", "--out", str(out), "--dtu", "--quiet"])
         if code != 0:
             return code
         (destination / "tabletop").mkdir(parents=True, exist_ok=True)
         for name in FILES:
             shutil.copyfile(out / name, destination / "tabletop" / name)
+        shutil.rmtree(destination / "dtu", ignore_errors=True)
+        shutil.copytree(out / "dtu", destination / "dtu")
     return 0
 
 

@@ -25,6 +25,9 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--noise", choices=("none", "realsense"), default="realsense", help="depth noise (default: realsense)"
     )
+    parser.add_argument(
+        "--dtu", action="store_true", help="write PATH/dtu too: a DTU scan of a scene that stands still"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,6 +51,9 @@ def run(args: argparse.Namespace) -> int:
         with stopwatch.stage("log"):
             truth, num_frames = _record(folder, options, console)
         write_json(folder / "truth.json", truth_document(truth))
+        if args.dtu:
+            with stopwatch.stage("dtu"):
+                _write_scan(folder / "dtu")
         metrics = _metrics(truth, num_frames)
         write_run(
             folder,
@@ -58,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             stopwatch=stopwatch,
             seed=options.seed,
         )
-        sizes = {path.name: path.stat().st_size for path in sorted(folder.iterdir())}
+        sizes = _sizes(folder)
     console.result({"out": str(out), "bytes": sizes, **metrics}, _report(out, truth, num_frames, sizes))
     return 0
 
@@ -109,6 +115,32 @@ def _truth(folder: Path, recording: "Recording", contrast: dict[str, float]) -> 
         stamps=stamps,
         clearance=clearance,
     )
+
+
+def _write_scan(root: Path) -> None:
+    from splatctrl_cli.io.dtu import DtuView, write_dtu
+    from splatctrl_cli.simulate.turntable import views
+
+    scan = [
+        DtuView(
+            name=frame.camera,
+            color=frame.color,
+            depth=frame.depth,
+            intrinsics=frame.intrinsics,
+            T_world_camera=frame.T_world_camera,
+        )
+        for frame in views()
+    ]
+    write_dtu(root, "scan1", scan)
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Bytes of each file, and of each folder's files in all."""
+    sizes = {}
+    for path in sorted(folder.iterdir()):
+        parts = [path] if path.is_file() else [part for part in path.rglob("*") if part.is_file()]
+        sizes[path.name if path.is_file() else f"{path.name}/"] = sum(part.stat().st_size for part in parts)
+    return sizes
 
 
 def _metrics(truth: "Truth", num_frames: dict[str, int]) -> dict[str, Any]:

@@ -1,0 +1,252 @@
+"""DTU scans in MVSNet's layout: reads real ones and writes ours.
+
+ROOT/Cameras/[train/]00000000_cam.txt (world-to-camera and K), ROOT/Cameras/pair.txt,
+ROOT/Rectified/SCAN_train/rect_001_3_r5000.png (view 0, light 3), ROOT/Depths_raw/SCAN/depth_map_0000.pfm with
+depth_visual_0000.png (above 10 where the depth counts). Lengths there are millimetres, here metres.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.io.pfm import read_pfm, write_pfm
+from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
+
+MILLIMETRES = 1000.0
+LIGHT = 3  # of seven; the one MVSNet's own lists test with
+RAW = (1600, 1200)  # pixels of DTU's cameras; 640x512 is half of that, cropped about the middle
+CROPPED = (640, 512)
+CROP = (80, 44)  # pixels cut off left and top of the half-size image
+VISIBLE_ABOVE = 10  # of depth_visual
+
+
+@dataclass(frozen=True, kw_only=True)
+class DtuView:
+    """One view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m] (0 = none), K in pixels, camera pose [m]."""
+
+    name: str
+    color: UInt8
+    depth: Float32
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class DtuScan:
+    """The views of one scan by number; files: what was read; without_depth: views left out for want of depth."""
+
+    name: str
+    views: tuple[DtuView, ...]
+    files: tuple[Path, ...]
+    without_depth: tuple[str, ...]
+
+
+def read_dtu(root: Path, scan: str | None = None) -> DtuScan:
+    """The views of scan `scan` (default: the only one) of a DTU folder.
+
+    K is scaled to the images as MVSNet's own loaders do (the file's K may be for 1600x1200 or for a quarter of the
+    image). Depth of another size than the image is sampled, not blended: from 1600x1200 at the pixels the image
+    was cut from; a smaller map sets only the pixels it was made for. Raises InputError naming the file.
+    """
+    scan, folder = _scan_folder(root, scan)
+    images = _images(folder)
+    views: list[DtuView] = []
+    files: list[Path] = []
+    without_depth: list[str] = []
+    for number, path in images.items():
+        color = _read_image(path)
+        size = (color.shape[1], color.shape[0])
+        camera = _camera_file(root, number)
+        K, T_world_camera = _read_camera(camera)
+        depth_path = _depth_file(root, scan, number)
+        if depth_path is None:
+            without_depth.append(path.name)
+            continue
+        visual = depth_path.with_name(f"depth_visual_{number:04d}.png")
+        depth = _read_depth(depth_path, visual, size)
+        views.append(
+            DtuView(
+                name=path.stem,
+                color=color,
+                depth=depth,
+                intrinsics=_fitted(K, size, camera),
+                T_world_camera=T_world_camera,
+            )
+        )
+        files += [path, camera, depth_path, *([visual] if visual.exists() else [])]
+    if not views:
+        raise InputError(
+            f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
+        )
+    return DtuScan(name=scan, views=tuple(views), files=tuple(files), without_depth=tuple(without_depth))
+
+
+def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
+    """Write views as one scan of a new DTU folder; a view's K is for its own image size."""
+    cameras = root / "Cameras"
+    rectified = root / "Rectified" / f"{scan}_train"
+    depths = root / "Depths_raw" / scan
+    for folder in (cameras, rectified, depths):
+        folder.mkdir(parents=True, exist_ok=True)
+    cameras.joinpath("pair.txt").write_text(_pairs(views), encoding="utf-8")
+    for number, view in enumerate(views):
+        cameras.joinpath(f"{number:08d}_cam.txt").write_text(_camera_text(view), encoding="utf-8")
+        image = rectified / f"rect_{number + 1:03d}_{LIGHT}_r5000.png"
+        image.write_bytes(cv2.imencode(".png", view.color[:, :, ::-1])[1].tobytes())
+        write_pfm(depths / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
+        visual = np.where(view.depth > 0, 255, 0).astype(np.uint8)
+        depths.joinpath(f"depth_visual_{number:04d}.png").write_bytes(cv2.imencode(".png", visual)[1].tobytes())
+
+
+def _scan_folder(root: Path, scan: str | None) -> tuple[str, Path]:
+    rectified = root / "Rectified"
+    if not rectified.is_dir():
+        raise InputError(
+            f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, got none",
+            remedy="give the folder that holds Rectified",
+        )
+    folders = {path.name.removesuffix("_train"): path for path in sorted(rectified.iterdir()) if path.is_dir()}
+    if scan is None and len(folders) == 1:
+        scan = next(iter(folders))
+    if scan is None or scan not in folders:
+        got = "several scans" if scan is None else f"no scan '{scan}'"
+        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}")
+    return scan, folders[scan]
+
+
+def _images(folder: Path) -> dict[int, Path]:
+    """Image of each view number, of light 3 where there is a choice."""
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        match = re.fullmatch(r"rect_(\d+)_(\d+|max)(_r5000)?\.(png|jpg)", path.name)
+        if match:
+            number = int(match[1]) - 1
+            if number not in found or match[2] == str(LIGHT):
+                found[number] = path
+    if not found:
+        raise InputError(f"{folder}: expected images such as rect_001_3_r5000.png, got none")
+    return dict(sorted(found.items()))
+
+
+def _read_image(path: Path) -> UInt8:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
+    return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def _camera_file(root: Path, number: int) -> Path:
+    """The camera of the training images where there is one, else of the full images."""
+    candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(f"{candidates[-1]}: missing", remedy="every image needs its camera file")
+
+
+def _read_camera(path: Path) -> tuple[Float64, Float64]:
+    """K (3, 3) as written and T_world_camera (4, 4) [m]."""
+    words = path.read_text(encoding="utf-8", errors="replace").split()
+    try:
+        extrinsic = np.array(words[words.index("extrinsic") + 1 :][:16], dtype=np.float64).reshape(4, 4)
+        K = np.array(words[words.index("intrinsic") + 1 :][:9], dtype=np.float64).reshape(3, 3)
+    except ValueError:
+        raise InputError(f"{path}: expected 'extrinsic' (4x4) and 'intrinsic' (3x3), got another text") from None
+    R = extrinsic[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise InputError(f"{path}: extrinsic: expected a rotation in its first three columns")
+    extrinsic[:3, 3] /= MILLIMETRES
+    return K, invert_transform(extrinsic)
+
+
+def _fitted(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
+    """K for an image of `size` (width, height), whichever of the sizes in use the file's K was made for."""
+    width, height = size
+    if _is_centered(K, width, height):
+        scale, crop = 1.0, (0, 0)
+    elif _is_centered(K, width / 4, height / 4):
+        scale, crop = 4.0, (0, 0)
+    elif _is_centered(K, *RAW) and size == CROPPED:
+        scale, crop = 0.5, CROP
+    elif _is_centered(K, *RAW) and width * RAW[1] == height * RAW[0]:
+        scale, crop = width / RAW[0], (0, 0)
+    else:
+        raise InputError(
+            f"{path}: principal point ({K[0, 2]:g}, {K[1, 2]:g}) fits no image of {width}x{height}, nor a quarter of "
+            f"it, nor 1600x1200"
+        )
+    return Intrinsics(
+        fx=float(K[0, 0] * scale),
+        fy=float(K[1, 1] * scale),
+        cx=float(K[0, 2] * scale - crop[0]),
+        cy=float(K[1, 2] * scale - crop[1]),
+        width=width,
+        height=height,
+    )
+
+
+def _is_centered(K: Float64, width: float, height: float) -> bool:
+    return bool(abs(K[0, 2] / width - 0.5) < 0.1 and abs(K[1, 2] / height - 0.5) < 0.1)
+
+
+def _depth_file(root: Path, scan: str, number: int) -> Path | None:
+    for folder in (f"Depths_raw/{scan}", f"Depths/{scan}_train", f"Depths/{scan}"):
+        path = root / folder / f"depth_map_{number:04d}.pfm"
+        if path.is_file():
+            return path
+    return None
+
+
+def _read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
+    """Depth (H, W) [m] at the pixels of an image of `size` (width, height), 0 = none."""
+    depth = read_pfm(path)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))
+    if visual.is_file():
+        shown = cv2.imread(str(visual), cv2.IMREAD_GRAYSCALE)
+        if shown is None or shown.shape != depth.shape:
+            raise InputError(f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
+        depth = np.where(shown > VISIBLE_ABOVE, depth, np.float32(0))
+    width, height = size
+    if depth.shape == (height, width):
+        return depth
+    if depth.shape == (RAW[1], RAW[0]) and size == CROPPED:
+        return np.ascontiguousarray(depth[2 * CROP[1] :: 2, 2 * CROP[0] :: 2][:height, :width])
+    factor = width // depth.shape[1] if depth.shape[1] else 0
+    if factor >= 2 and (depth.shape[1] * factor, depth.shape[0] * factor) == size:
+        spread = np.zeros((height, width), dtype=np.float32)
+        spread[::factor, ::factor] = depth
+        return spread
+    raise InputError(f"{path}: {depth.shape[1]}x{depth.shape[0]} does not fit an image of {width}x{height}")
+
+
+def _camera_text(view: DtuView) -> str:
+    T_camera_world = invert_transform(view.T_world_camera)
+    T_camera_world[:3, 3] *= MILLIMETRES
+    k = view.intrinsics
+    K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+    known = view.depth[view.depth > 0].astype(np.float64) * MILLIMETRES
+    near, far = (float(np.floor(known.min())), float(np.ceil(known.max()))) if known.size else (425.0, 935.0)
+    rows = ["extrinsic", *_rows(T_camera_world), "", "intrinsic", *_rows(K), "", f"{near:g} {(far - near) / 191:.6g}"]
+    return "\n".join(rows) + "\n"
+
+
+def _rows(matrix: Float64) -> list[str]:
+    return [" ".join(f"{value + 0.0:.10g}" for value in row) for row in matrix]
+
+
+def _pairs(views: Sequence[DtuView]) -> str:
+    """For each view the others, nearest camera first; the score falls with the distance of the cameras [mm]."""
+    centers = np.array([view.T_world_camera[:3, 3] for view in views]) * MILLIMETRES
+    lines = [str(len(views))]
+    for number in range(len(views)):
+        gaps = np.linalg.norm(centers - centers[number], axis=1)
+        order = [int(i) for i in np.argsort(gaps, kind="stable") if i != number][:10]
+        words = [f"{other} {1e6 / (1000 + gaps[other]):.2f}" for other in order]
+        lines += [str(number), " ".join([str(len(order)), *words])]
+    return "\n".join(lines) + "\n"
