@@ -1,12 +1,13 @@
 """``splatctrl score``: renders views that did not train a scene and compares them with what was recorded."""
 
 import argparse
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_gates, add_output, check_gates, table
+from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
@@ -23,7 +24,11 @@ DAMAGED = 3
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
     parser = add_command(
-        subparsers, "score", run, summary="compare renders of a scene with recorded views: PSNR, SSIM, depth error"
+        subparsers,
+        "score",
+        run,
+        summary="compare renders of a scene with recorded views (by default of the cameras that did not train it): "
+        "PSNR, SSIM, depth error",
     )
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a folder that reconstruct wrote")
     reference = parser.add_mutually_exclusive_group(required=True)
@@ -33,15 +38,6 @@ def register(subparsers: Subparsers) -> None:
     reference.add_argument("--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout")
     parser.add_argument("--scan", metavar="NAME", help="which scan of --dtu (default: the only one)")
     parser.add_argument(
-        "--holdout", metavar="VIEW,...", help="views of an image folder or --dtu that were held out of reconstruct"
-    )
-    parser.add_argument(
-        "--root", type=Path, metavar="DIR", help="where the files that an image folder's TOML names lie"
-    )
-    parser.add_argument(
-        "--cameras", metavar="NAME,...", help="cameras to score (default: those that did not train the scene)"
-    )
-    parser.add_argument(
         "--snapshots",
         choices=("newest", "final"),
         default="newest",
@@ -49,6 +45,7 @@ def register(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--allow-training", action="store_true", help="also score cameras that trained the scene")
     parser.add_argument("--threads", type=int, default=0, help="threads (default: one per core)")
+    add_source(parser)
     add_output(parser, default="none, the scores are only printed", what="folder for scores and pictures")
     add_gates(parser)
 
@@ -70,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
         "reference": str(args.reference or args.dtu),
         "cameras": list(cameras),
         "training_cameras": list(scene.cameras),
+        "has_clock": scores.has_clock,
         "snapshots": args.snapshots if scores.has_clock else "final",
         "protocol": PROTOCOL,
         "metrics": as_json(totals),
@@ -98,20 +96,16 @@ class _Scores:
 
 
 def _open_reference(args: argparse.Namespace) -> "RecordSource":
-    from splatctrl_cli.io.source import SourceOptions, open_source
-
-    holdout = None if args.holdout is None else tuple(_words(args.holdout))
+    """The recording with all its cameras: --cameras chooses those to score, the others say what was seen."""
     if args.dtu is not None:
         from splatctrl_cli.io.dtu_source import DtuSource, view_numbers
 
-        return DtuSource(args.dtu, args.scan, view_numbers(holdout or ()))
+        return DtuSource(args.dtu, args.scan, view_numbers(_words(args.holdout or "")))
+    from splatctrl_cli.io.source import open_source
+
     if args.scan:
         raise UsageError(f"--scan {args.scan}: only with --dtu", remedy="leave it out")
-    if args.reference.suffix != ".toml" and (holdout or args.root):
-        raise UsageError(
-            f"{args.reference}: --holdout and --root go with an image folder's TOML", remedy="give --cameras instead"
-        )
-    return open_source(args.reference, SourceOptions(holdout=holdout, root=args.root))
+    return open_source(args.reference, replace(source_options(args), cameras=None))
 
 
 def _words(text: str) -> list[str]:
@@ -267,7 +261,8 @@ HEADER = ("dB seen", "dB all", "SSIM seen", "SSIM all", "depth mm seen", "depth 
 
 
 def _lines(result: dict[str, Any]) -> list[str]:
-    views = [[view["view"], f"{view['stamp_ns'] / 1e9:.3f}", *_cells(view)] for view in result["views"]]
+    stamps = [f"{view['stamp_ns'] / 1e9:.3f}" if result["has_clock"] else "-" for view in result["views"]]
+    views = [[view["view"], stamp, *_cells(view)] for view, stamp in zip(result["views"], stamps, strict=True)]
     metrics = result["metrics"]
     views.append([f"mean of {metrics['num_views']:.0f}", "-", *_cells(metrics)])
     lines = table(("view", "stamp [s]", *HEADER), views)

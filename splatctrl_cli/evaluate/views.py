@@ -1,5 +1,6 @@
 """The views of a recording that are scored, each with what the training cameras had seen by then."""
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
@@ -8,7 +9,10 @@ from splatctrl_cli.records import RecordSource, RgbdFrame
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame to score, its name (camera and number), and the training frames that count as known at its time."""
+    """A frame to score, its name, and the training frames that count as known at its time.
+
+    The name is the camera and a number: among the camera's frames with a clock, among all views without one.
+    """
 
     name: str
     frame: RgbdFrame
@@ -23,31 +27,26 @@ def views_to_score(
     With a clock, what counts is the newest frame of each training camera not later than the view (a frame of the same
     stamp counts); without one, every training frame of the recording, which is then read twice.
     """
-    names = _Names()
     if not has_clock:
         known = tuple(frame for frame in _frames(source) if frame.camera in training)
-        for frame in _frames(source):
+        for number, frame in enumerate(_frames(source)):
             if frame.camera in scoring:
-                yield View(name=names.next(frame.camera), frame=frame, training=known)
+                yield View(name=_name(frame.camera, number), frame=frame, training=known)
         return
+    counts: Counter[str] = Counter()
     newest: dict[str, RgbdFrame] = {}
     for moment in _moments(source):
         newest |= {frame.camera: frame for frame in moment if frame.camera in training}
         for frame in moment:
             if frame.camera in scoring:
-                yield View(name=names.next(frame.camera), frame=frame, training=tuple(newest.values()))
+                name = _name(frame.camera, counts[frame.camera])
+                yield View(name=name, frame=frame, training=tuple(newest.values()))
+                counts[frame.camera] += 1
 
 
-class _Names:
-    """Numbers the frames of each camera: ``cam3-0000``, ``cam3-0001``, …; fit for file names."""
-
-    def __init__(self) -> None:
-        self._counts: dict[str, int] = {}
-
-    def next(self, camera: str) -> str:
-        number = self._counts.get(camera, 0)
-        self._counts[camera] = number + 1
-        return f"{camera.strip('/').replace('/', '_')}-{number:04d}"
+def _name(camera: str, number: int) -> str:
+    """``cam3-0000``: fit for a file name."""
+    return f"{camera.strip('/').replace('/', '_')}-{number:04d}"
 
 
 def _frames(source: RecordSource) -> Iterator[RgbdFrame]:

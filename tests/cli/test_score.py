@@ -13,6 +13,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.io import scene_folder, source
+from splatctrl_cli.io.dtu import DtuView, write_dtu
 from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.records import Float64, Intrinsics, LossReport, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
@@ -226,7 +227,6 @@ def test_a_training_camera_is_scored_only_when_allowed(scored: Path, capsys: pyt
         (["--cameras", ","], 2, "has no camera ','"),
         (["--require", "sharpness>=1"], 2, "unknown metric"),
         (["--scan", "scan1"], 2, "--scan scan1: only with --dtu"),
-        (["--holdout", "3"], 2, "--holdout and --root go with an image folder's TOML"),
         (["--dtu", "root"], 2, "not allowed with argument"),
     ],
 )
@@ -256,3 +256,38 @@ def test_a_recording_of_training_cameras_alone_is_refused(
     set_up(monkeypatch, FakeScene(cameras=("cam0", "cam3")), FakeSource(frames=FRAMES))
     assert run(scored) == 2
     assert "every camera trained the scene (cam0, cam3)" in capsys.readouterr().err
+
+
+def test_a_dtu_scan_is_scored_on_the_views_held_out(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = [
+        DtuView(name=f.camera, color=f.color, depth=f.depth, intrinsics=f.intrinsics, T_world_camera=f.T_world_camera)
+        for f in (frame(0, "a", FRONT), frame(1, "b", SIDE, 0.1), frame(2, "c", FRONT))
+    ]
+    write_dtu(scored / "dtu", "scan1", views)
+    set_up(monkeypatch, FakeScene(cameras=("camera",), has_clock=False, snapshots=()), FakeSource(frames=[]))
+    arguments = ["score", str(scored / "scene"), "--dtu", str(scored / "dtu"), "--holdout", "1", "--json"]
+    assert main(arguments) == 0
+    result = result_of(capsys)
+    (view,) = result["views"]
+    assert (view["view"], view["camera"], result["training_cameras"]) == ("holdout-0001", "holdout", ["camera"])
+    assert view["psnr_seen"] == pytest.approx(20.0, abs=0.6)
+    assert view["depth_median_seen"] < 1e-5
+    assert view["seen_share"] > 0.8
+
+
+def test_a_dtu_scan_without_views_held_out_is_refused(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    f = frame(0, "a", FRONT)
+    view = DtuView(name="a", color=f.color, depth=f.depth, intrinsics=f.intrinsics, T_world_camera=f.T_world_camera)
+    write_dtu(scored / "dtu", "scan1", [view])
+    set_up(monkeypatch, FakeScene(cameras=("camera",)), FakeSource(frames=[]))
+    assert main(["score", str(scored / "scene"), "--dtu", str(scored / "dtu")]) == 2
+    assert "every camera trained the scene (camera)" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["score", str(tmp_path), "--reference", "fake.mcap"]) == 4
+    assert "expected a scene folder with splats.ply and run.json" in capsys.readouterr().err
