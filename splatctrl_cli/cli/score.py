@@ -1,6 +1,7 @@
 """``splatctrl score``: renders views that did not train a scene and compares them with what was recorded."""
 
 import argparse
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from math import isnan
 from pathlib import Path
@@ -52,7 +53,6 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.evaluate.score import PROTOCOL, as_json, total_score
     from splatctrl_cli.io.output import Stopwatch, output_path
     from splatctrl_cli.io.scene_folder import open_scene
 
@@ -60,9 +60,23 @@ def run(args: argparse.Namespace) -> int:
     scene = open_scene(args.scene)
     source = _open_reference(args)
     cameras = _cameras_to_score(args, source.cameras, scene.cameras)
-    scores = _score_views(args, console, stopwatch, scene, source, cameras)
-    totals = total_score(scores.views) | {"num_skipped": len(scores.skipped)}
-    result: dict[str, Any] = {
+    output = output_path(args.out, force=args.force, is_folder=True) if args.out else nullcontext()
+    with output as folder:
+        scores = _score_views(args, console, stopwatch, scene, source, cameras)
+        result = _result(args, scene, cameras, scores)
+        if folder:
+            _write(folder, args, source, result, scores, stopwatch)
+    console.result(result, _lines(result))
+    check_gates(args.require, result["metrics"])
+    return DAMAGED if source.loss.damaged else 0
+
+
+def _result(
+    args: argparse.Namespace, scene: "SceneFolder", cameras: tuple[str, ...], scores: "_Scores"
+) -> dict[str, Any]:
+    from splatctrl_cli.evaluate.score import PROTOCOL, as_json, total_score
+
+    return {
         "scene": str(args.scene),
         "reference": str(args.reference or args.dtu),
         "cameras": list(cameras),
@@ -70,18 +84,12 @@ def run(args: argparse.Namespace) -> int:
         "has_clock": scores.has_clock,
         "snapshots": args.snapshots if scores.has_clock else "final",
         "protocol": PROTOCOL,
-        "metrics": as_json(totals),
+        "metrics": as_json(total_score(scores.views) | {"num_skipped": len(scores.skipped)}),
         "skipped_views": scores.skipped,
         "views": [
             {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scores.views
         ],
     }
-    if args.out:
-        with output_path(args.out, force=args.force, is_folder=True) as folder:
-            _write(folder, args, source, result, scores, stopwatch)
-    console.result(result, _lines(result))
-    check_gates(args.require, result["metrics"])
-    return DAMAGED if source.loss.damaged else 0
 
 
 @dataclass(kw_only=True)

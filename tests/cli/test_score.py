@@ -194,6 +194,15 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
     assert set(run_json["inputs"]) == {"fake", "scene/splats.ply"}
 
 
+def test_an_output_that_exists_is_refused_before_anything_is_rendered(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(FakeScene, "splats_at", lambda scene, stamp_ns: pytest.fail("rendered"))
+    (scored / "score").mkdir()
+    assert run(scored, "-o", scored / "score") == 2
+    assert "score: already exists; give --force" in capsys.readouterr().err
+
+
 def test_a_gate_that_fails_leaves_the_scores_and_exits_1(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scored, "-o", scored / "score", "--require", "psnr_seen>=20", "--require", "psnr_all>=90") == 1
     assert "psnr_all is" in capsys.readouterr().err
