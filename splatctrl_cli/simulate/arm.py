@@ -129,12 +129,11 @@ def arm_spheres_yaml() -> str:
 def covering_spheres(shapes: tuple[Capsule | Block, ...], spacing: float = 0.042) -> list[tuple[Float64, float]]:
     """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
 
-    Along a segment with steps h, a radius of sqrt(R^2 + (h/2)^2) covers the tube of radius R; for a box, R is half
-    the diagonal of the section across its longest side. A sphere that lies inside another one is left out.
+    Along a segment with steps h, a radius of sqrt(R^2 + (h/2)^2) covers the tube of radius R; for a bar of a box, R
+    is half the diagonal of its section. A sphere that lies inside another one is left out.
     """
     spheres: list[tuple[Float64, float]] = []
-    for shape in shapes:
-        start, end, radius = _spine(shape)
+    for start, end, radius in (spine for shape in shapes for spine in _spines(shape)):
         steps = int(np.ceil(np.linalg.norm(end - start) / spacing - 1e-9))
         step = float(np.linalg.norm(end - start)) / steps
         grown = float(np.ceil(np.hypot(radius, step / 2) * 1e4) / 1e4)
@@ -146,18 +145,26 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...], spacing: float = 0.042
     return kept
 
 
-def _spine(shape: Capsule | Block) -> tuple[Float64, Float64, float]:
-    """The segment (start, end) and the tube radius whose round-ended tube holds the shape, up to a box's corners."""
+def _spines(shape: Capsule | Block, widest: float = 0.04) -> list[tuple[Float64, Float64, float]]:
+    """Segments (start, end) and tube radii: a capsule's own, or those of the bars that a box is cut into.
+
+    The bars lie along the longest side and are at most `widest` [m] along the second longest. A bar's segment ends a
+    third of its thickness before the bar does: the last sphere still reaches past the corners.
+    """
     if isinstance(shape, Capsule):
-        return np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius
+        return [(np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius)]
     size = np.array(shape.size)
-    longest = int(np.argmax(size))
-    across = np.delete(size, longest)
-    radius = float(np.hypot(*across)) / 2
+    thin, wide, long = (int(axis) for axis in np.argsort(size, kind="stable"))
+    num_bars = int(np.ceil(size[wide] / widest - 1e-9))
+    width = size[wide] / num_bars
     half = np.zeros(3)
-    # Ends drawn in by a third of the section: the end spheres still reach past the corners.
-    half[longest] = size[longest] / 2 - min(0.33 * float(across.min()), size[longest] / 4)
-    return np.array(shape.middle) - half, np.array(shape.middle) + half, radius
+    half[long] = size[long] / 2 - min(0.33 * min(size[thin], width), size[long] / 4)
+    spines = []
+    for bar in range(num_bars):
+        middle = np.array(shape.middle, dtype=float)
+        middle[wide] += (bar + 0.5) * width - size[wide] / 2
+        spines.append((middle - half, middle + half, float(np.hypot(size[thin], width)) / 2))
+    return spines
 
 
 def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]]:

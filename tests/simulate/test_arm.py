@@ -1,0 +1,87 @@
+"""The simulated arm: its spheres cover its shapes, tightly."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import Shape
+from splatctrl_cli.simulate.arm import JOINTS, arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.truth import distance_to
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    folder = tmp_path_factory.mktemp("arm")
+    (folder / "robot.urdf").write_text(arm_urdf())
+    (folder / "spheres.yaml").write_text(arm_spheres_yaml())
+    return RobotModel.from_urdf(folder / "robot.urdf", folder / "spheres.yaml")
+
+
+def samples(shape: Shape, count: int = 3000) -> Float64:
+    """Points on a shape's surface, in its link's frame; the corners and rims among them."""
+    rng = np.random.default_rng(0)
+    direction = rng.standard_normal((count, 3))
+    points = direction / np.linalg.norm(direction, axis=1, keepdims=True) * shape.size[0]
+    if shape.kind == "box":
+        points = rng.uniform(-1, 1, (count, 3))
+        points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-1.0, 1.0], count)
+        corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+        points = np.concatenate([points, corners]) * np.array(shape.size) / 2
+    elif shape.kind == "cylinder":
+        angle = rng.uniform(0, 2 * np.pi, count)
+        z = np.concatenate([rng.uniform(-0.5, 0.5, count // 2), rng.choice([-0.5, 0.5], count - count // 2)])
+        points = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)]) * shape.size[0]
+        points[:, 2] = z * shape.size[1]
+    return points @ shape.T_link_shape[:3, :3].T + shape.T_link_shape[:3, 3]
+
+
+def test_spheres_cover_every_shape_to_a_millimetre(arm: RobotModel) -> None:
+    links = np.array(arm.sphere_set.links)
+    for shape in arm.urdf.shapes:
+        own = links == shape.link
+        gap = (
+            np.linalg.norm(samples(shape)[:, None] - arm.sphere_set.centers[own], axis=2) - arm.sphere_set.radii[own]
+        )
+        assert gap.min(axis=1).max() < 1e-3, shape
+
+
+def protrusion(arm: RobotModel, link: str) -> float:
+    """How far [m] the link's spheres stand out of its shapes."""
+    rng = np.random.default_rng(1)
+    own = np.array(arm.sphere_set.links) == link
+    direction = rng.standard_normal((400, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = (arm.sphere_set.centers[own, None] + arm.sphere_set.radii[own, None, None] * direction).reshape(-1, 3)
+    texture = Texture(pattern="noise", feature=1.0, dark=(0, 0, 0), bright=(1, 1, 1))
+    solids = [
+        Primitive(name=link, kind=shape.kind, size=shape.size, T_world_shape=shape.T_link_shape, texture=texture)
+        for shape in arm.urdf.shapes
+        if shape.link == link
+    ]
+    return float(distance_to(solids, points, 0).max())
+
+
+def test_spheres_stand_out_of_round_links_by_under_six_millimetres(arm: RobotModel) -> None:
+    worst = {link: protrusion(arm, link) for link in arm.urdf.links if link != "hand"}
+    assert max(worst.values()) < 0.006, worst
+
+
+def test_spheres_stand_out_of_the_flat_hand_by_under_two_centimetres(arm: RobotModel) -> None:
+    assert protrusion(arm, "hand") < 0.02
+
+
+def test_limits_are_those_that_the_maker_publishes(arm: RobotModel) -> None:
+    np.testing.assert_allclose(arm.lower, [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
+    np.testing.assert_allclose(arm.upper, [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+    np.testing.assert_allclose(arm.velocity_limit, [2.175] * 4 + [2.61] * 3)
+    assert arm.joint_names == tuple(joint[0] for joint in JOINTS)
+
+
+def test_the_committed_robot_files_are_what_the_code_writes(sample_data: Path) -> None:
+    assert (sample_data / "tabletop/robot.urdf").read_text() == arm_urdf()
+    assert (sample_data / "tabletop/robot_spheres.yaml").read_text() == arm_spheres_yaml()

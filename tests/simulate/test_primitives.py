@@ -1,0 +1,127 @@
+"""Primitives: distances with known answers, and against each other (rays, surface points, dense sampling)."""
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.geometry import look_at, transform_points
+from splatctrl_cli.records import Float64
+from splatctrl_cli.simulate.primitives import Primitive, closest_point, hit, normals, signed_distance
+from splatctrl_cli.simulate.textures import Texture
+
+PLAIN = Texture(pattern="noise", feature=0.1, dark=(0, 0, 0), bright=(1, 1, 1))
+TILTED = look_at([0.3, -0.2, 0.5], [1.0, 0.4, 0.1])
+SIZES = {"box": (0.2, 0.4, 0.6), "cylinder": (0.2, 0.6), "sphere": (0.3,)}
+KINDS = sorted(SIZES)
+
+
+def solid(kind: str, T_world_shape: Float64 | None = None) -> Primitive:
+    pose = np.eye(4) if T_world_shape is None else T_world_shape
+    return Primitive(name=kind, kind=kind, size=SIZES[kind], T_world_shape=pose, texture=PLAIN)
+
+
+def surface_samples(kind: str, rng: np.random.Generator, count: int = 200_000) -> Float64:
+    """Points on the surface, in the solid's own frame."""
+    direction = rng.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    if kind == "sphere":
+        return direction * 0.3
+    if kind == "box":
+        p = rng.uniform(-1, 1, (count, 3))
+        axis = rng.integers(0, 3, count)
+        p[np.arange(count), axis] = np.sign(p[np.arange(count), axis])
+        return p * np.array([0.1, 0.2, 0.3])
+    angle = rng.uniform(0, 2 * np.pi, count)
+    is_side = rng.uniform(size=count) < 0.7
+    rho = np.where(is_side, 0.2, 0.2 * np.sqrt(rng.uniform(size=count)))
+    z = np.where(is_side, rng.uniform(-0.3, 0.3, count), rng.choice([-0.3, 0.3], count))
+    return np.column_stack([rho * np.cos(angle), rho * np.sin(angle), z])
+
+
+@pytest.mark.parametrize(
+    ("kind", "point", "distance"),
+    [
+        ("box", (0.4, 0, 0), 0.3),
+        ("box", (0.4, 0.6, 0), 0.5),
+        ("box", (0.05, 0, 0), -0.05),
+        ("box", (0.0, 0.19, 0), -0.01),
+        ("cylinder", (0.5, 0, 0), 0.3),
+        ("cylinder", (0, 0, 0.5), 0.2),
+        ("cylinder", (0.5, 0, 0.7), 0.5),
+        ("cylinder", (0, 0, 0), -0.2),
+        ("cylinder", (0, 0.05, -0.28), -0.02),
+        ("sphere", (0, 0.5, 0), 0.2),
+        ("sphere", (0, 0, 0), -0.3),
+    ],
+)
+def test_distance_to_a_solid_at_the_origin_is_known(kind: str, point: tuple[float, ...], distance: float) -> None:
+    assert signed_distance(solid(kind), np.array([point]))[0] == pytest.approx(distance, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_distance_agrees_with_dense_samples_of_the_surface(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    surface = surface_samples(kind, rng)
+    points = rng.uniform(-0.6, 0.6, (40, 3))
+    nearest = np.array([np.min(np.linalg.norm(surface - p, axis=1)) for p in points])
+    np.testing.assert_allclose(np.abs(signed_distance(solid(kind), points)), nearest, atol=3e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_closest_point_lies_on_the_surface_at_the_distance(kind: str) -> None:
+    points = np.random.default_rng(2).uniform(-0.7, 0.7, (500, 3)) + TILTED[:3, 3]
+    distance, surface = closest_point(solid(kind, TILTED), points)
+    np.testing.assert_allclose(np.linalg.norm(points - surface, axis=1), np.abs(distance), atol=1e-12)
+    np.testing.assert_allclose(signed_distance(solid(kind, TILTED), surface), 0, atol=1e-12)
+    assert (distance < 0).any()
+    assert (distance > 0).any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_distance_moves_with_the_solid(kind: str) -> None:
+    points = np.random.default_rng(3).uniform(-0.7, 0.7, (100, 3))
+    moved = signed_distance(solid(kind, TILTED), transform_points(TILTED, points))
+    np.testing.assert_allclose(moved, signed_distance(solid(kind), points), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_ray_stops_where_the_distance_first_becomes_zero(kind: str) -> None:
+    shape = solid(kind, TILTED)
+    rng = np.random.default_rng(4)
+    origin = TILTED[:3, 3] + np.array([1.0, 0.4, -0.3])
+    directions = TILTED[:3, 3] + rng.uniform(-0.4, 0.4, (400, 3)) - origin
+    t = hit(shape, origin, directions)
+    is_hit = np.isfinite(t)
+    assert 50 < is_hit.sum() < 400
+    ends = origin + t[is_hit, None] * directions[is_hit]
+    np.testing.assert_allclose(signed_distance(shape, ends), 0, atol=1e-9)
+    before = origin + (t[is_hit, None] * np.linspace(0.01, 0.99, 50)[:, None, None]) * directions[is_hit]
+    assert signed_distance(shape, before.reshape(-1, 3)).min() > 0
+    along = origin + np.linspace(0, 2, 400)[:, None, None] * directions[~is_hit]
+    assert signed_distance(shape, along.reshape(-1, 3)).min() > -1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_behind_the_camera_is_hit(kind: str) -> None:
+    assert np.isinf(hit(solid(kind), np.array([2.0, 0, 0]), np.array([[1.0, 0, 0]]))[0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_normals_are_the_gradient_of_the_distance(kind: str) -> None:
+    points = surface_samples(kind, np.random.default_rng(5), 300)
+    step = 1e-6
+    gradient = np.stack(
+        [
+            (signed_distance(solid(kind), points + step * e) - signed_distance(solid(kind), points - step * e))
+            / (2 * step)
+            for e in np.eye(3)
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(normals(solid(kind), points), gradient, atol=2e-3)
+
+
+def test_a_solid_is_present_from_its_first_stamp_to_before_its_last() -> None:
+    shape = Primitive(
+        name="a", kind="sphere", size=(1.0,), T_world_shape=np.eye(4), texture=PLAIN, from_ns=10, to_ns=20
+    )
+    assert [shape.is_present(t) for t in (9, 10, 19, 20)] == [False, True, True, False]
