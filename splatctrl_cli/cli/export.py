@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     if not len(chosen):
         raise NotEvaluableError(f"{source}: no splat to write among {len(splats)}", remedy="give other --labels")
     with output_path(out, force=args.force, is_folder=False) as partial:
-        write_ply(partial, chosen, {**comments, "source": f"{source.name} sha256 {sha256(source)}"})
+        write_ply(partial, chosen, {**comments, "exported_from": f"{source.name} sha256 {sha256(source)}"})
         difference, covered = _compare(chosen, read_ply(partial)[0])
         if not difference <= MAX_PIXEL_DIFFERENCE:
             raise WriteError(

@@ -51,7 +51,7 @@ def test_a_scene_is_exported_and_renders_the_same(scene: Path, capsys: pytest.Ca
     splats, comments = read_ply(out)
     assert len(splats) == 400
     assert comments["scene"] == "ball"
-    assert comments["source"].startswith("splats.ply sha256 ")
+    assert comments["exported_from"].startswith("splats.ply sha256 ")
 
 
 def test_labels_choose_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
