@@ -49,4 +49,9 @@ def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
         elif isinstance(value, list):
             yield f"{indent}{name}: {', '.join(map(str, value)) or '-'}"
         else:
-            yield f"{indent}{name}: {f'{value:.6f}'.rstrip('0') if isinstance(value, float) else value}"
+            yield f"{indent}{name}: {_number(value) if isinstance(value, float) else value}"
+
+
+def _number(value: float) -> str:
+    """Up to six decimals; more digits where the number is small."""
+    return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"

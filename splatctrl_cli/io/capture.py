@@ -26,6 +26,7 @@ FORMAT, VERSION = "splatctrl-capture", 1
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
 FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
 FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
+_NOT_FOR_CAPTURES = ("world_frame", "camera_topics", "camera_poses", "depth_scale", "joint_topic", "root", "holdout")
 PNG_LEVEL = 3  # zlib; 3 is half the time of OpenCV's default 6 and 5 % larger on apc_shelf depth
 
 
@@ -100,6 +101,7 @@ class CaptureSource:
     """Records of a capture folder; a file whose checksum differs is counted as damage and left out."""
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
+        options.refuse(_NOT_FOR_CAPTURES, "a capture", path)
         self._path = path
         self.name = path.name
         header = read_capture_header(path)

@@ -51,6 +51,7 @@ class ImageFolderSource:
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
+        options.refuse(("world_frame", "camera_topics", "camera_poses", "joint_topic"), "an image folder", path)
         self.name = path.name
         self._description = _completed(read_description(path, options.root))
         self._scale = self._description.depth.scale if options.depth_scale is None else options.depth_scale

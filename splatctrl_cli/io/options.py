@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from splatctrl_cli.errors import InputError
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTopics:
@@ -36,3 +38,12 @@ class SourceOptions:
     joint_topic: str | None = None
     root: Path | None = None
     holdout: tuple[str, ...] | None = None
+
+    def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
+        """Raise InputError where a person gave an option that means nothing for this kind of input."""
+        flags = {"camera_topics": "camera", "camera_poses": "camera-pose"}
+        default = SourceOptions()
+        for name in names:
+            if getattr(self, name) != getattr(default, name):
+                flag = flags.get(name, name.replace("_", "-"))
+                raise InputError(f"{path}: --{flag} does not apply to {kind}", remedy="leave it out")

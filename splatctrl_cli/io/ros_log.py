@@ -41,6 +41,7 @@ class RosLogSource:
     has_clock = True
 
     def __init__(self, log: RawLog, options: SourceOptions) -> None:
+        options.refuse(("root", "holdout"), "a log", log.path)
         self.name = log.path.name
         self._log = log
         self._options = options

@@ -36,6 +36,7 @@ class LogRecipe:
     depth_size: tuple[int, int] = (WIDTH, HEIGHT)
     tf_last: bool = False
     tf_frames: int | None = None
+    tf_delay_ns: int = 0
     is_bigendian: bool = False
     step_padding: int = 0
     distortion: tuple[float, ...] = (0.0,) * 5
@@ -56,7 +57,7 @@ def make_log(path: Path, recipe: LogRecipe | None = None) -> Path:
 def color_pixels(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """The RGB image of a frame: red grows with the frame, green with the column."""
     image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
-    image[..., 0] = 40 + 20 * index
+    image[..., 0] = 40 + 10 * index
     image[..., 1] = np.linspace(20, 200, WIDTH, dtype=np.uint8)
     image[..., 2] = 90
     return image
@@ -102,7 +103,7 @@ class _LogWriter:
             static.append(self._transform(START_NS, f"{recipe.cameras[0]}_optical", recipe.depth_frame, (0.05, 0, 0)))
         yield START_NS, "/tf_static", "tf2_msgs/msg/TFMessage", T["tf2_msgs/msg/TFMessage"](transforms=static)
         for index in range(recipe.tf_frames if recipe.tf_frames is not None else recipe.num_frames):
-            stamp = START_NS + index * FRAME_NS
+            stamp = START_NS + index * FRAME_NS + recipe.tf_delay_ns
             moving = [
                 self._transform(stamp, "world", f"{c}_link", (camera_x(index), 0.0, 0.0)) for c in recipe.cameras
             ]

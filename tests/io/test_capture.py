@@ -1,0 +1,127 @@
+"""A capture gives back what was put in, to the bit where it can, and notices damage."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.capture import write_capture
+from splatctrl_cli.io.source import SourceOptions, open_source
+from splatctrl_cli.records import JointState, Record, RgbdFrame
+from tests.io.make_log import LogRecipe, make_log
+
+
+def captured(tmp_path: Path, recipe: LogRecipe, name: str = "x.capture") -> tuple[list[Record], Path]:
+    source = open_source(make_log(tmp_path / "log.mcap", recipe))
+    folder = tmp_path / name
+    folder.mkdir()
+    write_capture(folder, source)
+    return list(source.records()), folder
+
+
+def assert_same(before: list[Record], after: list[Record]) -> None:
+    assert len(before) == len(after) > 0
+    for a, b in zip(before, after, strict=True):
+        assert a.stamp_ns == b.stamp_ns
+        if isinstance(a, RgbdFrame):
+            assert isinstance(b, RgbdFrame)
+            assert (a.camera, a.intrinsics) == (b.camera, b.intrinsics)
+            assert np.array_equal(a.color, b.color)
+            assert np.array_equal(a.depth, b.depth)
+            assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
+        else:
+            assert isinstance(b, JointState)
+            assert np.array_equal(a.position, b.position)
+            assert np.array_equal(a.velocity, b.velocity)
+
+
+@pytest.mark.parametrize("color_format", ["jpeg", "png", "rgb8", "bgra8", "mono8"])
+def test_a_capture_gives_the_same_records(tmp_path: Path, color_format: str) -> None:
+    before, folder = captured(tmp_path, LogRecipe(color_format=color_format, cameras=("cam0", "cam1")))
+    source = open_source(folder)
+    assert_same(before, list(source.records()))
+    assert source.joint_names == ("joint_a", "joint_b")
+    assert source.has_clock
+    assert source.loss.damaged == 0
+
+
+def test_float_depth_on_a_grid_becomes_png_and_other_depth_stays_float(tmp_path: Path) -> None:
+    on_grid, folder = captured(tmp_path, LogRecipe(depth_encoding="32FC1", depth_m=1.2345), "grid.capture")
+    assert (folder / "depth/cam0/000000.png").is_file()
+    back = [r for r in open_source(folder).records() if isinstance(r, RgbdFrame)]
+    first = next(r for r in on_grid if isinstance(r, RgbdFrame))
+    assert np.abs(back[0].depth - first.depth).max() <= 1e-6
+    off_grid, folder = captured(tmp_path, LogRecipe(depth_encoding="32FC1", depth_m=1.23457), "float.capture")
+    assert (folder / "depth/cam0/000000.npy").is_file()
+    assert_same(off_grid, list(open_source(folder).records()))
+
+
+def test_compressed_color_is_kept_byte_for_byte(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap"))
+    folder = tmp_path / "x.capture"
+    folder.mkdir()
+    write_capture(folder, source)
+    shots = [shot for shot in source.shots() if not isinstance(shot, JointState)]
+    assert [(folder / f"color/cam0/{i:06d}.jpg").read_bytes() for i in range(5)] == [s.color_file for s in shots]
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+    _, first = captured(tmp_path, LogRecipe(), "a.capture")
+    _, second = captured(tmp_path, LogRecipe(), "b.capture")
+    files = sorted(p.relative_to(first) for p in first.rglob("*") if p.is_file())
+    assert files == sorted(p.relative_to(second) for p in second.rglob("*") if p.is_file())
+    assert len(files) == 14
+    assert all((first / name).read_bytes() == (second / name).read_bytes() for name in files)
+
+
+def test_every_file_stands_in_sha256sums(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    sums = dict(reversed(line.split("  ")) for line in (folder / "SHA256SUMS").read_text().splitlines())
+    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} - {"SHA256SUMS"}
+    assert set(sums) == files
+    assert all(hashlib.sha256((folder / name).read_bytes()).hexdigest() == sums[name] for name in files)
+
+
+def test_a_damaged_image_is_left_out_and_counted(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, LogRecipe())
+    image = folder / "depth/cam0/000002.png"
+    image.write_bytes(image.read_bytes()[:-4])
+    (folder / "color/cam0/000004.jpg").unlink()
+    source = open_source(folder)
+    after = list(source.records())
+    assert len(after) == len(before) - 2
+    assert source.loss.damaged == 2
+    assert "depth/cam0/000002.png: its checksum differs" in source.loss.notes[0]
+    assert "color/cam0/000004.jpg: missing" in source.loss.notes[1]
+
+
+def test_losses_of_the_log_stay_with_the_capture(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe(tf_frames=3))
+    assert open_source(folder).loss.without_pose == 2
+
+
+def test_a_capture_of_a_newer_version_is_refused(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    header = folder / "capture.json"
+    header.write_text(header.read_text().replace('"version": 1', '"version": 99'))
+    with pytest.raises(InputError, match="expected version 1, got 99"):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("name", ["SHA256SUMS", "frames.csv", "joints.npz"])
+def test_a_capture_without_an_index_is_refused(tmp_path: Path, name: str) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=name):
+        open_source(folder)
+
+
+def test_options_that_a_capture_cannot_honour_are_refused(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    options = SourceOptions()
+    for change in ({"depth_scale": 1e-4}, {"world_frame": "base"}, {"holdout": ("0",)}, {"root": tmp_path}):
+        with pytest.raises(InputError, match="does not apply to a capture"):
+            open_source(folder, replace(options, **change))
