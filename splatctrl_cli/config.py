@@ -24,12 +24,14 @@ class SceneConfig:
     lambda_color: float = 1.0
     lambda_depth: float = 1.0
     lambda_reg: float = 0.02
-    depth_loss: str = "printed"  # eq. 3 as printed, or "normalised" by accumulated opacity
+    lambda_opacity: float = 0.1  # of the mean transmittance where there is depth; 0 in the paper
+    depth_loss: str = "normalised"  # by accumulated opacity; "printed" (eq. 3) sets surfaces 12 mm too deep
     lambda_mde: float = 50.0  # III-C eq. 5 gives none; its source (SplaTAM) uses 50
     min_depth_error: float = 0.02  # [m] floor of lambda_mde * MDE, so that a perfect map is not re-seeded
     max_depth_error: float = 0.04  # [m] ceiling of it: above, a box on a table would never be added
     hole_opacity: float = 0.5  # accumulated opacity below which a pixel is a hole in the map
     min_opacity: float = 0.1  # III-C, alpha_min
+    min_spacing: float = 0.008  # [m] between seeds, however large the budget
     fill: float = 0.85  # share of the budget that the first time step may use; the rest is for what comes later
     iterations_per_step: int = 30  # K optimiser steps per time step
     first_iterations: int = 300  # optimiser steps on the first time step

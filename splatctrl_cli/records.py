@@ -11,6 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.errors import UsageError
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
@@ -148,6 +150,17 @@ class Box:
 
     lower: Float64
     upper: Float64
+
+    @classmethod
+    def from_text(cls, text: str) -> "Box":
+        """The box of ``x0,y0,z0,x1,y1,z1``. Raises UsageError unless each upper bound exceeds its lower one."""
+        try:
+            values = np.array([float(part) for part in text.split(",")])
+        except ValueError:
+            values = np.empty(0)
+        if values.shape != (6,) or not np.all(values[:3] < values[3:]):
+            raise UsageError(f"--box {text}: expected x0,y0,z0,x1,y1,z1 [m] with x0 < x1, y0 < y1, z0 < z1")
+        return cls(lower=values[:3], upper=values[3:])
 
     def contains(self, points_world: NDArray[np.floating]) -> Bool:
         """(…, 3) points -> (…,) True inside, borders included."""

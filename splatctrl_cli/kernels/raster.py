@@ -71,22 +71,38 @@ class Rasteriser:
 
 @dataclass(frozen=True, kw_only=True)
 class LossTerms:
-    """Means over one image: |colour error|, 1 - SSIM, |depth error| [m], squared colour error."""
+    """Means over one image: |colour error|, 1 - SSIM, |depth error| [m], 1 - opacity, squared colour error."""
 
     l1: float
     dssim: float
     depth: float
+    transmittance: float
     squared: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class LossWeights:
-    """Weights of eq. 4; `normalised` compares depth divided by accumulated opacity."""
+    """Weights of eq. 4; `normalised` compares depth divided by accumulated opacity.
+
+    opacity weighs the mean transmittance where there is depth: a term of ours, 0 in the paper.
+    """
 
     dssim: float
     color: float
     depth: float
+    opacity: float
     normalised: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetView:
+    """What a camera saw: color (3, H, W) float32 in [0, 1]; depth (H, W) float32 [m], 0 = none; counted (H, W) uint8,
+    0 = a pixel that the map need not explain.
+    """
+
+    color: Float32
+    depth: Float32
+    counted: NDArray[np.uint8]
 
 
 class ImageLoss:
@@ -96,16 +112,18 @@ class ImageLoss:
         self.num_threads = num_threads
         self._native: Any = native.ImageLoss()
 
-    def evaluate(
-        self, planes: Float32, color: Float32, depth: Float32, weights: LossWeights, out: Float32
-    ) -> LossTerms:
-        """planes (5, H, W), color (3, H, W) in [0, 1], depth (H, W) [m], 0 = none; writes out (5, H, W)."""
-        height, width = depth.shape
-        l1, dssim, error, squared = self._native.evaluate(
-            planes, color, depth, width, height, weights.dssim, weights.color, weights.depth, weights.normalised,
-            out, self.num_threads,
+    def evaluate(self, planes: Float32, view: TargetView, weights: LossWeights, out: Float32) -> LossTerms:
+        """Loss of planes (5, H, W) against a view; writes its derivative to out (5, H, W).
+
+        The colours of pixels that are not counted are overwritten in `planes`.
+        """
+        height, width = view.depth.shape
+        w = weights
+        l1, dssim, error, transmittance, squared = self._native.evaluate(
+            planes, view.color, view.depth, view.counted, width, height, w.dssim, w.color, w.depth, w.opacity,
+            w.normalised, out, self.num_threads,
         )  # fmt: skip
-        return LossTerms(l1=l1, dssim=dssim, depth=error, squared=squared)
+        return LossTerms(l1=l1, dssim=dssim, depth=error, transmittance=transmittance, squared=squared)
 
 
 @dataclass(frozen=True, kw_only=True)

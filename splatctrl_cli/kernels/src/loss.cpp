@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 
 #include "parallel.h"
 #include "simd.h"
@@ -106,8 +107,8 @@ double ssim_row(const Image& image, const float* x_plane, const float* y_plane, 
 }
 
 // The derivative of the colour loss for one row of one channel; returns the sums of |x - y| and (x - y)^2.
-void color_row(const Image& image, const float* x_plane, const float* y_plane, const float* maps[3], int row,
-               float weight_l1, float weight_ssim, std::vector<PaddedRow>& sums, float* gradient, double* l1,
+void color_row(const Image& image, const float* x_plane, const float* y_plane, const std::uint8_t* counted,
+               const float* maps[3], int row, float weight_l1, float weight_ssim, std::vector<PaddedRow>& sums, float* gradient, double* l1,
                double* squared) {
   const int width = image.width;
   for (int x = 0; x < width; x += 8) {
@@ -130,30 +131,31 @@ void color_row(const Image& image, const float* x_plane, const float* y_plane, c
     sum_squared += error * error;
     store_pixels(gradient, x, width, weight_l1 * sign8(error) - weight_ssim * ssim);
   }
+  for (int x = 0; x < width; ++x) gradient[x] = counted[x] ? gradient[x] : 0.0f;
   *l1 += sum8(sum_l1);
   *squared += sum8(sum_squared);
 }
 
-double depth_row(const Image& image, const float* planes, const float* depth, int row, float weight,
-                 bool normalised, float* plane_gradients) {
+void depth_row(const Image& image, const float* planes, const float* depth, int row, float weight, float weight_opacity,
+               bool normalised, float* plane_gradients, double* error_sum, double* transmittance_sum) {
   const std::size_t size = static_cast<std::size_t>(image.width) * image.height;
   const float* rendered = image.row(planes + 3 * size, row);
   const float* opacity = image.row(planes + 4 * size, row);
   const float* target = image.row(depth, row);
   float* g_depth = image.row(plane_gradients + 3 * size, row);
   float* g_opacity = image.row(plane_gradients + 4 * size, row);
-  double sum = 0.0;
   for (int x = 0; x < image.width; ++x) {
     g_depth[x] = g_opacity[x] = 0.0f;
     if (!(target[x] > 0.0f)) continue;
     const float inverse = normalised && opacity[x] > kOpaqueEnough ? 1.0f / opacity[x] : 1.0f;
     const float error = rendered[x] * inverse - target[x];
     const float sign = error > 0.0f ? weight : (error < 0.0f ? -weight : 0.0f);
-    sum += std::abs(error);
+    *error_sum += std::abs(error);
+    *transmittance_sum += 1.0f - opacity[x];
     g_depth[x] = sign * inverse;
-    if (inverse != 1.0f) g_opacity[x] = -sign * rendered[x] * inverse * inverse;
+    g_opacity[x] = -weight_opacity;
+    if (inverse != 1.0f) g_opacity[x] -= sign * rendered[x] * inverse * inverse;
   }
-  return sum;
 }
 
 long count_valid(const float* depth, std::size_t size) {
@@ -162,28 +164,42 @@ long count_valid(const float* depth, std::size_t size) {
 
 }  // namespace
 
-LossTerms ImageLoss::evaluate(const float* planes, const float* color, const float* depth, int width, int height,
-                              const LossWeights& weights, float* plane_gradients, int num_threads) {
+LossTerms ImageLoss::evaluate(float* planes, const float* color, const float* depth, const std::uint8_t* counted,
+                              int width, int height, const LossWeights& weights, float* plane_gradients,
+                              int num_threads) {
   const Image image{width, height};
   const std::size_t size = static_cast<std::size_t>(width) * height;
   maps_.resize(9 * size);
-  rows_.assign(4 * static_cast<std::size_t>(height), 0.0);
+  rows_.assign(5 * static_cast<std::size_t>(height), 0.0);
   const long num_valid = count_valid(depth, size);
-  const float per_value = 1.0f / (3.0f * static_cast<float>(size));
+  const long num_counted = std::count_if(counted, counted + size, [](std::uint8_t c) { return c != 0; });
+  const double num_values = 3.0 * static_cast<double>(std::max(num_counted, 1L));
+  const auto per_value = static_cast<float>(1.0 / num_values);
   const float weight_l1 = weights.color * (1.0f - weights.dssim) * per_value;
   const float weight_ssim = weights.color * weights.dssim * per_value;
   const float weight_depth = num_valid > 0 ? weights.depth / static_cast<float>(num_valid) : 0.0f;
+  const float weight_opacity = num_valid > 0 ? weights.opacity / static_cast<float>(num_valid) : 0.0f;
   constexpr int kRows = 8;
   const int num_chunks = (height + kRows - 1) / kRows;
   const auto each_row = [&](int chunk, auto&& visit) {
     for (int row = chunk * kRows; row < std::min(height, (chunk + 1) * kRows); ++row) visit(row);
   };
   parallel_for(num_chunks, num_threads, [&](int chunk) {
+    each_row(chunk, [&](int row) {
+      for (int c = 0; c < 3; ++c) {
+        float* x = image.row(planes + c * size, row);
+        const float* y = image.row(color + c * size, row);
+        const std::uint8_t* keep = counted + static_cast<std::size_t>(row) * width;
+        for (int u = 0; u < width; ++u) x[u] = keep[u] ? x[u] : y[u];
+      }
+    });
+  });
+  parallel_for(num_chunks, num_threads, [&](int chunk) {
     std::vector<PaddedRow> sums(5, PaddedRow(width));
     each_row(chunk, [&](int row) {
       for (int c = 0; c < 3; ++c) {
         float* maps = maps_.data() + 3 * c * size;
-        rows_[4 * row] += ssim_row(image, planes + c * size, color + c * size, row, sums, image.row(maps, row),
+        rows_[5 * row] += ssim_row(image, planes + c * size, color + c * size, row, sums, image.row(maps, row),
                                    image.row(maps + size, row), image.row(maps + 2 * size, row));
       }
     });
@@ -194,25 +210,27 @@ LossTerms ImageLoss::evaluate(const float* planes, const float* color, const flo
       for (int c = 0; c < 3; ++c) {
         const float* maps = maps_.data() + 3 * c * size;
         const float* three[3] = {maps, maps + size, maps + 2 * size};
-        color_row(image, planes + c * size, color + c * size, three, row, weight_l1, weight_ssim, sums,
-                  image.row(plane_gradients + c * size, row), &rows_[4 * row + 1], &rows_[4 * row + 2]);
+        color_row(image, planes + c * size, color + c * size, counted + static_cast<std::size_t>(row) * width, three, row, weight_l1, weight_ssim, sums,
+                  image.row(plane_gradients + c * size, row), &rows_[5 * row + 1], &rows_[5 * row + 2]);
       }
-      rows_[4 * row + 3] = depth_row(image, planes, depth, row, weight_depth, weights.normalised, plane_gradients);
+      depth_row(image, planes, depth, row, weight_depth, weight_opacity, weights.normalised, plane_gradients,
+                &rows_[5 * row + 3], &rows_[5 * row + 4]);
     });
   });
   LossTerms terms;
   double ssim = 0.0;
   for (int row = 0; row < height; ++row) {
-    ssim += rows_[4 * row];
-    terms.l1 += rows_[4 * row + 1];
-    terms.squared += rows_[4 * row + 2];
-    terms.depth += rows_[4 * row + 3];
+    ssim += rows_[5 * row];
+    terms.l1 += rows_[5 * row + 1];
+    terms.squared += rows_[5 * row + 2];
+    terms.depth += rows_[5 * row + 3];
+    terms.transmittance += rows_[5 * row + 4];
   }
-  const double num_values = 3.0 * static_cast<double>(size);
-  terms.dssim = 1.0 - ssim / num_values;
+  terms.dssim = (3.0 * static_cast<double>(size) - ssim) / num_values;
   terms.l1 /= num_values;
   terms.squared /= num_values;
-  terms.depth = num_valid > 0 ? terms.depth / static_cast<double>(num_valid) : 0.0;
+  terms.depth /= static_cast<double>(std::max(num_valid, 1L));
+  terms.transmittance /= static_cast<double>(std::max(num_valid, 1L));
   return terms;
 }
 

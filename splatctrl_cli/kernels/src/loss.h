@@ -1,6 +1,7 @@
 // The image part of the paper's loss (eq. 4): L1 + D-SSIM on colour, L1 on depth; value and gradient together.
 #pragma once
 
+#include <cstdint>
 #include <vector>
 
 namespace splatctrl {
@@ -9,6 +10,7 @@ struct LossWeights {
   float dssim;       // lambda: share of D-SSIM in the colour loss
   float color;       // lambda_color
   float depth;       // lambda_depth
+  float opacity;     // lambda_opacity: of the mean transmittance where there is depth (not in the paper)
   bool normalised;   // compare depth divided by accumulated opacity instead of eq. 3 as printed
 };
 
@@ -16,20 +18,22 @@ struct LossTerms {
   double l1 = 0.0;     // mean |C - C_gt| over pixels and channels
   double dssim = 0.0;  // mean 1 - SSIM
   double depth = 0.0;  // mean |D - D_gt| over pixels with depth [m]
+  double transmittance = 0.0;  // mean 1 - accumulated opacity over pixels with depth
   double squared = 0.0;  // mean squared colour error, for PSNR
 };
 
 // SSIM with an 11 x 11 Gaussian window of sigma 1.5, zero beyond the border, C1 = 0.01^2, C2 = 0.03^2.
 class ImageLoss {
  public:
-  // planes (5, H, W) as the rasteriser writes them; color (3, H, W) in [0, 1]; depth (H, W) [m], 0 = none.
-  // Writes plane_gradients (5, H, W).
-  LossTerms evaluate(const float* planes, const float* color, const float* depth, int width, int height,
-                     const LossWeights& weights, float* plane_gradients, int num_threads);
+  // planes (5, H, W) as the rasteriser writes them; color (3, H, W) in [0, 1]; depth (H, W) [m], 0 = none; counted
+  // (H, W), 0 = this pixel is none of the map's business: its colour is copied into planes and its gradient is zero.
+  // Writes plane_gradients (5, H, W). Means are over counted pixels.
+  LossTerms evaluate(float* planes, const float* color, const float* depth, const std::uint8_t* counted, int width,
+                     int height, const LossWeights& weights, float* plane_gradients, int num_threads);
 
  private:
   std::vector<float> maps_;  // (3 channels, 3 maps, H, W): dSSIM/d(mean, second moment, cross moment)
-  std::vector<double> rows_; // (H, 4) partial sums
+  std::vector<double> rows_; // (H, 5) partial sums
 };
 
 }  // namespace splatctrl

@@ -1,0 +1,114 @@
+"""A fixed budget of splat slots: parameters, Adam moments, labels. Dead slots stay, transparent, until reused."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.kernels.raster import Moments, unpack_parameters
+from splatctrl_cli.records import Bool, Float32, Label, SplatSet
+
+DEAD_LOGIT = -6.9  # opacity 0.001, below what the rasteriser blends
+CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seeds:
+    """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1], all float32."""
+
+    centers: Float32
+    radii: Float32
+    colors: Float32
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filled:
+    """Where seeds went: into fresh slots, into slots of dead splats, nowhere."""
+
+    added: int
+    relocated: int
+    unmet: int
+
+
+class SplatBuffer:
+    """M slots; arrays are changed in place and never grow."""
+
+    def __init__(self, max_splats: int) -> None:
+        self.parameters: Float32 = np.zeros((max_splats, 8), np.float32)
+        self.parameters[:, LOGIT] = DEAD_LOGIT
+        self.moments = Moments(
+            first=np.zeros((max_splats, 8), np.float32),
+            second=np.zeros((max_splats, 8), np.float32),
+            num_steps=np.zeros(max_splats, np.uint32),
+        )
+        self.is_alive: Bool = np.zeros(max_splats, bool)
+        self.was_used: Bool = np.zeros(max_splats, bool)
+        self.labels: NDArray[np.uint8] = np.zeros(max_splats, np.uint8)
+        self.num_uncertain: NDArray[np.uint16] = np.zeros(max_splats, np.uint16)
+
+    @property
+    def centers(self) -> Float32:
+        """(M, 3) [m], world; a view."""
+        return self.parameters[:, CENTER]
+
+    @property
+    def opacities(self) -> Float32:
+        """(M,) in (0, 1)."""
+        return np.asarray(1.0 / (1.0 + np.exp(-self.parameters[:, LOGIT])), np.float32)
+
+    def kill(self, slots: Bool) -> None:
+        """Make the slots of a mask (M,) dead: transparent, without moments, free for reuse."""
+        self.is_alive[slots] = False
+        self.parameters[slots, LOGIT] = DEAD_LOGIT
+        self.labels[slots] = Label.OBJECT
+        self._reset(np.flatnonzero(slots))
+
+    def fill(self, seeds: Seeds, opacity: float) -> Filled:
+        """Put seeds into dead slots, in slot order, with `opacity`; seeds beyond the number of slots are unmet."""
+        slots = np.flatnonzero(~self.is_alive)[: len(seeds)]
+        count = len(slots)
+        self.parameters[slots, CENTER] = seeds.centers[:count]
+        self.parameters[slots, LOG_RADIUS] = np.log(seeds.radii[:count])
+        self.parameters[slots, COLOR] = seeds.colors[:count]
+        self.parameters[slots, LOGIT] = np.log(opacity / (1.0 - opacity))
+        num_reused = int(self.was_used[slots].sum())
+        self.is_alive[slots] = True
+        self.was_used[slots] = True
+        self.labels[slots] = Label.OBJECT
+        self._reset(slots)
+        return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
+
+    def _reset(self, slots: NDArray[np.intp]) -> None:
+        self.moments.first[slots] = 0.0
+        self.moments.second[slots] = 0.0
+        self.moments.num_steps[slots] = 0
+        self.num_uncertain[slots] = 0
+
+    def splats(self, num_threads: int) -> SplatSet:
+        """The live splats, in slot order."""
+        centers, radii, colors, opacities = unpack_parameters(self.parameters, num_threads)
+        alive = self.is_alive
+        return SplatSet(
+            centers=centers[alive],
+            radii=radii[alive],
+            colors=colors[alive],
+            opacities=opacities[alive],
+            labels=self.labels[alive],
+            density=np.zeros(int(alive.sum()), np.float32),
+        )
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Every array by name: the buffer's whole state."""
+        return {
+            "parameters": self.parameters,
+            "first_moment": self.moments.first,
+            "second_moment": self.moments.second,
+            "num_steps": self.moments.num_steps,
+            "is_alive": self.is_alive,
+            "was_used": self.was_used,
+            "labels": self.labels,
+            "num_uncertain": self.num_uncertain,
+        }

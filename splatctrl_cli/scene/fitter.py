@@ -1,0 +1,305 @@
+"""`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to an up-to-date splat set."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.kernels import num_threads
+from splatctrl_cli.kernels.raster import (
+    ImageLoss,
+    LossTerms,
+    LossWeights,
+    OptimiserSettings,
+    Rasteriser,
+    optimiser_step,
+    unpack_parameters,
+)
+from splatctrl_cli.records import Bool, Box, Float32, Intrinsics, Label, OccupancyGrid, RgbdFrame, SplatSet
+from splatctrl_cli.scene.buffer import Filled, SplatBuffer
+from splatctrl_cli.scene.occupancy import OccupancyMap
+from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture, carried
+from splatctrl_cli.scene.removal import removals, robot_labels
+from splatctrl_cli.scene.render import Rendering
+from splatctrl_cli.scene.seeding import add_mask, candidates, inside_workspace, seeds_at, spacing_for, world_points
+from splatctrl_cli.scene.window import View, Window, make_view
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditRow:
+    """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames.
+
+    dead: slots that wait to be reused. unmet: seeds that found no free slot.
+    """
+
+    stamp_ns: int
+    cameras: tuple[str, ...]
+    alive: int
+    dead: int
+    added: int
+    relocated: int
+    unmet: int
+    removed: dict[str, int]
+    robot: int
+    loss: float
+    psnr: float
+
+
+class SceneFitter:
+    """Fits a fixed budget of isotropic splats to a stream of RGB-D frames.
+
+    The whole state is `state()`; the same frames and seed give the same bytes at any thread count.
+    """
+
+    def __init__(
+        self, config: SceneConfig, occupancy: OccupancyConfig, workspace: Box, *, seed: int = 0, threads: int = 0
+    ) -> None:
+        if config.depth_loss not in ("printed", "normalised"):
+            raise UsageError(f"scene.depth_loss: expected printed or normalised, got {config.depth_loss!r}")
+        if occupancy.voxel < config.max_radius:
+            raise UsageError(
+                f"occupancy.voxel: {occupancy.voxel} m is smaller than scene.max_radius, {config.max_radius} m",
+                remedy="III-C asks for voxels at least as large as the largest radius",
+            )
+        self.config = config
+        self.workspace = workspace
+        self.seed = seed
+        self.num_threads = num_threads(threads)
+        self.buffer = SplatBuffer(config.max_splats)
+        self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
+        self.window = Window(config)
+        self.num_steps = 0
+        self.num_iterations = 0
+        self.spacing = 0.0  # [m] between seeds, set by the first time step that has any
+        self._posture: RobotPosture | None = None
+        self._raster = Rasteriser(self.num_threads)
+        self._loss = ImageLoss(self.num_threads)
+        self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
+
+    def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
+        """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
+        rng = np.random.default_rng([self.seed, self.num_steps])
+        views = [self._view(frame) for frame in frames]
+        for frame in frames:
+            self.occupancy.integrate(frame)
+        self._carry(robot)
+        is_trail = self._label(robot)
+        removed = self._remove(is_trail)
+        filled = self._seed(views, rng)
+        self.window.advance(views)
+        is_first = self.num_steps == 0
+        self._optimise(self.config.first_iterations if is_first else self.config.iterations_per_step, rng)
+        self._label(robot)
+        self.num_steps += 1
+        terms = [self._evaluate(view, self._planes(view)) for view in views]
+        return self._audit(frames, filled, removed, terms)
+
+    def refine(self, num_iterations: int) -> None:
+        """Optimise over the window with learning rates that fall to `final_rate`; for scenes that do not move."""
+        rng = np.random.default_rng([self.seed, self.num_steps, 1])
+        final = self.config.final_rate
+        blocks = 10
+        for block in range(blocks):
+            self._optimise(num_iterations // blocks, rng, rate=final ** (block / (blocks - 1)))
+            self._remove(np.zeros(self.config.max_splats, bool))
+            if block < blocks // 2:
+                self._seed([*self.window.newest, *self.window.keyframes], rng)
+
+    def splats(self) -> SplatSet:
+        """The live splats."""
+        return self.buffer.splats(self.num_threads)
+
+    def occupancy_grid(self) -> OccupancyGrid:
+        """The occupancy grid as it is now."""
+        return self.occupancy.grid()
+
+    def _view(self, frame: RgbdFrame) -> View:
+        return make_view(frame, inside_workspace(frame, world_points(frame), self.workspace))
+
+    def _label(self, robot: RobotPosture | None) -> Bool:
+        """Label the robot's splats; returns those (M,) that were robot and no longer are: its trail."""
+        was_robot: Bool = self.buffer.labels == Label.ROBOT
+        if robot is None:
+            return np.zeros(len(was_robot), bool)
+        is_robot = robot_labels(self.buffer, self.occupancy, robot.centers, robot.radii)
+        is_trail: Bool = was_robot & ~is_robot
+        self.buffer.labels[is_robot] = Label.ROBOT
+        self.buffer.labels[is_trail] = Label.OBJECT
+        return is_trail
+
+    def _carry(self, robot: RobotPosture | None) -> None:
+        """Move the robot's splats with the link of the sphere they are nearest to."""
+        before, self._posture = self._posture, robot
+        if before is None or robot is None:
+            return
+        slots = np.flatnonzero(self.buffer.is_alive & (self.buffer.labels == Label.ROBOT))
+        self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
+
+    def _remove(self, is_trail: Bool) -> dict[str, int]:
+        reasons = removals(self.buffer, self.occupancy, self.workspace, self.config.min_opacity, is_trail)
+        for mask in reasons.values():
+            self.buffer.kill(mask)
+        return {reason: int(mask.sum()) for reason, mask in reasons.items()}
+
+    def _seed(self, views: Sequence[View], rng: np.random.Generator) -> Filled:
+        """Fill dead slots at the pixels of M_add; the first time chooses the spacing that uses `fill` of them."""
+        sources = []
+        for view in views:
+            mask = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
+            if mask.any():
+                sources.append(candidates(view.frame, world_points(view.frame), mask))
+        if not sources:
+            return Filled(added=0, relocated=0, unmet=0)
+        if self.spacing == 0.0:
+            points = np.concatenate([source[0] for source in sources])
+            self.spacing = max(
+                spacing_for(points, int(self.config.fill * self.config.max_splats), rng), self.config.min_spacing
+            )
+        live = self.buffer.centers[self.buffer.is_alive]
+        seeds = seeds_at(sources, live, self.spacing, self.config, rng)
+        return self.buffer.fill(seeds, self.config.initial_opacity)
+
+    def _optimise(self, num_iterations: int, rng: np.random.Generator, rate: float = 1.0) -> None:
+        settings = self._settings(rate)
+        for view in self.window.schedule(num_iterations, rng):
+            planes = self._planes(view)
+            plane_gradients = np.empty_like(planes)
+            self._loss.evaluate(planes, view.target, self._weights(), plane_gradients)
+            self._raster.backward(planes, plane_gradients, self._gradients)
+            step_seed = (self.seed << 32) + self.num_iterations
+            optimiser_step(
+                self._raster, self._gradients, self.buffer.parameters, self.buffer.moments, settings, step_seed
+            )
+            self.num_iterations += 1
+
+    def _planes(self, view: View) -> Float32:
+        centers, radii, colors, opacities = unpack_parameters(self.buffer.parameters, self.num_threads)
+        self._raster.prepare(view.camera, centers, radii, opacities, colors)
+        return self._raster.forward()
+
+    def _rendering(self, view: View) -> Rendering:
+        planes = self._planes(view)
+        return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
+
+    def _evaluate(self, view: View, planes: Float32) -> LossTerms:
+        return self._loss.evaluate(planes, view.target, self._weights(), np.empty_like(planes))
+
+    def _weights(self) -> LossWeights:
+        c = self.config
+        return LossWeights(
+            dssim=c.lambda_dssim,
+            color=c.lambda_color,
+            depth=c.lambda_depth,
+            opacity=c.lambda_opacity,
+            normalised=c.depth_loss == "normalised",
+        )
+
+    def _settings(self, rate: float) -> OptimiserSettings:
+        c = self.config
+        return OptimiserSettings(
+            lr_center=c.lr_center * rate,
+            lr_log_radius=c.lr_log_radius * rate,
+            lr_color=c.lr_color * rate,
+            lr_logit_opacity=c.lr_logit_opacity * rate,
+            regulariser=c.lambda_reg / max(int(self.buffer.is_alive.sum()), 1),
+            noise=c.noise * rate,
+            min_opacity=c.min_opacity,
+            min_radius=c.min_radius,
+            max_radius=c.max_radius,
+        )
+
+    def _audit(
+        self,
+        frames: Sequence[RgbdFrame],
+        filled: Filled,
+        removed: dict[str, int],
+        terms: Sequence[LossTerms],
+    ) -> AuditRow:
+        c, buffer = self.config, self.buffer
+        opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
+        image = [
+            c.lambda_color * ((1 - c.lambda_dssim) * t.l1 + c.lambda_dssim * t.dssim)
+            + c.lambda_depth * t.depth
+            + c.lambda_opacity * t.transmittance
+            for t in terms
+        ]
+        squared = float(np.mean([t.squared for t in terms]))
+        return AuditRow(
+            stamp_ns=max(frame.stamp_ns for frame in frames),
+            cameras=tuple(frame.camera for frame in frames),
+            alive=int(buffer.is_alive.sum()),
+            dead=int((buffer.was_used & ~buffer.is_alive).sum()),
+            added=filled.added,
+            relocated=filled.relocated,
+            unmet=filled.unmet,
+            removed=removed,
+            robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
+            loss=round(float(np.mean(image)) + c.lambda_reg * opacity, 6),
+            psnr=round(-10.0 * float(np.log10(max(squared, 1e-12))), 4),
+        )
+
+    def state(self) -> dict[str, NDArray[np.generic]]:
+        """Everything a fitter needs to go on exactly, as arrays: splats, Adam, occupancy, window, counters."""
+        arrays = self.buffer.arrays() | {
+            "log_odds": self.occupancy.log_odds,
+            "num_updates": self.occupancy.num_updates,
+            "entity": self.occupancy.entity,
+            "counters": np.array([self.num_steps, self.num_iterations], np.int64),
+            "spacing": np.array(self.spacing),
+        }
+        if self._posture is not None:
+            arrays |= {f"posture/{name}": getattr(self._posture, name) for name in POSTURE_NAMES}
+        for kind, views in (("newest", self.window.newest), ("keyframe", self.window.keyframes)):
+            for index, view in enumerate(views):
+                arrays |= {f"{kind}/{index}/{name}": array for name, array in _frame_arrays(view.frame).items()}
+        return arrays
+
+    def restore(self, arrays: dict[str, NDArray[np.generic]]) -> None:
+        """Take over the state that `state` of a fitter with the same configuration gave."""
+        for name, array in self.buffer.arrays().items():
+            array[...] = arrays[name]
+        for name in ("log_odds", "num_updates", "entity"):
+            getattr(self.occupancy, name)[...] = arrays[name]
+        self.num_steps, self.num_iterations = (int(n) for n in arrays["counters"])
+        self.spacing = float(arrays["spacing"])
+        if "posture/radii" in arrays:
+            self._posture = RobotPosture(**{n: np.asarray(arrays[f"posture/{n}"], float) for n in POSTURE_NAMES})
+        self.window = Window(self.config)
+        self.window.newest = [self._view(frame) for frame in _frames(arrays, "newest")]
+        self.window.keyframes = [self._view(frame) for frame in _frames(arrays, "keyframe")]
+
+
+def _frame_arrays(frame: RgbdFrame) -> dict[str, NDArray[np.generic]]:
+    k = frame.intrinsics
+    return {
+        "color": frame.color,
+        "depth": frame.depth,
+        "T_world_camera": frame.T_world_camera,
+        "intrinsics": np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height]),
+        "stamp_ns": np.array(frame.stamp_ns, np.int64),
+        "camera": np.array(frame.camera),
+    }
+
+
+def _frames(arrays: dict[str, NDArray[np.generic]], kind: str) -> list[RgbdFrame]:
+    frames: list[RgbdFrame] = []
+    while f"{kind}/{len(frames)}/color" in arrays:
+        a = {name: arrays[f"{kind}/{len(frames)}/{name}"] for name in _FRAME_NAMES}
+        fx, fy, cx, cy, width, height = (float(x) for x in a["intrinsics"])
+        frames.append(
+            RgbdFrame(
+                stamp_ns=int(a["stamp_ns"]),
+                camera=str(a["camera"]),
+                color=np.asarray(a["color"], np.uint8),
+                depth=np.asarray(a["depth"], np.float32),
+                intrinsics=Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height)),
+                T_world_camera=np.asarray(a["T_world_camera"], np.float64),
+            )
+        )
+    return frames
+
+
+_FRAME_NAMES = ("color", "depth", "T_world_camera", "intrinsics", "stamp_ns", "camera")

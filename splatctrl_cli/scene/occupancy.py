@@ -1,0 +1,91 @@
+"""The occupancy grid of III-C: what the depth images have seen free, occupied, or never."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.kernels.occupancy import integrate_depth, mark_spheres, pack_grid
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
+
+MAX_VOXELS = 400_000_000
+
+
+class OccupancyMap:
+    """A dense log-odds grid over a workspace, changed in place."""
+
+    def __init__(self, workspace: Box, config: OccupancyConfig, num_threads: int) -> None:
+        self.config = config
+        self.num_threads = num_threads
+        extent = workspace.upper - workspace.lower
+        shape = tuple(int(n) for n in np.maximum(np.ceil(extent / config.voxel), 1))
+        if np.prod([float(n) for n in shape]) > MAX_VOXELS:
+            size = " x ".join(f"{e:.1f}" for e in extent)
+            raise UsageError(
+                f"workspace of {size} m: too large for {config.voxel} m voxels",
+                remedy="give --box, or a larger occupancy.voxel",
+            )
+        self.origin: Float64 = workspace.lower + 0.5 * config.voxel
+        self.log_odds: Float32 = np.zeros(shape, np.float32)
+        self.num_updates: NDArray[np.uint16] = np.zeros(shape, np.uint16)
+        self.entity: NDArray[np.uint8] = np.zeros(shape, np.uint8)
+        self._marks: NDArray[np.uint8] = np.zeros(shape, np.uint8)
+        self._packed = pack_grid(self.origin, config.voxel, shape)
+
+    def integrate(self, frame: RgbdFrame) -> None:
+        """Add one depth image: rays free what they pass, ends are hits."""
+        k = frame.intrinsics
+        integrate_depth(
+            self._packed,
+            self.log_odds,
+            self.num_updates,
+            self._marks,
+            np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64),
+            np.ascontiguousarray(frame.T_world_camera, np.float64),
+            np.ascontiguousarray(frame.depth, np.float32),
+            hit=self.config.log_odds_hit,
+            miss=self.config.log_odds_miss,
+            limit=self.config.log_odds_limit,
+            max_range=self.config.max_range,
+            stride=self.config.ray_stride,
+            num_threads=self.num_threads,
+        )
+
+    def mark_robot(self, centers: Float64, radii: Float64) -> None:
+        """Set the robot bit in the voxels that spheres (S, 3), (S,) [m] meet, and in no other."""
+        self.entity &= np.uint8(~Label.ROBOT & 0xFF)
+        mark_spheres(self._packed, self.entity, centers, radii, int(Label.ROBOT), self.num_threads)
+
+    def entity_at(self, points_world: Float32) -> NDArray[np.uint8]:
+        """Entity bits (N,) of the voxels that hold points (N, 3); 0 outside the grid."""
+        cell = np.floor((points_world - self.origin) / self.config.voxel + 0.5).astype(np.int64)
+        is_inside = np.all((cell >= 0) & (cell < self.entity.shape), axis=1)
+        i, j, k = np.clip(cell, 0, np.array(self.entity.shape) - 1).T
+        return np.where(is_inside, self.entity[i, j, k], np.uint8(0))
+
+    def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
+        """The largest occupancy (N,) of the eight voxels nearest to each point, and whether any was ever seen.
+
+        A surface within half a voxel of a splat keeps it: the eight nearest centres reach that far on every side.
+        Never-seen voxels count only where all eight are (occupancy one half).
+        """
+        base = np.floor((points_world - self.origin) / self.config.voxel).astype(np.int64)
+        limit = np.array(self.log_odds.shape) - 1
+        largest = np.full(len(points_world), -np.inf, np.float32)
+        for corner in np.ndindex(2, 2, 2):
+            i, j, k = np.clip(base + corner, 0, limit).T
+            is_seen = self.num_updates[i, j, k] > 0
+            largest = np.where(is_seen, np.maximum(largest, self.log_odds[i, j, k]), largest)
+        is_observed = np.isfinite(largest)
+        log_odds = np.where(is_observed, largest, np.float32(0.0))
+        return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
+
+    def grid(self) -> OccupancyGrid:
+        """A copy of the grid as it is now."""
+        return OccupancyGrid(
+            origin=self.origin.copy(),
+            voxel=self.config.voxel,
+            log_odds=self.log_odds.copy(),
+            num_updates=self.num_updates.copy(),
+            entity=self.entity.copy(),
+        )

@@ -1,0 +1,71 @@
+"""Which splats must go, and why (III-C)."""
+
+import numpy as np
+
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Label
+from splatctrl_cli.scene.buffer import SplatBuffer
+from splatctrl_cli.scene.occupancy import OccupancyMap
+
+REASONS = ("broken", "workspace", "opacity", "free", "uncertain", "trail")
+
+
+def inside_spheres(points: Float32, centers: Float64, radii: Float64, margin: float) -> Bool:
+    """Points (N, 3) within `margin` [m] of a sphere of (S, 3), (S,) [m]."""
+    inside = np.zeros(len(points), bool)
+    for center, radius in zip(centers, radii, strict=True):
+        inside |= np.sum((points - center) ** 2, axis=1) <= (radius + margin) ** 2
+    return inside
+
+
+def removals(
+    buffer: SplatBuffer, occupancy: OccupancyMap, workspace: Box, min_opacity: float, is_trail: Bool
+) -> dict[str, Bool]:
+    """Masks (M,) of live splats to remove, by reason; each splat under its first reason in `REASONS`.
+
+    broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free.
+    uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot, is no longer.
+    Updates the buffer's count of uncertain time steps. Splats whose surroundings were never seen stay, unless the
+    rule is "literal".
+    """
+    config = occupancy.config
+    centers = buffer.centers
+    is_broken: Bool = ~np.all(np.isfinite(buffer.parameters), axis=1)
+    value, is_observed = occupancy.occupancy_around(np.where(is_broken[:, None], np.float32(0), centers))
+    is_free, is_uncertain = _verdict(value, is_observed, config)
+    buffer.num_uncertain[:] = np.where(is_uncertain, buffer.num_uncertain + 1, 0)
+    has_lost_patience = is_uncertain & (
+        (buffer.num_uncertain > config.uncertain_patience) | (config.rule == "literal")
+    )
+    masks = {
+        "broken": is_broken,
+        "workspace": ~workspace.contains(centers),
+        "opacity": buffer.opacities < min_opacity,
+        "free": is_free,
+        "uncertain": has_lost_patience,
+        "trail": is_trail,
+    }
+    remaining = buffer.is_alive.copy()
+    reasons = {}
+    for reason in REASONS:
+        reasons[reason] = masks[reason] & remaining
+        remaining &= ~masks[reason]
+    return reasons
+
+
+def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tuple[Bool, Bool]:
+    if config.rule == "literal":
+        return value < config.free_below, (value >= config.free_below) & (value < config.occupied_above)
+    return (
+        is_observed & (value < config.free_below),
+        is_observed & (value >= config.free_below) & (value < config.occupied_above),
+    )
+
+
+def robot_labels(buffer: SplatBuffer, occupancy: OccupancyMap, centers: Float64, radii: Float64) -> Bool:
+    """Splats (M,) of the robot: those in voxels that its spheres meet, then within a margin of a sphere itself."""
+    margin = occupancy.config.robot_margin
+    occupancy.mark_robot(centers, radii + margin)
+    is_robot = buffer.is_alive & (occupancy.entity_at(buffer.centers) & Label.ROBOT > 0)
+    is_robot[is_robot] = inside_spheres(buffer.centers[is_robot], centers, radii, margin)
+    return is_robot

@@ -1,0 +1,85 @@
+"""Groups a stream of records into time steps, and finds the workspace."""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Box, Float64, JointState, Record, RgbdFrame
+from splatctrl_cli.scene.seeding import world_points
+
+LARGEST_STEP = 32  # frames of a scene without a clock that are taken in together
+LARGEST_GAP_NS = 200_000_000  # a joint state older than this says nothing about a frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeStep:
+    """Frames taken together, at most one per camera where there is a clock, and the joint positions then.
+
+    position (J,) float64, in the source's joint order; None where no joint state is near.
+    """
+
+    frames: tuple[RgbdFrame, ...]
+    position: Float64 | None
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the newest frame."""
+        return max(frame.stamp_ns for frame in self.frames)
+
+
+def time_steps(
+    records: Iterator[Record], cameras: Collection[str], *, has_clock: bool, tolerance_ns: int = 20_000_000
+) -> Iterator[TimeStep]:
+    """Group the frames of `cameras`: with a clock by stamp, else up to 32 views at a time."""
+    frames: list[RgbdFrame] = []
+    newest: JointState | None = None
+    at_frames: JointState | None = None
+    for record in records:
+        if isinstance(record, JointState):
+            newest = record
+            continue
+        if record.camera not in cameras:
+            continue
+        if frames and _is_complete(frames, record, has_clock=has_clock, tolerance_ns=tolerance_ns):
+            yield _time_step(frames, at_frames)
+            frames = []
+        frames.append(record)
+        at_frames = newest
+    if frames:
+        yield _time_step(frames, at_frames)
+
+
+def _is_complete(frames: Sequence[RgbdFrame], record: RgbdFrame, *, has_clock: bool, tolerance_ns: int) -> bool:
+    if not has_clock:
+        return len(frames) >= LARGEST_STEP
+    is_later = record.stamp_ns - frames[0].stamp_ns > tolerance_ns
+    return is_later or any(frame.camera == record.camera for frame in frames)
+
+
+def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeStep:
+    """Joint positions are carried to the frames' stamp by their velocities."""
+    position = None
+    if joints is not None and abs(frames[-1].stamp_ns - joints.stamp_ns) <= LARGEST_GAP_NS:
+        elapsed = (frames[-1].stamp_ns - joints.stamp_ns) * 1e-9
+        position = joints.position + elapsed * np.nan_to_num(joints.velocity)
+    return TimeStep(frames=tuple(frames), position=position)
+
+
+def depth_box(frames: Sequence[RgbdFrame], max_range: float) -> Box:
+    """The box of the valid depth of `frames` up to `max_range` [m], without its outermost 0.5 % on each side.
+
+    Raises InputError when there is no valid depth at all.
+    """
+    points = [world_points(frame)[(frame.depth > 0) & (frame.depth <= max_range)] for frame in frames]
+    joined = np.concatenate(points)
+    if not len(joined):
+        names = ", ".join(sorted({frame.camera for frame in frames}))
+        raise InputError(
+            f"camera {names}: no valid depth within {max_range} m in the first frames",
+            remedy="check the depth topic and scale, or raise occupancy.max_range",
+        )
+    lower, upper = np.percentile(joined, [0.5, 99.5], axis=0)
+    margin = 0.02 * (upper - lower) + 0.02
+    return Box(lower=lower - margin, upper=upper + margin)

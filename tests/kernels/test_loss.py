@@ -1,0 +1,84 @@
+"""The fused image loss against eq. 4 in float64."""
+
+import numpy as np
+import pytest
+import torch
+
+from splatctrl_cli.kernels.raster import Float32, ImageLoss, LossTerms, LossWeights, TargetView
+from tests.reference import loss as reference
+
+WEIGHTS = LossWeights(dssim=0.2, color=1.0, depth=0.7, opacity=0.1, normalised=False)
+
+
+def images(height: int = 29, width: int = 43, seed: int = 0) -> tuple[Float32, TargetView]:
+    rng = np.random.default_rng(seed)
+    planes = rng.uniform(0.05, 1.0, (5, height, width)).astype(np.float32)
+    depth = rng.uniform(0.4, 1.5, (height, width)).astype(np.float32)
+    depth[rng.uniform(size=depth.shape) < 0.3] = 0.0
+    counted = (rng.uniform(size=depth.shape) < 0.9).astype(np.uint8)
+    color = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+    return planes, TargetView(color=color, depth=depth, counted=counted)
+
+
+def evaluated(planes: Float32, view: TargetView, weights: LossWeights, threads: int = 1) -> tuple[LossTerms, Float32]:
+    gradient = np.full_like(planes, np.nan)
+    return ImageLoss(threads).evaluate(planes.copy(), view, weights, gradient), gradient
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_value_and_gradient_equal_the_reference(normalised: bool) -> None:
+    planes, view = images()
+    weights = LossWeights(dssim=0.2, color=1.0, depth=0.7, opacity=0.1, normalised=normalised)
+    terms, gradient = evaluated(planes, view, weights)
+    leaf = torch.tensor(planes.astype(np.float64), requires_grad=True)
+    expected = reference.loss(
+        leaf,
+        torch.tensor(view.color.astype(np.float64)),
+        torch.tensor(view.depth.astype(np.float64)),
+        torch.tensor(view.counted > 0),
+        dssim=0.2,
+        color_weight=1.0,
+        depth_weight=0.7,
+        opacity_weight=0.1,
+        normalised=normalised,
+    )
+    expected.backward()  # type: ignore[no-untyped-call]
+    value = 0.8 * terms.l1 + 0.2 * terms.dssim + 0.7 * terms.depth + 0.1 * terms.transmittance
+    assert value == pytest.approx(expected.item(), rel=1e-5)
+    assert leaf.grad is not None
+    want = leaf.grad.numpy()
+    assert np.abs(gradient - want).max() < 1e-5 * np.abs(want).max()
+
+
+def test_identical_images_have_no_colour_loss() -> None:
+    planes, view = images()
+    planes[:3] = view.color
+    terms, gradient = evaluated(planes, view, WEIGHTS)
+    assert (terms.l1, terms.squared) == (0.0, 0.0)
+    assert terms.dssim == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(gradient[:3]).max() < 1e-6
+
+
+def test_pixels_that_do_not_count_change_neither_value_nor_gradient() -> None:
+    planes, view = images()
+    other = planes.copy()
+    other[:3, view.counted == 0] += 0.3
+    a, b = evaluated(planes, view, WEIGHTS), evaluated(other, view, WEIGHTS)
+    assert a[0] == b[0]
+    assert np.array_equal(a[1], b[1])
+    assert not a[1][:3, view.counted == 0].any()
+
+
+def test_a_frame_without_depth_has_no_depth_loss() -> None:
+    planes, view = images()
+    view = TargetView(color=view.color, depth=np.zeros_like(view.depth), counted=view.counted)
+    terms, gradient = evaluated(planes, view, WEIGHTS)
+    assert terms.depth == 0.0
+    assert not gradient[3:].any()
+
+
+def test_thread_count_does_not_change_a_bit() -> None:
+    planes, view = images(120, 161)
+    one, two = evaluated(planes, view, WEIGHTS, 1), evaluated(planes, view, WEIGHTS, 2)
+    assert one[0] == two[0]
+    assert one[1].tobytes() == two[1].tobytes()
