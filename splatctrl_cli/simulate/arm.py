@@ -27,6 +27,8 @@ JOINTS = (
     ("joint7", (0.088, 0.0, 0.0), np.pi / 2, -2.8973, 2.8973, 2.61, 12.0),
 )
 FLANGE = 0.107  # [m] along z of link7
+SPACING = 0.042  # [m] at most, between the spheres along a link
+BAR_WIDTH = 0.04  # [m] at most, of the bars that boxes are cut into to be covered
 HAND_YAW = -np.pi / 4  # the hand is mounted turned by 45 degrees
 
 
@@ -126,7 +128,7 @@ def arm_spheres_yaml() -> str:
     return "\n".join(lines) + "\n"
 
 
-def covering_spheres(shapes: tuple[Capsule | Block, ...], spacing: float = 0.042) -> list[tuple[Float64, float]]:
+def covering_spheres(shapes: tuple[Capsule | Block, ...]) -> list[tuple[Float64, float]]:
     """Spheres (center (3,), radius) [m], link frame, whose union contains every shape.
 
     Along a segment with steps h, a radius of sqrt(R^2 + (h/2)^2) covers the tube of radius R; for a bar of a box, R
@@ -134,7 +136,7 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...], spacing: float = 0.042
     """
     spheres: list[tuple[Float64, float]] = []
     for start, end, radius in (spine for shape in shapes for spine in _spines(shape)):
-        steps = int(np.ceil(np.linalg.norm(end - start) / spacing - 1e-9))
+        steps = int(np.ceil(np.linalg.norm(end - start) / SPACING - 1e-9))
         step = float(np.linalg.norm(end - start)) / steps
         grown = float(np.ceil(np.hypot(radius, step / 2) * 1e4) / 1e4)
         spheres += [(start + (end - start) * (i / steps), grown) for i in range(steps + 1)]
@@ -145,20 +147,21 @@ def covering_spheres(shapes: tuple[Capsule | Block, ...], spacing: float = 0.042
     return kept
 
 
-def _spines(shape: Capsule | Block, widest: float = 0.04) -> list[tuple[Float64, Float64, float]]:
+def _spines(shape: Capsule | Block) -> list[tuple[Float64, Float64, float]]:
     """Segments (start, end) and tube radii: a capsule's own, or those of the bars that a box is cut into.
 
-    The bars lie along the longest side and are at most `widest` [m] along the second longest. A bar's segment ends a
-    third of its thickness before the bar does: the last sphere still reaches past the corners.
+    The bars lie along the longest side. A bar's segment ends half a step before the bar does, so that the corners
+    are as far from the last sphere's middle as the edges between two spheres are.
     """
     if isinstance(shape, Capsule):
         return [(np.array(shape.start, dtype=float), np.array(shape.end, dtype=float), shape.radius)]
     size = np.array(shape.size)
     thin, wide, long = (int(axis) for axis in np.argsort(size, kind="stable"))
-    num_bars = int(np.ceil(size[wide] / widest - 1e-9))
+    num_bars = int(np.ceil(size[wide] / BAR_WIDTH - 1e-9))
     width = size[wide] / num_bars
     half = np.zeros(3)
-    half[long] = size[long] / 2 - min(0.33 * min(size[thin], width), size[long] / 4)
+    num_steps = max(2, int(np.ceil(size[long] / SPACING - 1e-9)))
+    half[long] = (size[long] - size[long] / num_steps) / 2
     spines = []
     for bar in range(num_bars):
         middle = np.array(shape.middle, dtype=float)
