@@ -1,6 +1,7 @@
 """Options that say how a recorded input is to be read, for every subcommand that reads one."""
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,7 +69,7 @@ def _topics(text: str) -> "CameraTopics":
 
     name, equals, rest = text.partition("=")
     topics = rest.split(",")
-    if not (name and equals and len(topics) in {2, 3} and all(topics)):
+    if not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)):
         raise UsageError(f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO")
     return CameraTopics(name=name, color=topics[0], depth=topics[1], info=topics[2] if len(topics) == 3 else "")
 

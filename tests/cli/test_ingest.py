@@ -1,0 +1,153 @@
+"""``splatctrl ingest`` and ``splatctrl info`` as a person meets them: exit codes, one line, nothing left behind."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.io.source import open_source
+from tests.io.make_log import LogRecipe, make_log
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    code = main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_ingest_writes_a_capture_that_reads_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, out = make_log(tmp_path / "log.mcap"), tmp_path / "x.capture"
+    code, printed, _ = run(capsys, "ingest", log, "-o", out, "--json")
+    assert code == 0
+    result = json.loads(printed)
+    assert result["frames"] == {"cam0": 5}
+    assert result["joint_states"] == 5
+    assert len(list(open_source(out).records())) == 10
+    assert json.loads((out / "run.json").read_text())["inputs"].keys() == {"log.mcap"}
+    assert not (tmp_path / "x.capture.partial").exists()
+
+
+def test_an_existing_capture_is_kept_without_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, out = make_log(tmp_path / "log.mcap"), tmp_path / "x.capture"
+    out.mkdir()
+    (out / "precious").touch()
+    code, _, error = run(capsys, "ingest", log, "-o", out)
+    assert code == 2
+    assert "already exists; give --force" in error
+    assert (out / "precious").exists()
+    assert run(capsys, "ingest", log, "-o", out, "--force")[0] == 0
+    assert not (out / "precious").exists()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "said"),
+    [
+        (LogRecipe(has_depth=False), "no depth topic"),
+        (LogRecipe(has_info=False), "has no usable CameraInfo"),
+        (LogRecipe(has_tf=False), "no tf for frame"),
+        (LogRecipe(depth_encoding="32FC1", depth_m=1250.0), "median depth 1250 m is implausible"),
+        (LogRecipe(num_frames=0, has_tf=False), "holds no messages"),
+    ],
+)
+def test_an_unusable_log_is_one_line_exit_4_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], recipe: LogRecipe, said: str
+) -> None:
+    log = make_log(tmp_path / "log.mcap", recipe)
+    code, printed, error = run(capsys, "ingest", log, "-o", tmp_path / "x.capture", "-q")
+    assert code == 4
+    assert printed == ""
+    assert error.count("\n") == 1
+    assert said in error
+    assert "; " in error
+    assert [p.name for p in tmp_path.iterdir()] == ["log.mcap"]
+
+
+@pytest.mark.parametrize("command", ["ingest", "info"])
+def test_a_missing_file_is_exit_4(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    code, _, error = run(capsys, command, tmp_path / "nothing.mcap")
+    assert code == 4
+    assert "nothing.mcap: no such file" in error
+
+
+def test_a_truncated_log_is_exit_3_with_what_precedes_the_cut(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=20)), tmp_path / "x.capture"
+    log.write_bytes(log.read_bytes()[: log.stat().st_size * 6 // 10])
+    code, printed, _ = run(capsys, "ingest", log, "-o", out, "--json")
+    assert code == 3
+    assert json.loads(printed)["loss"]["damaged"] == 1
+    assert (out / "capture.json").is_file()
+    assert run(capsys, "info", log)[0] == 3
+
+
+def test_frames_without_partner_or_pose_are_counted_and_exit_0(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(tf_frames=3))
+    code, printed, _ = run(capsys, "ingest", log, "-o", tmp_path / "x.capture")
+    assert code == 0
+    assert "without pose: 2" in printed
+
+
+def test_an_unwritable_output_is_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, error = run(capsys, "ingest", make_log(tmp_path / "log.mcap"), "-o", "/proc/x.capture", "-q")
+    assert code == 2
+    assert "cannot be written" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--depth-scale", "-1"),
+        ("--camera", "cam0"),
+        ("--camera", "cam0=/a"),
+        ("--camera", "../x=/a,/b"),
+        ("--camera-pose", "cam0=1,2,3"),
+        ("--camera-pose", "cam0=0,0,0,0,0,0,0"),
+        ("--pairing-tolerance", "-0.1"),
+    ],
+)
+def test_options_of_the_wrong_form_are_exit_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[str, str]
+) -> None:
+    code, _, error = run(capsys, "ingest", make_log(tmp_path / "log.mcap"), *option)
+    assert code == 2
+    assert option[0] in error
+
+
+def test_topics_and_pose_can_be_given_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, out = make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False)), tmp_path / "x.capture"
+    topics = "eye=/cam0/color/image_raw/compressed,/cam0/depth/image_raw,/cam0/color/camera_info"
+    pose = "eye=0.5,0,1,0,0,0,1"
+    assert run(capsys, "ingest", log, "-o", out, "--camera", topics, "--camera-pose", pose)[0] == 0
+    assert open_source(out).cameras == ("eye",)
+
+
+def test_info_says_for_people_and_in_json_what_is_there_and_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_depth=False))
+    code, printed, _ = run(capsys, "info", log)
+    assert code == 0
+    assert "missing for a reconstruction: no depth topic" in printed
+    assert "/joint_states" in printed
+    code, printed, _ = run(capsys, "info", log, "--json")
+    result = json.loads(printed)
+    assert result["kind"] == "MCAP"
+    assert result["missing"][0].startswith("no depth topic")
+    assert {row["topic"] for row in result["topics"]} >= {"/tf", "/joint_states"}
+
+
+def test_the_sample_log_becomes_a_capture_of_all_its_cameras(
+    sample_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "x.capture"
+    code, printed, _ = run(capsys, "ingest", sample_data / "tabletop/log.mcap", "-o", out, "--json")
+    assert code == 0
+    frames = json.loads(printed)["frames"]
+    assert sorted(frames) == ["cam0", "cam1", "cam2", "cam3"]
+    assert min(frames.values()) > 20
+    assert json.loads(printed)["loss"]["damaged"] == 0
