@@ -83,7 +83,7 @@ class ControlConfig:
 
     margin: float = 0.02  # [m] epsilon, IV-C
     period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
-    barrier_gain: float = 10.0  # [1/s] alpha of every limit and barrier row; printed as 1; alpha * dt <= 1 is checked
+    barrier_gain: float = 10.0  # [1/s] alpha of every limit and barrier row; 1 (as printed) takes 1.4 times as long
     self_margin: float = 0.02  # [m] epsilon of the self-collision rows, III-E
     weight_linear: float = 10.0  # Q of III-E, linear part; III-E gives no weights
     weight_angular: float = 1.0  # Q of III-E, angular part

@@ -142,7 +142,7 @@ def _audited(inputs: _Inputs, config: "Config") -> "Replay":
     """The audit of every logged state for which a scene was known."""
     from splatctrl_cli.cli.replay_report import Replay
     from splatctrl_cli.control.audit import audit
-    from splatctrl_cli.control.step import static_violations
+    from splatctrl_cli.control.checks import static_violations
 
     scene, model = inputs.scene, inputs.model
     states = [s for s in inputs.states if scene.first_ns is None or s.stamp_ns >= scene.first_ns]
@@ -159,7 +159,7 @@ def _audited(inputs: _Inputs, config: "Config") -> "Replay":
         audit=trace,
         num_before_scene=len(inputs.states) - len(states),
         median_radius=last.median_radius,
-        static_violations=static_violations(model, config.control, last.barrier, trace.position[-1]),
+        static_violations=static_violations(model, last.barrier, trace.position[-1], config.control.margin),
     )
 
 
@@ -196,8 +196,8 @@ def _task(args: argparse.Namespace, inputs: _Inputs) -> "ReplayTask":
     import numpy as np
 
     from splatctrl_cli.control.audit import checked_states
+    from splatctrl_cli.control.checks import checked_posture
     from splatctrl_cli.control.replay import ReplayTask
-    from splatctrl_cli.control.step import checked_posture
     from splatctrl_cli.geometry import transform_from
 
     model = inputs.model

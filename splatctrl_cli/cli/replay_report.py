@@ -10,8 +10,8 @@ from splatctrl_cli.cli.common import table
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
     from splatctrl_cli.control.audit import AuditTrace
+    from splatctrl_cli.control.checks import StaticViolation
     from splatctrl_cli.control.replay import ReplayTrace
-    from splatctrl_cli.control.step import StaticViolation
     from splatctrl_cli.evaluate.clearance import ClearanceAgreement
     from splatctrl_cli.io.output import Stopwatch
     from splatctrl_cli.records import Float64
@@ -77,8 +77,8 @@ def metrics_of(replay: Replay) -> Metrics:
 def _closed_loop_metrics(trace: "ReplayTrace", start_time_s: float) -> Metrics:
     import numpy as np
 
+    from splatctrl_cli.control.ladder import Rung
     from splatctrl_cli.control.replay import Outcome, num_on_rung
-    from splatctrl_cli.control.step import Rung
 
     steps, last = trace.steps, trace.steps[-1]
     return {
@@ -93,6 +93,8 @@ def _closed_loop_metrics(trace: "ReplayTrace", start_time_s: float) -> Metrics:
         "num_relaxed": num_on_rung(trace, Rung.RELAXED),
         "num_minimum_violation": num_on_rung(trace, Rung.MINIMUM_VIOLATION),
         "num_hold": num_on_rung(trace, Rung.HOLD),
+        "num_refused": sum(step.num_refused for step in steps),
+        "num_scene_hits": sum(change.is_hit for change in trace.scene_changes),
         "num_scaled_back": sum(step.scale < 1 for step in steps),
         "max_residual": _finite(max(step.residual for step in steps)),
     }
@@ -186,7 +188,7 @@ def events_of(replay: Replay) -> dict[str, Any]:
     import numpy as np
 
     from splatctrl_cli.control.arm import sphere_names
-    from splatctrl_cli.control.step import Rung
+    from splatctrl_cli.control.ladder import Rung
     from splatctrl_cli.evaluate.clearance import intervals_below
 
     audit, names = replay.audit, sphere_names(replay.model.sphere_set)
@@ -196,6 +198,7 @@ def events_of(replay: Replay) -> dict[str, Any]:
         for interval in intervals_below(audit.stamp_ns, clearance.distance, replay.margin)
     ]
     steps = () if replay.closed_loop is None else replay.closed_loop.steps
+    changes = () if replay.closed_loop is None else replay.closed_loop.scene_changes
     return {
         "below_margin": below,
         "outside_limits": [
@@ -207,6 +210,11 @@ def events_of(replay: Replay) -> dict[str, Any]:
             {"state": int(i), "share": float(audit.unknown_share[i])} for i in np.flatnonzero(audit.unknown_share > 0)
         ],
         "static_violations": [asdict(violation) for violation in replay.static_violations],
+        "scene_changes": [
+            asdict(change) | {"is_hit": change.is_hit}
+            for change in changes
+            if abs(change.after - change.before) > 0.01
+        ],
         "steps_not_plainly_solved": [
             {
                 "step": index,

@@ -7,19 +7,21 @@ from enum import StrEnum
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import Stamps
-from splatctrl_cli.control.qp import QpSolver
-from splatctrl_cli.control.step import (
-    ControlStep,
-    QpIkController,
-    Rung,
+from splatctrl_cli.control.checks import (
     StaticViolation,
     check_config,
+    check_free,
+    check_goal,
+    check_within_limits,
     checked_posture,
+    sphere_clearance,
     static_violations,
 )
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.qp import QpSolver
+from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.records import DistanceField, Float64
 
 FieldAt = Callable[[int], DistanceField]
@@ -48,6 +50,23 @@ class ReplayTask:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneChange:
+    """A newer scene at `stamp_ns`: the least clearance [m] of the unmoved arm before and after.
+
+    A recorded obstacle appears where the logged arm was not; an arm that went elsewhere may be in its place.
+    """
+
+    stamp_ns: int
+    before: float
+    after: float
+
+    @property
+    def is_hit(self) -> bool:
+        """True where the newer scene has something inside the arm that the older did not: no controller's doing."""
+        return self.after < 0 <= self.before
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReplayTrace:
     """T steps: stamp_ns (T,), position (T, J) [rad] at which each step was taken, and the steps themselves."""
 
@@ -56,6 +75,7 @@ class ReplayTrace:
     steps: tuple[ControlStep, ...]
     outcome: Outcome
     static_violations: tuple[StaticViolation, ...]
+    scene_changes: tuple[SceneChange, ...]
 
 
 def closed_loop(
@@ -72,17 +92,19 @@ def closed_loop(
     outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
     """
     check_config(config)
-    q = _checked_start(model, config, task)
+    q = checked_posture(model, task.start, what="start")
+    check_within_limits(model, q, config.limit_tolerance)
     check_goal(model, task.T_world_goal)
     field = field_at(task.stamp_ns)
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
-    _check_free(model, field, q)
-    statics = static_violations(model, config, field, q)
-    stamps, positions, steps = [], [], []
+    check_free(model, field, q)
+    statics = static_violations(model, field, q, config.margin)
+    stamps, positions, steps, changes = [], [], [], []
     outcome = Outcome.TIMEOUT
     for index in range(max(round(config.max_time / config.period), 1)):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
         if field_at(stamp) is not field:
+            changes.append(_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
             controller = controller.with_field(field)
         step = controller.step(q, task.T_world_goal)
@@ -102,6 +124,7 @@ def closed_loop(
         steps=tuple(steps),
         outcome=outcome,
         static_violations=statics,
+        scene_changes=tuple(changes),
     )
 
 
@@ -111,43 +134,10 @@ def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
     return bool(position <= config.goal_position and rotation <= config.goal_rotation)
 
 
-def check_goal(model: ArmModel, T_world_goal: Float64) -> None:
-    """Raise InputError for a goal that is no pose, or that lies outside the ball the robot can reach."""
-    if np.shape(T_world_goal) != (4, 4) or not np.all(np.isfinite(T_world_goal)):
-        raise InputError("goal: expected a finite pose x,y,z,qx,qy,qz,qw")
-    distance = float(np.linalg.norm(T_world_goal[:3, 3] - model.base_position))
-    if distance > model.reach():
-        where = ", ".join(f"{v:.3f}" for v in T_world_goal[:3, 3])
-        raise InputError(
-            f"goal: expected within {model.reach():.3f} m of the base, got ({where}) at {distance:.3f} m",
-            remedy="give a nearer --goal, or check --base and the world frame",
-        )
-
-
-def _checked_start(model: ArmModel, config: ControlConfig, task: ReplayTask) -> Float64:
-    q = checked_posture(model, task.start, what="start")
-    outside = np.maximum(q - model.upper, model.lower - q)
-    worst = int(np.argmax(outside))
-    if outside[worst] > config.limit_tolerance:
-        raise InputError(
-            f"start: joint {model.joint_names[worst]}: expected within [{model.lower[worst]:.4f}, "
-            f"{model.upper[worst]:.4f}] rad, got {q[worst]:.4f}",
-            remedy="choose another --start-time, or check that the URDF is of this robot",
-        )
-    return q
-
-
-def _check_free(model: ArmModel, field: DistanceField, q: Float64) -> None:
-    moving = np.flatnonzero(model.moving_spheres)
-    points = np.ascontiguousarray(model.sphere_centers(q)[moving])
-    distance = field.query(points)[0] - model.sphere_set.radii[moving]
-    worst = int(np.argmin(np.where(np.isfinite(distance), distance, np.inf)))
-    if distance[worst] < 0:
-        name = sphere_names(model.sphere_set)[moving[worst]]
-        raise NotEvaluableError(
-            f"start: expected a posture free of collision, got sphere {name} {-distance[worst]:.4f} m deep in it",
-            remedy="choose another --start-time, or check the robot's labels in the scene and --base",
-        )
+def _change(model: ArmModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField) -> SceneChange:
+    moving = np.asarray(model.moving_spheres)
+    least = [float(np.min(sphere_clearance(model, field, q, moving)[1])) for field in (before, after)]
+    return SceneChange(stamp_ns=stamp_ns, before=least[0], after=least[1])
 
 
 def _has_stalled(positions: list[Float64], config: ControlConfig) -> bool:

@@ -23,6 +23,7 @@ class PlanarArm:
         )
         self.moving_spheres: Bool = np.array([False, True, True, True, True])
         self.base_position: Float64 = np.zeros(3)
+        self.middle: Float64 = np.zeros(2)
         self.pairs = np.array([[0, 3], [0, 4]])
 
     def sphere_centers(self, q: Float64) -> Float64:

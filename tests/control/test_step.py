@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.checks import static_violations
+from splatctrl_cli.control.ladder import Rung, is_usable
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
-from splatctrl_cli.control.step import QpIkController, Rung, is_usable, middle_posture, static_violations
+from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.records import DistanceField, Float64
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away
@@ -104,7 +106,7 @@ def test_spheres_that_no_joint_moves_stay_out_of_the_program_and_are_reported() 
     buried_base = Balls([[0.0, 0.0, 0.0]], [0.1])
     step = controller(buried_base).step(Q, goal(np.array([0.35, 0.55])))
     assert step.rung is Rung.SOLVED
-    (violation,) = static_violations(PlanarArm(), CONFIG, buried_base, Q)
+    (violation,) = static_violations(PlanarArm(), buried_base, Q, CONFIG.margin)
     assert violation.sphere == "base[0]"
     assert violation.clearance == pytest.approx(-0.1 - 0.06)
 
@@ -119,9 +121,10 @@ def test_a_flat_field_cannot_be_acted_on_and_is_named() -> None:
 def test_an_unchecked_solution_is_never_used(status: str, residual: float) -> None:
     step = controller(far_away(), solver=Scripted(1, status, residual)).step(Q, goal(np.zeros(2)))
     assert step.rung is Rung.MINIMUM_VIOLATION
+    assert step.num_refused == 1
     np.testing.assert_allclose(step.velocity, 0.0, atol=1e-6)
     step = controller(far_away(), solver=Scripted(2, status, residual)).step(Q, goal(np.zeros(2)))
-    assert step.rung is Rung.HOLD and step.scale == 0.0
+    assert step.rung is Rung.HOLD and step.scale == 0.0 and step.num_refused == 2
     assert np.all(step.velocity == 0.0)
 
 
@@ -208,9 +211,3 @@ def test_a_start_outside_the_joint_limits_is_brought_back() -> None:
     assert step.rung is Rung.SOLVED
     assert step.velocity[0] == pytest.approx(-0.5, abs=1e-5)  # gain 10 /s times 0.05 rad
     assert "shoulder highest" in step.intervening
-
-
-def test_the_middle_posture_is_zero_for_an_unlimited_joint() -> None:
-    arm = PlanarArm()
-    arm.lower, arm.upper = np.array([-np.inf, 0.0]), np.array([np.inf, 1.0])
-    np.testing.assert_allclose(middle_posture(arm), [0.0, 0.5])

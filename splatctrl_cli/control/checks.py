@@ -1,0 +1,119 @@
+"""What must hold before a controller runs, and what no controller can change."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.records import DistanceField, Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class StaticViolation:
+    """A sphere that no joint moves and that is closer to the scene than the margin."""
+
+    sphere: str
+    clearance: float
+
+
+def check_config(config: ControlConfig) -> None:
+    """Raise UsageError for a period, gain or weight that no controller can run with."""
+    if not config.period > 0:
+        raise UsageError(f"control.period: expected above 0 s, got {config.period:g}")
+    if not 0 < config.barrier_gain * config.period <= 1:
+        raise UsageError(
+            f"control.barrier_gain: expected gain * period in (0, 1], got {config.barrier_gain * config.period:g}",
+            remedy="lower control.barrier_gain or control.period",
+        )
+    weights = ("weight_linear", "weight_angular", "weight_kinematics", "weight_slack", "posture_weight")
+    for name in (*weights, "slack_cost", "self_slack_cost"):
+        if not getattr(config, name) > 0:
+            raise UsageError(f"control.{name}: expected above 0, got {getattr(config, name):g}")
+
+
+def check_model(model: ArmModel) -> None:
+    """Raise InputError for a robot without velocity limits, or without a sphere that moves."""
+    has_limit = np.asarray(model.velocity_limit) > 0
+    if not np.all(has_limit):
+        joint = int(np.argmin(has_limit))
+        raise InputError(
+            f"joint {model.joint_names[joint]}: expected a velocity limit above zero, "
+            f"got {model.velocity_limit[joint]:g}",
+            remedy="set it in the URDF's <limit velocity=...>",
+        )
+    if not np.any(model.moving_spheres):
+        raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
+
+
+def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions") -> Float64:
+    """q as (J,) float64. Raises InputError where it has another size or is not finite."""
+    posture = np.asarray(q, dtype=np.float64)
+    if posture.shape != (len(model.joint_names),):
+        raise InputError(f"{what}: expected {len(model.joint_names)} joints, got shape {posture.shape}")
+    if not np.all(np.isfinite(posture)):
+        joint = int(np.argmin(np.isfinite(posture)))
+        raise InputError(f"{what}: joint {model.joint_names[joint]} is {posture[joint]}, expected a finite angle")
+    return posture
+
+
+def check_within_limits(model: ArmModel, q: Float64, tolerance: float) -> None:
+    """Raise InputError for a start q (J,) outside the position limits by more than `tolerance` [rad]."""
+    outside = np.maximum(q - model.upper, model.lower - q)
+    worst = int(np.argmax(outside))
+    if outside[worst] > tolerance:
+        raise InputError(
+            f"start: joint {model.joint_names[worst]}: expected within [{model.lower[worst]:.4f}, "
+            f"{model.upper[worst]:.4f}] rad, got {q[worst]:.4f}",
+            remedy="choose another --start-time, or check that the URDF is of this robot",
+        )
+
+
+def check_free(model: ArmModel, field: DistanceField, q: Float64) -> None:
+    """Raise NotEvaluableError for a start q (J,) with a moving sphere in the scene, naming the deepest."""
+    moving, distance = sphere_clearance(model, field, q, np.asarray(model.moving_spheres))
+    worst = int(np.argmin(np.where(np.isfinite(distance), distance, np.inf)))
+    if distance[worst] < 0:
+        name = sphere_names(model.sphere_set)[moving[worst]]
+        raise NotEvaluableError(
+            f"start: expected a posture free of collision, got sphere {name} {-distance[worst]:.4f} m deep in it",
+            remedy="choose another --start-time, or check the robot's labels in the scene and --base",
+        )
+
+
+def check_goal(model: ArmModel, T_world_goal: Float64) -> None:
+    """Raise InputError for a goal that is no pose, or that lies outside the ball the robot can reach."""
+    if np.shape(T_world_goal) != (4, 4) or not np.all(np.isfinite(T_world_goal)):
+        raise InputError("goal: expected a finite pose x,y,z,qx,qy,qz,qw")
+    distance = float(np.linalg.norm(T_world_goal[:3, 3] - model.base_position))
+    if distance > model.reach():
+        where = ", ".join(f"{v:.3f}" for v in T_world_goal[:3, 3])
+        raise InputError(
+            f"goal: expected within {model.reach():.3f} m of the base, got ({where}) at {distance:.3f} m",
+            remedy="give a nearer --goal, or check --base and the world frame",
+        )
+
+
+def static_violations(
+    model: ArmModel, field: DistanceField, q: Float64, margin: float
+) -> tuple[StaticViolation, ...]:
+    """The spheres that no joint moves and that stand within the margin [m]: a matter of mounting, not of control."""
+    if np.all(model.moving_spheres):
+        return ()
+    still, distance = sphere_clearance(model, field, q, ~np.asarray(model.moving_spheres))
+    names = sphere_names(model.sphere_set)
+    return tuple(
+        StaticViolation(sphere=names[s], clearance=float(d))
+        for s, d in zip(still, distance, strict=True)
+        if d < margin
+    )
+
+
+def sphere_clearance(
+    model: ArmModel, field: DistanceField, q: Float64, chosen: "np.ndarray[tuple[int], np.dtype[np.bool_]]"
+) -> tuple["np.ndarray[tuple[int], np.dtype[np.intp]]", Float64]:
+    """Indices (M,) of the chosen spheres and their surfaces' distances (M,) [m] at q (J,)."""
+    index = np.flatnonzero(chosen)
+    distance = field.query(np.ascontiguousarray(model.sphere_centers(q)[index]))[0]
+    return index, distance - model.sphere_set.radii[index]

@@ -1,0 +1,81 @@
+"""From the rows of III-E to a velocity: the first rung whose solution checks, down to standing still."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control import tasks
+from splatctrl_cli.control.barriers import Barrier
+from splatctrl_cli.control.problem import assemble
+from splatctrl_cli.control.qp import QpSolution, QpSolver
+from splatctrl_cli.records import Float64
+
+
+class Rung(StrEnum):
+    """How a step came about."""
+
+    SOLVED = "solved"
+    RELAXED = "relaxed"
+    MINIMUM_VIOLATION = "minimum-violation"
+    HOLD = "hold"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """The ladder's answer: velocity (J,), slack (M,) of the barrier rows, multipliers of the box (2 J,) and of the
+    barrier rows (M,); solution is the last that was asked for, num_refused how many were not used.
+    """
+
+    velocity: Float64
+    rung: Rung
+    slack: Float64
+    box_multipliers: Float64
+    row_multipliers: Float64
+    solution: QpSolution
+    num_refused: int
+
+
+def is_usable(solution: QpSolution, max_residual: float) -> bool:
+    """True for a solution that is exactly solved and whose residuals, computed by us, check."""
+    return solution.is_solved and solution.residuals.worst <= max_residual
+
+
+def descend(
+    solver: QpSolver,
+    costs: Sequence[tasks.Cost],
+    box: tuple[Float64, Float64],
+    barriers: Sequence[Barrier],
+    config: ControlConfig,
+) -> Choice:
+    """Solved, or relaxed where a slack remains; else the least violation; else hold still.
+
+    Both programs have a feasible point by construction, so the lower rungs are for a solver that fails.
+    """
+    J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
+    least_violation = [tasks.posture_task(np.zeros(J), 1.0)]
+    for num_refused, (rung, terms) in enumerate(((Rung.SOLVED, costs), (Rung.MINIMUM_VIOLATION, least_violation))):
+        solution = solver.solve(assemble(terms, *box, barriers))
+        if is_usable(solution, config.max_residual):
+            slack = np.maximum(solution.z[J:], 0.0)
+            has_given_way = bool(np.any(slack > config.slack_tolerance))
+            return Choice(
+                velocity=solution.z[:J],
+                rung=Rung.RELAXED if rung is Rung.SOLVED and has_given_way else rung,
+                slack=slack,
+                box_multipliers=solution.multipliers[: 2 * J],
+                row_multipliers=solution.multipliers[2 * J : 2 * J + M],
+                solution=solution,
+                num_refused=num_refused,
+            )
+    return Choice(
+        velocity=np.zeros(J),
+        rung=Rung.HOLD,
+        slack=np.zeros(M),
+        box_multipliers=np.zeros(2 * J),
+        row_multipliers=np.zeros(M),
+        solution=solution,
+        num_refused=2,
+    )
