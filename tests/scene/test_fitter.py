@@ -1,0 +1,126 @@
+"""The fitter over a floor on which a block appears and leaves."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.records import Label, SplatSet
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.posture import RobotPosture, carried
+from splatctrl_cli.scene.render import render
+from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
+
+CONFIG = SceneConfig(max_splats=1500, first_iterations=60, iterations_per_step=10)
+OCCUPANCY = OccupancyConfig()
+
+
+def fitter(threads: int = 1, seed: int = 0) -> SceneFitter:
+    return SceneFitter(CONFIG, OCCUPANCY, WORKSPACE, seed=seed, threads=threads)
+
+
+def run(target: SceneFitter, blocks: list[float], first: int = 0) -> None:
+    for k, block in enumerate(blocks):
+        stamp = (first + k) * 100_000_000
+        target.step([frame(stamp, block=block, x=0.1), frame(stamp, block=block, x=-0.1, camera="cam1")])
+
+
+def on_top(splats: SplatSet) -> int:
+    """Splats on the top of the block."""
+    return int(((splats.centers[:, 2] > 0.15) & (splats.opacities > 0.3)).sum())
+
+
+def posture(x: float) -> RobotPosture:
+    T = np.eye(4)
+    T[0, 3] = x
+    return RobotPosture(centers=np.array([[x, 0.0, 0.2]]), radii=np.array([0.12]), T_world_link=T[None])
+
+
+def test_a_floor_is_reconstructed_in_colour_and_depth() -> None:
+    target = fitter()
+    run(target, [0.0] * 3)
+    view = render(target.splats(), INTRINSICS, looking_down())
+    inside = (slice(8, 52), slice(10, 68))
+    assert np.median(np.abs(view.normalised_depth()[inside] - 1.0)) < 0.005
+    error = (view.color - frame().color / 255.0)[inside]
+    assert -10 * np.log10(np.mean(error**2)) > 26
+    assert view.opacity[inside].mean() > 0.95
+
+
+def test_a_block_is_in_the_map_while_it_is_there() -> None:
+    target = fitter()
+    run(target, [0.0] * 2)
+    assert on_top(target.splats()) == 0
+    run(target, [0.2] * 3, first=2)
+    assert on_top(target.splats()) > 30
+    run(target, [0.0] * 5, first=5)
+    assert on_top(target.splats()) == 0
+
+
+def test_same_seed_gives_the_same_bytes_at_any_thread_count() -> None:
+    results = []
+    for threads in (1, 2, 3):
+        target = fitter(threads)
+        run(target, [0.0, 0.2, 0.2])
+        results.append({name: array.tobytes() for name, array in target.state().items()})
+    assert results[0] == results[1] == results[2]
+    other = fitter(seed=1)
+    run(other, [0.0, 0.2, 0.2])
+    assert other.state()["parameters"].tobytes() != results[0]["parameters"]
+
+
+def test_a_restored_fitter_goes_on_to_the_same_bytes() -> None:
+    straight = fitter()
+    run(straight, [0.0, 0.2, 0.2, 0.0])
+    first = fitter()
+    run(first, [0.0, 0.2])
+    second = fitter()
+    second.restore({name: array.copy() for name, array in first.state().items()})
+    run(second, [0.2, 0.0], first=2)
+    a, b = straight.state(), second.state()
+    assert a.keys() == b.keys()
+    assert all(a[name].tobytes() == b[name].tobytes() for name in a)
+
+
+def test_the_budget_is_never_exceeded_and_the_audit_adds_up() -> None:
+    target = SceneFitter(replace(CONFIG, max_splats=300), OCCUPANCY, WORKSPACE)
+    alive = 0
+    for k, block in enumerate([0.0, 0.2, 0.2, 0.0]):
+        row = target.step([frame(k, block=block)])
+        alive += row.added + row.relocated - sum(row.removed.values())
+        assert row.alive == alive == len(target.splats()) <= 300
+        assert set(asdict(row)["removed"]) == {"broken", "workspace", "opacity", "free", "uncertain", "trail"}
+
+
+def test_splats_inside_the_robot_are_its_own_and_the_table_under_it_is_not() -> None:
+    target = fitter()
+    seen = [frame(k, block=0.2) for k in range(3)]
+    for one in seen:
+        target.step([one], posture(0.0))
+    splats = target.splats()
+    top = splats.centers[:, 2] > 0.15
+    floor = splats.centers[:, 2] < 0.03
+    assert (splats.labels[top] == Label.ROBOT).mean() > 0.5
+    assert (splats.labels[floor] == Label.OBJECT).all()
+
+
+def test_robot_splats_move_with_their_link() -> None:
+    before, after = posture(0.0), posture(0.05)
+    points = np.float32([[0.0, 0.0, 0.32], [0.12, 0.0, 0.2]])
+    assert np.allclose(carried(points, before, after), points + np.float32([0.05, 0.0, 0.0]), atol=1e-6)
+
+
+def test_no_splat_of_a_robot_that_left_stays_behind() -> None:
+    target = fitter()
+    target.step([frame(0, block=0.2)], posture(0.0))
+    assert (target.splats().labels == Label.ROBOT).any()
+    for k in range(1, 6):
+        target.step([frame(k)], posture(0.8))
+    assert on_top(target.splats()) == 0
+
+
+def test_voxels_smaller_than_the_largest_radius_are_refused() -> None:
+    with pytest.raises(UsageError, match="at least as large"):
+        SceneFitter(CONFIG, OccupancyConfig(voxel=0.01), WORKSPACE)
