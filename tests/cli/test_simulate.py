@@ -1,0 +1,140 @@
+"""``splatctrl simulate`` as a process: the files it writes, the same bytes twice, and how it fails."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.truth import load_truth
+
+TINY = ("--duration", "0.6", "--fps", "5", "--width", "64", "--height", "48")
+
+
+def splatctrl(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "splatctrl_cli", *(str(word) for word in arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("simulate") / "run"
+    result = splatctrl("simulate", "-o", out, *TINY, "--dtu", "--json")
+    assert (result.returncode, result.stderr) == (0, "")
+    printed = json.loads(result.stdout)
+    assert printed["frames"] == {"cam0": 3, "cam1": 3, "cam2": 3, "cam3": 3}
+    assert printed["bytes"]["log.mcap"] == (out / "log.mcap").stat().st_size
+    return out
+
+
+def test_it_writes_log_truth_robot_run_and_scan(recorded: Path) -> None:
+    names = sorted(path.name for path in recorded.iterdir())
+    assert names == ["dtu", "log.mcap", "robot.urdf", "robot_spheres.yaml", "run.json", "truth.json"]
+    assert sorted(path.name for path in (recorded / "dtu").iterdir()) == ["Cameras", "Depths_raw", "Rectified"]
+    run = json.loads((recorded / "run.json").read_text())
+    assert (run["command"], run["config"]["fps"], run["metrics"]["joint_states"]) == ("simulate", 5.0, 31)
+
+
+def test_the_same_command_writes_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
+    result = splatctrl("simulate", "-o", tmp_path / "again", *TINY, "--dtu", "-q")
+    assert result.returncode == 0
+    files = [path.relative_to(recorded) for path in recorded.rglob("*") if path.is_file() and path.name != "run.json"]
+    assert len(files) > 30
+    for name in files:
+        assert (tmp_path / "again" / name).read_bytes() == (recorded / name).read_bytes(), name
+
+
+def test_any_ros_2_reader_finds_standard_messages(recorded: Path) -> None:
+    with AnyReader([recorded / "log.mcap"]) as reader:
+        found = {connection.topic: (connection.msgtype, connection.msgcount) for connection in reader.connections}
+    assert found["/joint_states"] == ("sensor_msgs/msg/JointState", 31)
+    assert found["/tf"] == ("tf2_msgs/msg/TFMessage", 31)
+    assert found["/tf_static"] == ("tf2_msgs/msg/TFMessage", 1)
+    for camera in ("cam0", "cam1", "cam2", "cam3"):
+        assert found[f"/{camera}/color/image_raw/compressed"] == ("sensor_msgs/msg/CompressedImage", 3)
+        assert found[f"/{camera}/depth/image_raw"] == ("sensor_msgs/msg/Image", 3)
+        assert found[f"/{camera}/color/camera_info"] == ("sensor_msgs/msg/CameraInfo", 3)
+    assert len(found) == 15
+
+
+def test_the_container_is_a_ros_2_profile_with_checksums_and_full_schemas(recorded: Path) -> None:
+    with (recorded / "log.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert all(chunk.compression == "zstd" for chunk in summary.chunk_indexes)
+        assert all(schema.encoding == "ros2msg" for schema in summary.schemas.values())
+        schema = next(s for s in summary.schemas.values() if s.name == "sensor_msgs/msg/CameraInfo")
+        assert b"MSG: sensor_msgs/RegionOfInterest" in schema.data
+        times = [message.log_time for _, _, message in reader.iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+
+
+def test_a_changed_byte_is_found_by_the_checksums(recorded: Path, tmp_path: Path) -> None:
+    content = bytearray((recorded / "log.mcap").read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (tmp_path / "log.mcap").write_bytes(content)
+    with (tmp_path / "log.mcap").open("rb") as stream, pytest.raises(Exception, match=r"(?i)crc|zstd|decompress"):
+        list(make_reader(stream, validate_crcs=True).iter_messages())
+
+
+def test_tf_places_cameras_and_links_where_the_truth_has_them(recorded: Path) -> None:
+    truth = load_truth(recorded / "truth.json")
+    robot = RobotModel.from_urdf(recorded / "robot.urdf", recorded / "robot_spheres.yaml")
+    poses, q = {"world": np.eye(4)}, np.zeros(7)
+    with AnyReader([recorded / "log.mcap"]) as reader:
+        for connection, _, data in reader.messages():
+            if connection.topic == "/joint_states":
+                q = reader.deserialize(data, connection.msgtype).position
+            if connection.msgtype != "tf2_msgs/msg/TFMessage":
+                continue
+            for stamped in reader.deserialize(data, connection.msgtype).transforms:
+                t, r = stamped.transform.translation, stamped.transform.rotation
+                parent = poses[stamped.header.frame_id]
+                poses[stamped.child_frame_id] = parent @ transform_from([t.x, t.y, t.z], [r.x, r.y, r.z, r.w])
+    for camera in truth.cameras:
+        np.testing.assert_allclose(poses[f"{camera.name}_optical_frame"], camera.T_world_camera, atol=1e-9)
+    np.testing.assert_allclose(poses["hand"], robot.frame_pose(q, "hand"), atol=1e-9)
+
+
+def test_depth_is_in_millimetres_and_camera_info_is_that_of_the_truth(recorded: Path) -> None:
+    truth = load_truth(recorded / "truth.json")
+    with AnyReader([recorded / "log.mcap"]) as reader:
+        chosen = [c for c in reader.connections if c.topic in ("/cam1/depth/image_raw", "/cam1/color/camera_info")]
+        messages = {c.topic: reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen)}
+    depth = messages["/cam1/depth/image_raw"]
+    k = truth.cameras[1].intrinsics
+    assert (depth.encoding, depth.width, depth.height, depth.step) == ("16UC1", 64, 48, 128)
+    millimetres = depth.data.view("<u2")
+    assert 600 < np.median(millimetres[millimetres > 0]) < 2000
+    assert depth.header.frame_id == "cam1_optical_frame"
+    np.testing.assert_array_equal(messages["/cam1/color/camera_info"].k, [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1])
+
+
+def test_an_existing_output_is_kept_without_force(recorded: Path) -> None:
+    before = (recorded / "log.mcap").read_bytes()
+    result = splatctrl("simulate", "-o", recorded, *TINY)
+    assert result.returncode == 2
+    assert "already exists; give --force" in result.stderr
+    assert (recorded / "log.mcap").read_bytes() == before
+
+
+def test_a_bad_option_leaves_nothing_behind(tmp_path: Path) -> None:
+    result = splatctrl("simulate", "-o", tmp_path / "out", "--duration", "0.1")
+    assert result.returncode == 2
+    assert result.stderr == "splatctrl: --duration: expected 0.5 to 600 s, got 0.1\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_that_cannot_be_written_is_a_usage_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    result = splatctrl("simulate", "-o", tmp_path / "file" / "out", *TINY)
+    assert result.returncode == 2
+    assert "cannot be written" in result.stderr

@@ -1,0 +1,261 @@
+"""The recording: images that agree with the truth, noise as stated, motion within limits, truth that reads back."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
+from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate import tabletop
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.noise import DepthNoise
+from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.recording import Recording, RecordingOptions
+from splatctrl_cli.simulate.render import Renderer
+from splatctrl_cli.simulate.textures import Texture, luminance_std
+from splatctrl_cli.simulate.truth import Truth, closest_of, distance_to, load_truth, truth_document
+
+SMALL = {"duration_s": 3.0, "fps": 1.0, "width": 80, "height": 60}
+
+
+@pytest.fixture(scope="module")
+def robot(sample_data: Path) -> RobotModel:
+    return RobotModel.from_urdf(
+        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
+    )
+
+
+@pytest.fixture(scope="module")
+def exact(robot: RobotModel) -> Recording:
+    return Recording(RecordingOptions(noise="none", **SMALL), robot)
+
+
+@pytest.fixture(scope="module")
+def frames(exact: Recording) -> list[RgbdFrame]:
+    return list(exact.frames())
+
+
+def solids_at(recording: Recording, frame: RgbdFrame) -> list[Primitive]:
+    """Everything there, the arm's shapes too."""
+    states = {state.stamp_ns: state for state in recording.joint_states()}
+    links = recording.link_poses(states[frame.stamp_ns].position)
+    present = [p for p in recording.primitives if p.is_present(frame.stamp_ns)]
+    return present + tabletop.arm_solids(recording.robot.urdf.shapes, links)
+
+
+def test_every_exact_depth_lies_on_a_surface(exact: Recording, frames: list[RgbdFrame]) -> None:
+    for frame in frames:
+        points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth))
+        error = np.abs(distance_to(solids_at(exact, frame), points[frame.depth > 0], frame.stamp_ns))
+        assert (frame.depth > 0).mean() > 0.98
+        assert error.max() < 1e-5  # float32 depth at 3 m
+
+
+def test_nothing_stands_before_the_depth(exact: Recording, frames: list[RgbdFrame]) -> None:
+    frame = frames[4]
+    points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth * 0.98))
+    assert distance_to(solids_at(exact, frame), points.reshape(-1, 3), frame.stamp_ns).min() > 0
+
+
+def test_the_window_of_a_solid_loses_no_pixel(exact: Recording) -> None:
+    camera = exact.cameras[0]
+    scene = tabletop.things()
+    whole = Renderer(camera, [*scene]).image([])
+    apart = Renderer(camera, []).image(scene)
+    np.testing.assert_array_equal(whole[0], apart[0])
+    np.testing.assert_array_equal(whole[1], apart[1])
+    hidden = Primitive(
+        name="far", kind="sphere", size=(0.1,), T_world_shape=np.diag([1, 1, 1, 1.0]), texture=scene[0].texture
+    )
+    hidden.T_world_shape[:3, 3] = camera.T_world_camera[:3, 3] - camera.T_world_camera[:3, 2]
+    np.testing.assert_array_equal(Renderer(camera, scene).image([hidden])[1], whole[1])
+
+
+def test_the_visitor_comes_after_a_third_and_leaves_after_two(exact: Recording) -> None:
+    visitor = exact.primitives[-1]
+    middle = visitor.T_world_shape[None, :3, 3]
+    stamps = [exact.start_ns + int(second * 1e9) for second in (0.9, 1.1, 1.9, 2.1)]
+    inside = [bool(distance_to(exact.primitives, middle, stamp)[0] < 0) for stamp in stamps]
+    assert inside == [False, True, True, False]
+
+
+def test_training_images_have_contrast_and_the_arm_is_in_sight(exact: Recording, frames: list[RgbdFrame]) -> None:
+    still = {camera.name: Renderer(camera, exact.primitives[:-1]).image([])[1] for camera in exact.cameras}
+    for frame in frames:
+        assert luminance_std(frame.color) >= 0.15, frame.camera
+        assert (frame.depth < still[frame.camera] - 0.01).mean() > 0.02, frame.camera
+
+
+def test_records_come_in_time_order_with_joint_states_first(exact: Recording) -> None:
+    records = list(exact.records())
+    keys = [(record.stamp_ns, isinstance(record, RgbdFrame)) for record in records]
+    assert keys == sorted(keys)
+    assert sum(isinstance(record, JointState) for record in records) == 151
+    assert sum(isinstance(record, RgbdFrame) for record in records) == 12
+
+
+def test_the_arm_moves_within_its_limits_and_its_velocity_is_the_slope(robot: RobotModel) -> None:
+    motion = tabletop.arm_motion(7.0)
+    for time in np.linspace(0.0, 7.0, 141):
+        position, velocity = motion.at(time)
+        slope = (motion.at(time + 1e-6)[0] - motion.at(time - 1e-6)[0]) / 2e-6
+        np.testing.assert_allclose(velocity, slope, atol=1e-5)
+        assert np.all((position > robot.lower) & (position < robot.upper))
+        assert np.all(np.abs(velocity) < robot.velocity_limit)
+    start, end = (robot.frame_pose(motion.at(t)[0], "hand")[:3, 3] for t in (0.0, 7.0))
+    assert np.linalg.norm(end - start) > 0.5
+
+
+def test_motion_rests_at_its_waypoints() -> None:
+    motion = Motion(times=np.array([0.0, 1.0, 3.0]), waypoints=np.array([[0.0], [1.0], [-1.0]]))
+    for time, waypoint in ((-1.0, 0.0), (0.0, 0.0), (1.0, 1.0), (3.0, -1.0), (9.0, -1.0)):
+        position, velocity = motion.at(time)
+        assert (position[0], velocity[0]) == pytest.approx((waypoint, 0.0))
+    assert motion.at(2.0)[0][0] == pytest.approx(0.0)
+
+
+def test_noise_has_the_stated_spread_and_grows_with_depth_squared() -> None:
+    noise = DepthNoise(step=1e-5, dropout=0.0)
+    for depth in (1.0, 2.0):
+        exact_depth = np.full((240, 320), depth, np.float32)
+        noisy = noise.applied(exact_depth, np.random.default_rng(0))
+        assert np.std(noisy - depth) == pytest.approx(noise.spread * depth**2, rel=0.1)
+
+
+def test_noise_loses_edges_dropouts_and_what_is_too_far() -> None:
+    exact_depth = np.full((60, 80), 1.0, np.float32)
+    exact_depth[:, 40:] = 1.1
+    exact_depth[:20, 60:] = 3.5
+    noisy = DepthNoise(dropout=0.0).applied(exact_depth, np.random.default_rng(0))
+    assert (noisy[30:, 39:41] == 0).all()
+    assert (noisy[:20, 60:] == 0).all()
+    assert (noisy[30:, 42:] > 0).all()
+    share = (DepthNoise(dropout=0.02).applied(np.ones((240, 320), np.float32), np.random.default_rng(0)) == 0).mean()
+    assert share == pytest.approx(0.02, abs=0.002)
+
+
+def test_noise_comes_in_steps_of_disparity() -> None:
+    noisy = DepthNoise().applied(np.full((60, 80), 1.0, np.float32), np.random.default_rng(0))
+    steps = 1 / (noisy[noisy > 0].astype(np.float64) * DepthNoise().step)
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-3)
+
+
+def test_the_same_seed_gives_the_same_images_and_another_seed_others(robot: RobotModel) -> None:
+    depth = [next(iter(Recording(RecordingOptions(seed=seed, **SMALL), robot).frames())).depth for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(depth[0], depth[1])
+    assert (depth[0] != depth[2]).any()
+
+
+def test_clearance_is_that_of_the_nearest_moving_sphere(exact: Recording) -> None:
+    stamps, clearance = exact.clearances()
+    index = int(np.argmin(clearance))
+    q = list(exact.joint_states())[index].position
+    moving = exact.robot.moving_spheres
+    by_hand = distance_to(exact.primitives, exact.robot.sphere_centers(q)[moving], int(stamps[index]))
+    assert clearance[index] == np.min(by_hand - exact.robot.sphere_set.radii[moving])
+    assert 0.03 < clearance[index] < 0.10
+
+
+@pytest.mark.parametrize("pattern", ["noise", "stripes", "checks"])
+def test_textures_stay_between_their_colours_and_are_smooth(pattern: str) -> None:
+    texture = Texture(pattern=pattern, feature=0.1, dark=(0.1, 0.2, 0.3), bright=(0.9, 0.8, 0.7), seed=3)
+    points = np.random.default_rng(0).uniform(-2, 2, (20_000, 3))
+    color = texture.color(points)
+    assert (color >= np.array(texture.dark) - 1e-12).all()
+    assert (color <= np.array(texture.bright) + 1e-12).all()
+    assert color[:, 0].std() > 0.15
+    assert np.abs(texture.color(points + 1e-5) - color).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"duration_s": 0.1}, "--duration: expected 0.5 to 600 s, got 0.1"),
+        ({"fps": 0.0}, "--fps: expected up to 60"),
+        ({"duration_s": float("nan")}, "--duration"),
+        ({"width": 8}, "--width: expected 16 to 4096 px, got 8"),
+        ({"noise": "loud"}, "--noise: expected one of none, realsense, got loud"),
+        ({"seed": -1}, "--seed"),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        RecordingOptions(**options)  # type: ignore[arg-type]
+
+
+def truth_of(recording: Recording, path: Path) -> Truth:
+    stamps, clearance = recording.clearances()
+    return Truth(
+        path=path,
+        primitives=recording.primitives,
+        cameras=recording.cameras,
+        luminance_std={camera.name: 0.2 for camera in recording.cameras},
+        joint_names=recording.robot.joint_names,
+        robot_urdf=path.parent / "robot.urdf",
+        robot_spheres=path.parent / "robot_spheres.yaml",
+        T_world_base=np.eye(4),
+        stamps=stamps,
+        clearance=clearance,
+    )
+
+
+def test_truth_reads_back_and_measures_the_same(exact: Recording, tmp_path: Path) -> None:
+    truth = truth_of(exact, tmp_path / "truth.json")
+    truth.path.write_text(json.dumps(truth_document(truth)))
+    found = load_truth(truth.path)
+    points = np.random.default_rng(0).uniform(-0.5, 1.0, (200, 3))
+    for stamp in (exact.start_ns, exact.start_ns + 1_500_000_000):
+        np.testing.assert_array_equal(found.distance(points, stamp), truth.distance(points, stamp))
+    assert [p.name for p in found.primitives] == [p.name for p in truth.primitives]
+    assert [(c.name, c.is_training) for c in found.cameras] == [(f"cam{i}", i < 3) for i in range(4)]
+    assert found.robot_urdf == tmp_path / "robot.urdf"
+    np.testing.assert_array_equal(found.stamps, truth.stamps)
+    np.testing.assert_allclose(found.clearance, truth.clearance, atol=1e-6)
+
+
+def test_closest_surface_points_are_at_the_distance(exact: Recording) -> None:
+    points = np.random.default_rng(0).uniform([0, -0.5, 0.01], [1.0, 0.5, 0.6], (500, 3))
+    distance, surface = closest_of(exact.primitives, points, exact.start_ns)
+    np.testing.assert_allclose(np.linalg.norm(points - surface, axis=1), np.abs(distance), atol=1e-12)
+    each = np.array([closest_of([p], points, exact.start_ns)[0] for p in exact.primitives])
+    np.testing.assert_array_equal(distance, each.min(axis=0))
+
+
+def test_where_nothing_is_the_distance_is_infinite(exact: Recording) -> None:
+    distance, surface = closest_of([exact.primitives[-1]], np.zeros((2, 3)), exact.start_ns)
+    assert np.isinf(distance).all()
+    assert np.isnan(surface).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "expected splatctrl-truth version 1"),
+        ('{"format": "splatctrl-truth", "version": 2}', "expected splatctrl-truth version 1"),
+        ('{"format": "splatctrl-truth", "version": 1}', "damaged: KeyError"),
+    ],
+)
+def test_what_is_no_truth_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "truth.json").write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_truth(tmp_path / "truth.json")
+
+
+def test_a_missing_truth_file_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(SplatCtrlError, match="No such file") as caught:
+        load_truth(tmp_path / "none.json")
+    assert caught.value.exit_code == 4
+
+
+def test_the_sample_truth_keeps_its_promises(sample_data: Path) -> None:
+    truth = load_truth(sample_data / "tabletop" / "truth.json")
+    assert truth.robot_urdf.is_file()
+    assert truth.robot_spheres.is_file()
+    assert all(truth.luminance_std[camera.name] >= 0.15 for camera in truth.cameras if camera.is_training)
+    assert 0.03 < truth.clearance.min() < 0.10
+    assert sum(path.stat().st_size for path in sample_data.rglob("*") if path.is_file()) < 9e6
