@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from splatctrl_cli.records import Box, DistanceGrid, Label, OccupancyGrid, RgbdFrame, SplatSet
 
 FORMATS = ("npz", "vti")
-POINTS_PER_CHUNK = 100_000  # of the truth's (points x primitives) arrays
+MAX_TRUTH_CELLS = 200_000  # a larger grid is compared with the truth at this many cells, drawn with the seed
+POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
 def register(subparsers: Subparsers) -> None:
@@ -47,6 +48,7 @@ def register(subparsers: Subparsers) -> None:
         "--box", metavar="X0,Y0,Z0,X1,Y1,Z1", help="what the grid covers [m]; write --box=-1,... for a negative start"
     )
     parser.add_argument("--urdf", type=Path, help="cover the reach of this robot around its base, without --box")
+    parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its spheres (default: the URDF's own)")
     parser.add_argument("--voxel", type=float, metavar="M", help="cell size (field.voxel)")
     parser.add_argument("--length-scale", type=float, metavar="M", help="l of the kernel (field.length_scale)")
     parser.add_argument("--truth", type=Path, metavar="truth.json", help="measure the field against this truth")
@@ -93,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         lines = table(("field", ""), [(name.replace("_", " "), _shown(value)) for name, value in result.items()])
         if args.truth is not None:
             with stopwatch.stage("accuracy"):
-                accuracy = _accuracy(grid, source, args.truth, args.seen_by)
+                accuracy = _accuracy(grid, source, args.truth, args.seen_by, seed=args.seed)
             write_json(partial / "accuracy.json", accuracy.as_dict())
             result["accuracy"] = accuracy.as_dict()
             lines += ["", *_accuracy_lines(accuracy)]
@@ -202,7 +204,7 @@ def _box(args: argparse.Namespace, splats: "SplatSet", labels: "frozenset[Label]
     if args.urdf is not None:
         from splatctrl_cli.robot.model import RobotModel
 
-        robot = RobotModel.from_urdf(args.urdf)
+        robot = RobotModel.from_urdf(args.urdf, args.spheres)
         return Box(lower=robot.base_position - robot.reach(), upper=robot.base_position + robot.reach())
     return bounding_box(field_splats(splats, labels), padding)
 
@@ -251,7 +253,7 @@ def _shown(value: Any) -> str:
     return " x ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _accuracy(grid: "DistanceGrid", source: _Source, truth_path: Path, log: Path) -> "FieldAccuracy":
+def _accuracy(grid: "DistanceGrid", source: _Source, truth_path: Path, log: Path, *, seed: int) -> "FieldAccuracy":
     import numpy as np
 
     from splatctrl_cli.evaluate.field_accuracy import BANDS, field_accuracy
@@ -261,9 +263,10 @@ def _accuracy(grid: "DistanceGrid", source: _Source, truth_path: Path, log: Path
     truth = load_truth(truth_path)
     stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
     shape = grid.channels["sdf"].shape
+    num_cells = int(np.prod(shape))
+    drawn = np.random.default_rng(seed).choice(num_cells, min(num_cells, MAX_TRUTH_CELLS), replace=False)
     near_cells, distances, surface = [], [], []
-    for start in range(0, int(np.prod(shape)), POINTS_PER_CHUNK):
-        cells = np.arange(start, min(start + POINTS_PER_CHUNK, int(np.prod(shape))))
+    for cells in np.array_split(np.sort(drawn), -(-len(drawn) // POINTS_PER_CHUNK)):
         points = grid.origin + grid.voxel * np.stack(np.unravel_index(cells, shape), axis=1)
         distance, closest = truth.closest(points, stamp_ns)
         is_near = (distance >= BANDS[0][0]) & (distance < BANDS[-1][1])
