@@ -49,7 +49,7 @@ class BagLog:
                     connection, log_time_ns, data = next(messages)
                 except StopIteration:
                     return
-                except _UNREADABLE as error:
+                except Exception as error:  # the readers let errors of sqlite, bz2 and lz4 through as they are
                     damage.add(f"{self.path.name}: unreadable from here on: {error}")
                     return
                 yield RawMessage(topic=self._topics[connection.id], log_time_ns=log_time_ns, data=bytes(data))

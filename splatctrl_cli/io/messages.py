@@ -35,6 +35,8 @@ _LAYOUT = {  # channels and dtype by encoding
     **dict.fromkeys(["16UC1", "mono16"], (1, "u2")),
     "32FC1": (1, "f4"),
 }
+_CLOSING_MARKS = ((b"\xff\xd8\xff", b"\xff\xd9"), (b"\x89PNG", b"IEND"))
+_TAIL = 64  # bytes in which the closing mark of a file stands; some encoders pad
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +118,12 @@ def metres(counts: NDArray[Any], scale: float) -> Float32:
 
 
 def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
-    """Pixels of a JPEG, PNG, ... file as OpenCV reads it (BGR), its orientation tag ignored; None if it is none."""
+    """Pixels of a JPEG, PNG, ... file as OpenCV reads it (BGR), its orientation tag ignored.
+
+    None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
+    """
+    if any(data.startswith(start) and end not in data[-_TAIL:] for start, end in _CLOSING_MARKS):
+        return None
     flags = cv2.IMREAD_COLOR if color else cv2.IMREAD_UNCHANGED
     buffer = np.frombuffer(data, dtype=np.uint8)
     if buffer.size == 0:

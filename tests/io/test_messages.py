@@ -106,3 +106,11 @@ def test_bytes_that_are_no_image_are_refused() -> None:
     broken = SimpleNamespace(header=header(5, "o"), format="jpeg", data=np.zeros(40, np.uint8))
     with pytest.raises(UndecodableMessageError, match="no image file"):
         read_image(broken, COMPRESSED_IMAGE)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpeg"])
+def test_a_cut_image_is_refused_not_filled_with_grey(suffix: str) -> None:
+    data = cv2.imencode(f".{suffix}", np.zeros((64, 64, 3), np.uint8) + RGB[0, 0])[1].ravel()
+    cut = SimpleNamespace(header=header(5, "o"), format=suffix, data=data[: len(data) * 3 // 4])
+    with pytest.raises(UndecodableMessageError, match="no image file"):
+        read_image(cut, COMPRESSED_IMAGE)
