@@ -26,7 +26,7 @@ PALETTE = {
     "shell": ((0.20, 0.21, 0.24), (1.00, 1.00, 0.98)),
 }
 
-# Position [m] of the hand's start and end lies on either side of the things on the table.
+# Joint positions [rad]: the hand right of the things on the table, above them, and left of them.
 WAYPOINTS = (
     (-0.80, 0.30, 0.00, -2.00, 0.00, 2.30, 0.00),
     (-0.10, 0.10, 0.00, -2.00, 0.00, 2.10, 0.69),
@@ -37,19 +37,19 @@ WAYPOINTS = (
 def furniture() -> list[Primitive]:
     """Table, floor and three walls; they stand for the room and are obstacles like any other."""
     return [
-        _box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), texture=_texture("noise", 0.10, "wood", 1)),
-        _box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), texture=_texture("noise", 0.15, "slate", 2)),
-        _box("wall_back", (0.05, 4.0, 2.2), (-0.80, 0.0, 0.40), texture=_texture("noise", 0.13, "moss", 3)),
-        _box("wall_left", (4.0, 0.05, 2.2), (1.2, 1.30, 0.40), texture=_texture("noise", 0.13, "brick", 4)),
-        _box("wall_right", (4.0, 0.05, 2.2), (1.2, -1.30, 0.40), texture=_texture("noise", 0.13, "ocean", 7)),
+        _box("table", (1.70, 1.80, 0.05), (0.30, 0.0, -0.025), _texture("noise", 0.10, "wood", 1)),
+        _box("floor", (4.0, 4.0, 0.05), (0.4, 0.0, -0.725), _texture("noise", 0.15, "slate", 2)),
+        _box("wall_back", (0.05, 4.0, 2.2), (-0.80, 0.0, 0.40), _texture("noise", 0.13, "moss", 3)),
+        _box("wall_left", (4.0, 0.05, 2.2), (1.2, 1.30, 0.40), _texture("noise", 0.13, "brick", 4)),
+        _box("wall_right", (4.0, 0.05, 2.2), (1.2, -1.30, 0.40), _texture("noise", 0.13, "ocean", 7)),
     ]
 
 
 def things() -> list[Primitive]:
     """What stands on the table from beginning to end."""
     return [
-        _box("crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), 20.0, _texture("stripes", 0.06, "ocean", 0)),
-        _box("parcel", (0.22, 0.14, 0.10), (0.66, -0.02, 0.05), -15.0, _texture("noise", 0.055, "brick", 5)),
+        _box("crate", (0.14, 0.18, 0.20), (0.655, 0.315, 0.10), _texture("stripes", 0.06, "ocean", 0), 20.0),
+        _box("parcel", (0.22, 0.14, 0.10), (0.66, -0.02, 0.05), _texture("noise", 0.055, "brick", 5), -15.0),
         _cylinder("canister", 0.055, 0.19, (0.585, -0.285, 0.095), _texture("stripes", 0.055, "moss", 1)),
         _cylinder("tin", 0.050, 0.14, (0.78, -0.24, 0.07), _texture("checks", 0.06, "grape", 0)),
         _sphere("ball", 0.075, (0.36, 0.40, 0.075), _texture("noise", 0.05, "sand", 6)),
@@ -124,10 +124,9 @@ def _box(
     name: str,
     size: tuple[float, float, float],
     position: Sequence[float],
+    texture: Texture,
     yaw_deg: float = 0.0,
-    texture: Texture | None = None,
 ) -> Primitive:
-    assert texture is not None
     return Primitive(name=name, kind="box", size=size, T_world_shape=_placed(position, yaw_deg), texture=texture)
 
 
