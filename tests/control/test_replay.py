@@ -110,3 +110,15 @@ def test_a_start_outside_the_limits_names_the_joint() -> None:
 def test_a_period_of_zero_is_refused() -> None:
     with pytest.raises(UsageError, match=r"control\.period"):
         closed_loop(PlanarArm(), replace(CONFIG, period=0.0), task(), lambda _: NOTHING_NEAR)
+
+
+def test_a_panda_with_a_public_sphere_set_passes_a_sphere_too(real_data: Path) -> None:
+    arm = RobotModel.from_urdf(real_data / "vamp_panda" / "resources" / "panda" / "panda_spherized.urdf")
+    start = np.array([0.6, 0.3, 0, -1.8, 0, 2.1, 0.78])
+    goal = arm.frame_pose(start * [-1, 1, 1, 1, 1, 1, 1], "panda_hand")
+    ball = Balls([[0.5, 0.0, 0.35]], [0.08])
+    panda = ReplayTask(start=start, T_world_goal=goal, frame="panda_hand")
+    trace = closed_loop(arm, ControlConfig(), panda, lambda _: ball)
+    assert trace.outcome is Outcome.GOAL_REACHED
+    assert num_on_rung(trace, Rung.SOLVED) == len(trace.steps)
+    assert min(step.clearance for step in trace.steps) >= ControlConfig().margin - 1e-3
