@@ -255,8 +255,8 @@ def _write_joints(folder: Path, joints: list[JointState], num_joints: int, sums:
     np.savez(
         stream,
         stamp_ns=np.array([j.stamp_ns for j in joints], dtype=np.int64),
-        position=np.array([j.position for j in joints], dtype=np.float64).reshape(-1, num_joints),
-        velocity=np.array([j.velocity for j in joints], dtype=np.float64).reshape(-1, num_joints),
+        position=np.array([j.position for j in joints], dtype=np.float64).reshape(len(joints), num_joints),
+        velocity=np.array([j.velocity for j in joints], dtype=np.float64).reshape(len(joints), num_joints),
     )
     sums.write(folder, "joints.npz", stream.getvalue())
 

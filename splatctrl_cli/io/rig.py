@@ -1,7 +1,7 @@
 """The cameras of a log made ready: intrinsics, world frame, lens and depth registration, or why they cannot be."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -110,6 +110,17 @@ def intrinsics_of(calibration: Calibration) -> Intrinsics:
     )
 
 
+def _is_rectified(topic: str) -> bool:
+    """Whether a topic's name says that its images are rectified (image_rect, image_rect_color, image_rect_raw)."""
+    return any(part.startswith("image_rect") for part in topic.split("/"))
+
+
+def _rectified(calibration: Calibration) -> Calibration:
+    """The camera of the rectified image: P where it is set, and no distortion."""
+    K = calibration.projection if calibration.projection[0, 0] > 0 else calibration.K
+    return replace(calibration, K=K, distortion=np.zeros(0))
+
+
 class _Builder:
     """Makes one camera ready."""
 
@@ -186,14 +197,8 @@ class _Builder:
                 f" got {size[0]}x{size[1]}",
                 remedy="name the right CameraInfo with --camera",
             )
-        return Calibration(
-            width=size[0],
-            height=size[1],
-            K=calibration.K,
-            distortion_model=calibration.distortion_model,
-            distortion=calibration.distortion,
-            frame_id=calibration.frame_id,
-        )
+        sized = replace(calibration, width=size[0], height=size[1])
+        return _rectified(sized) if _is_rectified(image_topic) else sized
 
     def _check_world(self) -> str:
         """The world frame, after checking that tf joins the camera to it."""
@@ -215,7 +220,7 @@ class _Builder:
         return world
 
     def _undistortion(self, calibration: Calibration, intrinsics: Intrinsics) -> Undistortion | None:
-        if not np.any(np.abs(calibration.distortion) > 1e-9) or "rect" in self._topics.color.rsplit("/", 2)[-1]:
+        if not np.any(np.abs(calibration.distortion) > 1e-9):
             return None
         if calibration.distortion_model not in DISTORTION_MODELS:
             raise InputError(

@@ -25,11 +25,14 @@ from splatctrl_cli.records import Float64
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """What a CameraInfo says: size [px], K (3, 3), distortion model and coefficients, frame."""
+    """What a CameraInfo says: size [px], K (3, 3) of the raw image with its distortion, projection (3, 3) of the
+    rectified image (the left part of P; zero where unset), frame.
+    """
 
     width: int
     height: int
     K: Float64
+    projection: Float64
     distortion_model: str
     distortion: Float64
     frame_id: str
@@ -123,6 +126,7 @@ def _calibration(message: Any) -> Calibration | None:
         width=int(message.width),
         height=int(message.height),
         K=K,
+        projection=np.asarray(fields["p"], dtype=np.float64).reshape(3, 4)[:, :3],
         distortion_model=str(message.distortion_model),
         distortion=np.asarray(fields["d"], dtype=np.float64),
         frame_id=message.header.frame_id.strip("/"),

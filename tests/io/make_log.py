@@ -41,6 +41,8 @@ class LogRecipe:
     step_padding: int = 0
     distortion: tuple[float, ...] = (0.0,) * 5
     with_velocity: bool = True
+    color_name: str = "image_raw"
+    projection_focal: float = 0.0
     chunk_size: int = 4096
 
 
@@ -114,7 +116,7 @@ class _LogWriter:
         stamp = START_NS + index * FRAME_NS
         for camera in recipe.cameras:
             optical = f"{camera}_optical"
-            yield stamp, *self._color(f"/{camera}/color/image_raw", stamp, optical, index)
+            yield stamp, *self._color(f"/{camera}/color/{recipe.color_name}", stamp, optical, index)
             if recipe.has_info:
                 yield stamp, f"/{camera}/color/camera_info", *self._info(stamp, optical, (WIDTH, HEIGHT))
             if recipe.has_depth:
@@ -181,7 +183,7 @@ class _LogWriter:
             d=np.array(self.recipe.distortion),
             k=K,
             r=np.eye(3).ravel(),
-            p=np.zeros(12),
+            p=np.array([self.recipe.projection_focal, 0, 16, 0, 0, self.recipe.projection_focal, 12, 0, 0, 0, 1, 0]),
             binning_x=0,
             binning_y=0,
             roi=roi,

@@ -125,3 +125,36 @@ def test_options_that_a_capture_cannot_honour_are_refused(tmp_path: Path) -> Non
     for change in ({"depth_scale": 1e-4}, {"world_frame": "base"}, {"holdout": ("0",)}, {"root": tmp_path}):
         with pytest.raises(InputError, match="does not apply to a capture"):
             open_source(folder, replace(options, **change))
+
+
+def test_a_log_without_joints_is_captured_too(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, LogRecipe(has_joints=False))
+    source = open_source(folder)
+    assert source.joint_names == ()
+    assert_same(before, list(source.records()))
+
+
+def test_warped_depth_comes_back_as_the_same_floats(tmp_path: Path) -> None:
+    recipe = LogRecipe(depth_frame="cam0_depth", depth_size=(16, 12), depth_encoding="32FC1", depth_m=1.23457)
+    before, folder = captured(tmp_path, recipe)
+    assert_same(before, list(open_source(folder).records()))
+
+
+@pytest.mark.parametrize(
+    ("example", "folder"),
+    [
+        ("apc_shelf", "apc_shelf/scene-0000"),
+        ("open3d_rgbd", "open3d_rgbd/RGBD"),
+        ("tabletop_views", "tabletop_views"),
+    ],
+)
+def test_real_folders_are_captured_without_loss(real_data: Path, tmp_path: Path, example: str, folder: str) -> None:
+    description = Path(__file__).parents[2] / f"docs/examples/{example}.toml"
+    source = open_source(description, SourceOptions(root=real_data / folder))
+    out = tmp_path / "x.capture"
+    out.mkdir()
+    write_capture(out, source)
+    capture = open_source(out)
+    assert not capture.has_clock
+    assert set(capture.cameras) == set(source.cameras)
+    assert_same(list(source.records()), list(capture.records()))

@@ -122,6 +122,25 @@ def test_unregistered_depth_is_warped_through_tf_and_both_lenses(tmp_path: Path)
     assert covered == pytest.approx(1.25, abs=1e-6)
 
 
+def test_a_distorted_lens_is_undone_on_colour_and_depth(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(color_format="png", distortion=(0.4, 0.0, 0.0, 0.0, 0.0)))
+    frame = frames_of(log)[0]
+    assert not np.array_equal(frame.color, color_pixels(0))
+    assert np.array_equal(frame.color[11:13, 15:17], color_pixels(0)[11:13, 15:17])  # the centre stays
+    assert frame.depth[12, 16] == np.float32(1.25)
+    assert frame.depth[0, 0] == 0  # the corner was outside the image
+    assert next(s for s in open_source(log).shots() if not isinstance(s, JointState)).color_file is None
+
+
+def test_rectified_images_take_the_projection_and_keep_their_pixels(tmp_path: Path) -> None:
+    recipe = LogRecipe(
+        color_name="image_rect_color", color_format="rgb8", distortion=(0.4, 0, 0, 0, 0), projection_focal=28.0
+    )
+    frame = frames_of(make_log(tmp_path / "log.mcap", recipe))[0]
+    assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (28.0, 16.0, 12.0)
+    assert np.array_equal(frame.color, color_pixels(0))
+
+
 def test_a_fixed_pose_stands_in_for_tf(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False))
     frames = frames_of(log, SourceOptions(camera_poses={"cam0": (1, 2, 3, 0, 0, 0, 1)}))
