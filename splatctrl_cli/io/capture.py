@@ -23,6 +23,7 @@ from splatctrl_cli.io.shot import Shot, ShotSource, merged
 from splatctrl_cli.records import Float32, Intrinsics, JointState, LossReport, Record, RgbdFrame
 
 FORMAT, VERSION = "splatctrl-capture", 1
+INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
 FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
 FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
@@ -197,7 +198,20 @@ def read_capture_header(path: Path) -> dict[str, Any]:
     for key in ("world_frame", "has_clock", "joint_names", "cameras", "loss", "sources", "name"):
         if key not in header:
             raise InputError(f"{file}: {key} is missing", remedy="run `splatctrl ingest` again")
+    _check_index(path)
     return header
+
+
+def _check_index(path: Path) -> None:
+    """Raises InputError where an index file is not as it was written: nothing in it can be trusted then."""
+    sums = _read_sums(path)
+    for name in INDEX_FILES:
+        if not (path / name).is_file():
+            raise InputError(f"{path / name}: missing", remedy="run `splatctrl ingest` again")
+        if sums.get(name) != sha256(path / name):
+            raise InputError(
+                f"{path / name}: its checksum differs from SHA256SUMS", remedy="run `splatctrl ingest` again"
+            )
 
 
 def _write_shot(folder: Path, shot: Shot, cameras: dict[str, dict[str, Any]], sums: _Sums) -> dict[str, str]:
@@ -305,5 +319,5 @@ def _read_sums(path: Path) -> dict[str, str]:
     file = path / "SHA256SUMS"
     if not file.is_file():
         raise InputError(f"{file}: missing", remedy="the capture was not finished; run `splatctrl ingest` again")
-    lines = file.read_text(encoding="utf-8").splitlines()
+    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
     return {line[66:]: line[:64] for line in lines}

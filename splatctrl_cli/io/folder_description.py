@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.poses import AXES, CONVENTIONS, FORMATS
+from splatctrl_cli.io.poses import AXES, CONVENTIONS, FORMATS, rigid
+from splatctrl_cli.io.registration import DISTORTION_MODELS
 from splatctrl_cli.records import Float64, Intrinsics
 
 DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
@@ -103,11 +104,13 @@ class Description:
     @property
     def T_color_depth(self) -> Float64:
         """``depth_to_color`` (4, 4): maps depth-camera to colour-camera coordinates."""
+        where = f"{self.path}: depth_camera.depth_to_color"
         rows = self.depth_camera.depth_to_color if self.depth_camera is not None else []
-        matrix = np.array(rows, dtype=np.float64) if rows else np.eye(4)
-        if matrix.shape != (4, 4):
-            raise InputError(f"{self.path}: depth_camera.depth_to_color: expected a 4x4 matrix, got {matrix.shape}")
-        return matrix
+        try:
+            matrix = np.array(rows, dtype=np.float64) if rows else np.eye(4)
+        except ValueError:
+            raise InputError(f"{where}: expected a 4x4 matrix", remedy="see docs/input.md") from None
+        return rigid(matrix, where)
 
 
 T = TypeVar("T")
@@ -139,11 +142,42 @@ def read_description(path: Path, root: Path | None = None) -> Description:
     _check_choice(path, "poses.convention", description.poses.convention, CONVENTIONS)
     _check_choice(path, "poses.axes", description.poses.axes, AXES)
     _check_choice(path, "depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
+    for name, camera in (("camera", description.camera), ("depth_camera", description.depth_camera)):
+        if camera is not None:
+            check_camera(camera, f"{path}: {name}")
+    if not 0 < description.depth.scale < 1e3:
+        raise InputError(
+            f"{path}: depth.scale: expected metres per count, got {description.depth.scale}",
+            remedy="see docs/input.md",
+        )
     if description.poses.format != "nerfstudio":
         for name in ("camera", "frames"):
             if getattr(description, name) is None:
                 raise InputError(f"{path}: [{name}] is missing", remedy="see docs/input.md")
     return description
+
+
+def check_camera(camera: CameraTable, where: str) -> None:
+    """Raises InputError naming a size or focal length that no camera has."""
+    for name in ("width", "height", "fx", "fy"):
+        value = getattr(camera, name)
+        if not 0 < value < 1e5:
+            raise InputError(
+                f"{where}.{name}: expected a positive number of pixels, got {value}", remedy="see docs/input.md"
+            )
+    for name in ("cx", "cy"):
+        if not abs(getattr(camera, name)) < 1e5:
+            raise InputError(
+                f"{where}.{name}: expected pixels, got {getattr(camera, name)}", remedy="see docs/input.md"
+            )
+    if not all(isinstance(value, int | float) for value in camera.distortion):
+        raise InputError(f"{where}.distortion: expected numbers, got {camera.distortion}", remedy="see docs/input.md")
+    if camera.distortion_model not in DISTORTION_MODELS:
+        names = ", ".join(DISTORTION_MODELS)
+        raise InputError(
+            f"{where}.distortion_model: expected one of {names}, got {camera.distortion_model!r}",
+            remedy="see docs/input.md",
+        )
 
 
 def _required(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T:
@@ -158,7 +192,7 @@ def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> 
         return None
     table = content[name]
     if not isinstance(table, dict):
-        raise InputError(f"{path}: {name}: expected a table [{name}], got {table!r}")
+        raise InputError(f"{path}: {name}: expected a table [{name}], got {table!r}", remedy="see docs/input.md")
     declared = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
     _check_keys(table, set(declared), str(path), f"{name}.")
     for key, f in declared.items():
@@ -178,7 +212,9 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
         float | None: is_number,
     }.get(hint, isinstance(value, list))
     if not good:
-        raise InputError(f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
+        raise InputError(
+            f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}", remedy="see docs/input.md"
+        )
     return float(value) if hint in (float, float | None) else value
 
 
@@ -192,4 +228,6 @@ def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str)
 
 def _check_choice(path: Path, key: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise InputError(f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}")
+        raise InputError(
+            f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}", remedy="see docs/input.md"
+        )

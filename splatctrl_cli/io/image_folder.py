@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.folder_description import CameraTable, Description, FramesTable, read_description
+from splatctrl_cli.io.folder_description import (
+    CameraTable,
+    Description,
+    FramesTable,
+    check_camera,
+    read_description,
+)
 from splatctrl_cli.io.messages import decode_file, metres
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
@@ -177,7 +183,10 @@ class ImageFolderSource:
         if counts is None:
             return None
         if counts.dtype != np.uint16 or counts.ndim != 2:
-            raise InputError(f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes")
+            raise InputError(
+                f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
+                remedy="see docs/input.md",
+            )
         if encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
         return metres(counts, self._scale)
@@ -226,7 +235,8 @@ def _completed(description: Description) -> Description:
             frames = FramesTable(
                 color=str(color.parent / f"*{color.suffix}"), depth=str(depth.parent / f"*{depth.suffix}")
             )
-    except (KeyError, IndexError, TypeError) as error:
+        check_camera(camera, str(description.root / description.poses.file))
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(
             f"{description.root / description.poses.file}: {error} is missing",
             remedy="give [camera] and [frames] in the description",
@@ -349,7 +359,9 @@ def _stamp_ns(description: Description, name: str, position: int) -> int:
     if stamps.names:
         seconds = _seconds(name)
         if seconds is None:
-            raise InputError(f"{description.path}: stamps.names: expected seconds, got {name!r}")
+            raise InputError(
+                f"{description.path}: stamps.names: expected seconds, got {name!r}", remedy="see docs/input.md"
+            )
         return round(seconds * _SECOND)
     if stamps.rate is not None:
         return round(_number(name) * _SECOND / stamps.rate)

@@ -16,26 +16,39 @@ FORMATS = ("matrix-blocks", "trajectory-log", "tum", "nerfstudio", "matrix-files
 CONVENTIONS = ("camera_to_world", "world_to_camera")
 AXES = ("opencv", "opengl")
 OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+MAX_ENTRY = 1e6  # [m] of a pose
 MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
 
 
 def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
     """T_world_camera (4, 4), optical, of a matrix as written in a file.
 
-    The rotation is replaced by the nearest one, which undoes the rounding of text; raises InputError where it is
-    none (scale, shear, mirror, NaN).
+    Raises InputError where it is no rigid transform.
     """
-    if not np.isfinite(matrix).all() or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
-        raise InputError(f"{where}: expected a rigid transform, got one with scale, shear or NaN")
+    T = rigid(matrix, where)
+    if convention == "world_to_camera":
+        T = invert_transform(T)
+    return T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+
+
+def rigid(matrix: Float64, where: str) -> Float64:
+    """The matrix (4, 4) with its rotation replaced by the nearest one, which undoes the rounding of text.
+
+    Raises InputError where it is none: scale, shear, mirror, NaN.
+    """
+    is_finite = matrix.shape == (4, 4) and bool((np.abs(matrix) < MAX_ENTRY).all())
+    if not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
+        raise InputError(
+            f"{where}: expected a rigid transform (4x4), got one with scale, shear or NaN",
+            remedy="correct the matrix",
+        )
     U, _, Vt = np.linalg.svd(matrix[:3, :3])
     if np.linalg.det(U @ Vt) < 0:
         raise InputError(f"{where}: expected a rotation, got a mirror image", remedy="check [poses] axes")
     T = np.eye(4)
     T[:3, :3] = U @ Vt
     T[:3, 3] = matrix[:3, 3]
-    if convention == "world_to_camera":
-        T = invert_transform(T)
-    return T @ OPENGL_FROM_OPTICAL if axes == "opengl" else T
+    return T
 
 
 def read_matrix_blocks(path: Path, heading: str) -> dict[str, Float64]:
@@ -57,7 +70,9 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
         where = f"{path}: pose {index // 5}"
         head = lines[index].split()
         if len(head) != 3 or not head[0].isdigit():
-            raise InputError(f"{where}: expected three integers, got {lines[index]!r}")
+            raise InputError(
+                f"{where}: expected three integers, got {lines[index]!r}", remedy="check [poses] format and file"
+            )
         poses[str(int(head[0]))] = _matrix(lines[index + 1 : index + 5], where)
     return poses
 
@@ -70,7 +85,10 @@ def read_tum(path: Path) -> dict[str, Float64]:
             words = line.split()
             values = _numbers(words, f"{path}:{index + 1}")
             if len(values) != 8 or np.linalg.norm(values[4:]) == 0:
-                raise InputError(f"{path}:{index + 1}: expected 'stamp tx ty tz qx qy qz qw', got {line!r}")
+                raise InputError(
+                    f"{path}:{index + 1}: expected 'stamp tx ty tz qx qy qz qw', got {line!r}",
+                    remedy="check [poses] format and file",
+                )
             poses[words[0]] = transform_from(values[1:4], values[4:8])
     return poses
 
@@ -81,10 +99,12 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
         content = json.loads(path.read_text(encoding="utf-8"))
         matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a transforms.json: {error}") from None
+        raise InputError(f"{path}: not a transforms.json: {error}", remedy="check [poses] format and file") from None
     for name, matrix in matrices.items():
         if matrix.shape != (4, 4):
-            raise InputError(f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}")
+            raise InputError(
+                f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy="check [poses] format and file"
+            )
     return content, matrices
 
 
@@ -112,7 +132,7 @@ def _lines(path: Path) -> list[str]:
 def _matrix(lines: list[str], where: str) -> Float64:
     rows = [_numbers(line.split(), where) for line in lines]
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
-        raise InputError(f"{where}: expected a 4x4 matrix")
+        raise InputError(f"{where}: expected a 4x4 matrix", remedy="check [poses] format and file")
     return np.array(rows)
 
 
@@ -120,4 +140,6 @@ def _numbers(words: list[str], where: str) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError:
-        raise InputError(f"{where}: expected numbers, got {' '.join(words)!r}") from None
+        raise InputError(
+            f"{where}: expected numbers, got {' '.join(words)!r}", remedy="check [poses] format and file"
+        ) from None

@@ -271,7 +271,10 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
                     remedy=f"image topics there: {_listed(images)}",
                 )
         if given.info and given.info not in [t.topic.name for t in survey.of_type(CAMERA_INFO)]:
-            raise InputError(f"{log.path}: --camera {given.name}: no CameraInfo on topic {given.info}")
+            raise InputError(
+                f"{log.path}: --camera {given.name}: no CameraInfo on topic {given.info}",
+                remedy="leave INFO out to have it found",
+            )
         color, depth = survey.topics[given.color], survey.topics[given.depth]
         cameras.append(
             CameraTopics(

@@ -25,6 +25,8 @@ def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
         return ImageFolderSource(path, options)
     if is_capture(path):
         return CaptureSource(path, options)
+    if path.suffix == ".toml":
+        return ImageFolderSource(path, options)
     if path.is_dir() and not is_bag_folder(path):
         raise InputError(
             f"{path}: a folder that is neither a capture nor a ROS 2 bag",

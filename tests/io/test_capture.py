@@ -158,3 +158,11 @@ def test_real_folders_are_captured_without_loss(real_data: Path, tmp_path: Path,
     assert not capture.has_clock
     assert set(capture.cameras) == set(source.cameras)
     assert_same(list(source.records()), list(capture.records()))
+
+
+@pytest.mark.parametrize("name", ["capture.json", "frames.csv", "joints.npz"])
+def test_an_index_that_was_changed_is_refused(tmp_path: Path, name: str) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    (folder / name).write_bytes((folder / name).read_bytes() + b"\n")
+    with pytest.raises(InputError, match=f"{name}: its checksum differs"):
+        open_source(folder)

@@ -185,6 +185,28 @@ def test_a_pose_that_is_no_rotation_is_refused(tmp_path: Path) -> None:
     assert "expected a rigid transform" in refusal(path)
 
 
+@pytest.mark.parametrize(
+    ("good", "bad", "said"),
+    [
+        ("fx = 10", "fx = -10", "camera.fx: expected a positive number of pixels"),
+        ("width = 8", "width = 0", "camera.width: expected a positive number of pixels"),
+        ("cy = 3.0", 'cy = 3.0\ndistortion_model = "fish"', "camera.distortion_model: expected one of plumb_bob"),
+        ("scale = 1e-4", "scale = -1.0", "depth.scale: expected metres per count"),
+    ],
+)
+def test_numbers_that_no_camera_has_are_refused(tmp_path: Path, good: str, bad: str, said: str) -> None:
+    path = described(tmp_path)
+    path.write_text(path.read_text().replace(good, bad))
+    assert said in refusal(path)
+
+
+@pytest.mark.parametrize("matrix", ["[[1, 0], [0, 1]]", "[[1, 0, 0], [0]]", str((2 * np.eye(4)).tolist())])
+def test_a_depth_to_color_that_is_no_transform_is_refused(tmp_path: Path, matrix: str) -> None:
+    lens = CAMERA.replace("[camera]", "[depth_camera]")
+    path = described(tmp_path, f"{lens}depth_to_color = {matrix}\n")
+    assert "depth_camera.depth_to_color: expected a" in refusal(path)
+
+
 def test_implausible_depth_suggests_the_scale(tmp_path: Path) -> None:
     path = described(tmp_path)
     path.write_text(path.read_text().replace("scale = 1e-4", "scale = 1.0"))
