@@ -1,8 +1,8 @@
 """``splatctrl sdf-bake``: a scene's splats as a distance grid, and its accuracy where the truth is known."""
 
 import argparse
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +17,13 @@ from splatctrl_cli.cli.common import (
     configured,
     table,
 )
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import FieldConfig
-    from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy
-    from splatctrl_cli.records import Box, DistanceGrid, Label, OccupancyGrid, RgbdFrame, SplatSet
+    from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 
 FORMATS = ("npz", "vti")
-MAX_TRUTH_CELLS = 200_000  # a larger grid is compared with the truth at this many cells, drawn with the seed
-POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
 def register(subparsers: Subparsers) -> None:
@@ -61,6 +58,8 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
+    from splatctrl_cli.cli.bake_source import read_bake_source
+    from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
     from splatctrl_cli.field.bake import bake
     from splatctrl_cli.io.output import Stopwatch, output_path, write_json, write_run
 
@@ -73,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path("field")
     with output_path(out, force=args.force, is_folder=True) as partial:
         with stopwatch.stage("read"):
-            source = _read_scene(args.scene, args.at)
+            source = read_bake_source(args.scene, args.at)
         box = _box(args, source.splats, labels, config.field.padding)
         with stopwatch.stage("bake"):
             grid = bake(
@@ -95,10 +94,10 @@ def run(args: argparse.Namespace) -> int:
         lines = table(("field", ""), [(name.replace("_", " "), _shown(value)) for name, value in result.items()])
         if args.truth is not None:
             with stopwatch.stage("accuracy"):
-                accuracy = _accuracy(grid, source, args.truth, args.seen_by, seed=args.seed)
-            write_json(partial / "accuracy.json", accuracy.as_dict())
-            result["accuracy"] = accuracy.as_dict()
-            lines += ["", *_accuracy_lines(accuracy)]
+                compared = compare_with_truth(grid, source, args.truth, args.seen_by, seed=args.seed)
+            write_json(partial / "accuracy.json", compared.as_dict())
+            result["accuracy"] = compared.as_dict()
+            lines += ["", *accuracy_lines(compared)]
         metrics = _metrics(result)
         write_run(
             partial,
@@ -113,55 +112,6 @@ def run(args: argparse.Namespace) -> int:
     console.result(result, lines)
     check_gates(args.require, metrics)
     return 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Source:
-    """What is baked: splats, the occupancy of the same moment where there is one, and where they come from."""
-
-    splats: "SplatSet"
-    occupancy: "OccupancyGrid | None"
-    stamp_ns: int | None
-    cameras: tuple[str, ...] | None
-    digests: dict[str, str]
-
-
-def _read_scene(path: Path, at_seconds: float | None) -> _Source:
-    from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.splats import read_ply
-
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
-    if path.is_dir():
-        return _read_folder(path, at_seconds)
-    if at_seconds is not None:
-        raise UsageError(f"--at {at_seconds:g}: {path} is one splat set", remedy="give the scene's folder")
-    splats, _ = read_ply(path)
-    return _Source(splats=splats, occupancy=None, stamp_ns=None, cameras=None, digests={path.name: sha256(path)})
-
-
-def _read_folder(path: Path, at_seconds: float | None) -> _Source:
-    from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.scene_folder import open_scene
-
-    scene = open_scene(path)
-    if at_seconds is None:
-        splats, occupancy, stamp_ns = scene.splats(), scene.occupancy(), scene.stamp_ns
-        files = [path / "splats.ply", path / "occupancy.npz"]
-    else:
-        if not scene.snapshots:
-            raise NotEvaluableError(f"{path}: has no snapshots", remedy="bake without --at")
-        wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
-        splats, occupancy = scene.splats_at(wanted_ns), None  # the occupancy on disk is that of the end
-        snapshot = max((s for s in scene.snapshots if s.stamp_ns <= wanted_ns), key=lambda s: s.stamp_ns)
-        stamp_ns, files = snapshot.stamp_ns, [snapshot.path]
-    return _Source(
-        splats=splats,
-        occupancy=occupancy,
-        stamp_ns=stamp_ns,
-        cameras=scene.cameras,
-        digests={file.name: sha256(file) for file in files},
-    )
 
 
 def _names(text: str, choices: tuple[str, ...], option: str) -> tuple[str, ...]:
@@ -251,71 +201,6 @@ def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return " x ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def _accuracy(grid: "DistanceGrid", source: _Source, truth_path: Path, log: Path, *, seed: int) -> "FieldAccuracy":
-    import numpy as np
-
-    from splatctrl_cli.evaluate.field_accuracy import BANDS, field_accuracy
-    from splatctrl_cli.evaluate.visibility import seen_by
-    from splatctrl_cli.simulate.truth import load_truth
-
-    truth = load_truth(truth_path)
-    stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
-    shape = grid.channels["sdf"].shape
-    num_cells = int(np.prod(shape))
-    drawn = np.random.default_rng(seed).choice(num_cells, min(num_cells, MAX_TRUTH_CELLS), replace=False)
-    near_cells, distances, surface = [], [], []
-    for cells in np.array_split(np.sort(drawn), -(-len(drawn) // POINTS_PER_CHUNK)):
-        points = grid.origin + grid.voxel * np.stack(np.unravel_index(cells, shape), axis=1)
-        distance, closest = truth.closest(points, stamp_ns)
-        is_near = (distance >= BANDS[0][0]) & (distance < BANDS[-1][1])
-        near_cells.append(cells[is_near])
-        distances.append(distance[is_near])
-        surface.append(closest[is_near])
-    cells, surface_points = np.concatenate(near_cells), np.concatenate(surface)
-    if not len(cells):
-        raise NotEvaluableError(f"{truth_path}: no cell of the grid lies within {BANDS[-1][1]} m of an object")
-    seen = np.zeros(len(cells), dtype=np.bool_)
-    for frame in _frames(log, source.cameras, stamp_ns):
-        unseen = np.flatnonzero(~seen)
-        seen[unseen] = seen_by(surface_points[unseen], [frame])
-    fields = {name: grid.channels[name].reshape(-1)[cells].astype(np.float64) for name in ("hard", "gpdf")}
-    health: Any = grid.header["health"]
-    return field_accuracy(fields, np.concatenate(distances), seen, median_radius=health["radius"])
-
-
-def _frames(log: Path, cameras: tuple[str, ...] | None, until_ns: int) -> "Iterator[RgbdFrame]":
-    """Frames of the scene's training cameras (of every camera for a bare splat set), up to its stamp."""
-    from splatctrl_cli.io.source import open_source
-    from splatctrl_cli.records import RgbdFrame
-
-    for record in open_source(log).records():
-        if record.stamp_ns > until_ns:
-            return
-        if isinstance(record, RgbdFrame) and (cameras is None or record.camera in cameras):
-            yield record
-
-
-def _accuracy_lines(accuracy: "FieldAccuracy") -> list[str]:
-    header = ("points", "field", "true cm", "cells", "mean", "rmse", "median", "95 %", "max over [mm]")
-    rows: list[tuple[object, ...]] = []
-    for where, fields in (("all", accuracy.everywhere), ("seen", accuracy.seen)):
-        for name, bands in fields.items():
-            for band in bands:
-                values = (band.mean, band.rmse, band.median, band.over_95, band.over_max)
-                shown = ["-" if value is None else f"{value * 1e3:.1f}" for value in values]
-                rows.append((where, name, f"{band.lower * 100:g}-{band.upper * 100:g}", band.count, *shown))
-    over = accuracy.over_estimate
-    verdict = (
-        f"hard exceeds the truth by more than {over.allowance * 1e3:.1f} mm at {over.count_beyond} of {over.count} "
-        f"seen cells"
-    )
-    if over.median_beyond is not None and over.max_error is not None:
-        verdict += (
-            f", there by {over.median_beyond * 1e3:.1f} mm more in the median, {over.max_error * 1e3:.1f} mm at most"
-        )
-    return [*table(header, rows), verdict]
 
 
 def _metrics(result: Mapping[str, Any]) -> dict[str, float | None]:

@@ -3,10 +3,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatctrl_cli.io.grid import read_npz
+from splatctrl_cli.io.scene_folder import SceneWriter
 from splatctrl_cli.io.splats import write_ply
+from splatctrl_cli.records import OccupancyGrid
+from splatctrl_cli.simulate.truth import load_truth
 from tests.field.scenes import cloud, splat_set
 
 
@@ -86,3 +90,68 @@ def test_a_missing_scene_is_named(tmp_path: Path) -> None:
     result = sdf_bake(tmp_path / "none", "-o", tmp_path / "field")
     assert result.returncode == 4
     assert "none: no such file or folder; give what reconstruct wrote" in result.stderr
+
+
+def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path: Path, sample_data: Path) -> None:
+    folder = sample_data / "tabletop"
+    truth = load_truth(folder / "truth.json")
+    box = np.array([[0.3, -0.4, -0.05], [0.8, 0.4, 0.3]])
+    near = np.random.default_rng(0).uniform(box[0] - 0.25, box[1] + 0.25, (100_000, 3))
+    distance, surface = truth.closest(near, int(truth.stamps[-1]))
+    surface = surface[np.abs(distance) < 0.05]
+    write_ply(tmp_path / "true.ply", splat_set(surface, np.full(len(surface), 0.002)), {})
+    corners = ",".join(f"{value}" for value in box.ravel())
+    result = sdf_bake(
+        tmp_path / "true.ply",
+        *("-o", tmp_path / "field", f"--box={corners}", "--voxel", 0.03, "--formats", "npz"),
+        *("--truth", folder / "truth.json", "--seen-by", folder / "log.mcap"),
+        *("--require", "over_estimate.count_beyond<=0", "--require", "seen.hard.0_2cm.rmse<0.006"),
+    )
+    assert result.returncode == 0, result.stderr
+    accuracy = json.loads((tmp_path / "field" / "accuracy.json").read_text())
+    assert accuracy["num_seen"] > 100
+    assert accuracy["holds"] is True
+    assert f"of {accuracy['num_seen']} seen cells" in result.stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene folder whose splats move up 10 cm a second, and whose grid saw everything free at the end."""
+    folder = tmp_path_factory.mktemp("scene")
+    writer = SceneWriter(folder, {})
+    start_ns, shape = 7_000_000_000, (4, 4, 4)
+    at = [splat_set(np.array([[0.0, 0.0, 0.1 * second]]), np.array([0.01])) for second in range(3)]
+    for second, splats in enumerate(at):
+        writer.snapshot(start_ns + second * 10**9, splats)
+    free = OccupancyGrid(
+        origin=np.full(3, -1.5),
+        voxel=1.0,
+        log_odds=np.full(shape, -2.0, np.float32),
+        num_updates=np.ones(shape, np.uint16),
+        entity=np.zeros(shape, np.uint8),
+    )
+    writer.finish(start_ns + 2 * 10**9, at[-1], free, {})
+    metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": start_ns + 2 * 10**9}
+    (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
+    return folder
+
+
+@pytest.mark.parametrize(("at", "height", "observed"), [(None, 0.2, 1), (0.0, 0.0, 0), (1.9, 0.1, 0)])
+def test_a_scene_is_baked_as_it_was_known_then(
+    tmp_path: Path, scene: Path, at: float | None, height: float, observed: int
+) -> None:
+    times = [] if at is None else ["--at", at]
+    result = sdf_bake(scene, "-o", tmp_path / "field", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, *times)
+    assert result.returncode == 0, result.stderr
+    grid = read_npz(tmp_path / "field" / "field.npz")
+    assert grid.channels["hard"][1, 1, 4] == pytest.approx(0.3 - height - 0.01, abs=1e-6)
+    assert (grid.channels["observed"] == observed).all()  # the occupancy grid on disk is that of the end
+    digests = grid.header["digests"]
+    assert isinstance(digests, dict)
+    assert ("occupancy.npz" in digests) == (at is None)
+
+
+def test_a_time_before_the_scene_was_known_is_refused(tmp_path: Path, scene: Path) -> None:
+    result = sdf_bake(scene, "-o", tmp_path / "field", "--at", -1)
+    assert result.returncode == 5
+    assert "no snapshot at or before" in result.stderr

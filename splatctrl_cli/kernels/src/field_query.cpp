@@ -8,7 +8,7 @@
 namespace splatctrl {
 namespace {
 
-constexpr int kPointsPerChunk = 128;
+constexpr int kPointsPerChunk = 16;
 constexpr float kNearLengths = 4.0f;  // the first pass: it sees most of the sum, and tells how far the second must go
 
 template <typename Fn>
