@@ -95,10 +95,10 @@ def test_a_missing_scene_is_named(tmp_path: Path) -> None:
 def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path: Path, sample_data: Path) -> None:
     folder = sample_data / "tabletop"
     truth = load_truth(folder / "truth.json")
-    box = np.array([[0.3, -0.4, -0.05], [0.8, 0.4, 0.3]])
-    near = np.random.default_rng(0).uniform(box[0] - 0.25, box[1] + 0.25, (100_000, 3))
+    box = np.array([[0.4, -0.15, -0.05], [0.7, 0.15, 0.2]])
+    near = np.random.default_rng(0).uniform(box[0] - 0.25, box[1] + 0.25, (80_000, 3))
     distance, surface = truth.closest(near, int(truth.stamps[-1]))
-    surface = surface[np.abs(distance) < 0.05]
+    surface = surface[np.abs(distance) < 0.1]
     write_ply(tmp_path / "true.ply", splat_set(surface, np.full(len(surface), 0.002)), {})
     corners = ",".join(f"{value}" for value in box.ravel())
     result = sdf_bake(
@@ -109,7 +109,7 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     )
     assert result.returncode == 0, result.stderr
     accuracy = json.loads((tmp_path / "field" / "accuracy.json").read_text())
-    assert accuracy["num_seen"] > 100
+    assert accuracy["num_seen"] > 50
     assert accuracy["holds"] is True
     assert f"of {accuracy['num_seen']} seen cells" in result.stdout
 
