@@ -16,6 +16,7 @@ from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, OccupancyGr
 
 FORMAT_VERSION = 1
 BYTES_PER_CELL = 25  # three distances and three gradient components of 4 bytes, one of observed
+PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
 NEVER_SEEN, FREE, OCCUPIED, UNCERTAIN = 0, 1, 2, 3
 
 Shape = tuple[int, int, int]
@@ -112,11 +113,21 @@ def check_memory(shape: Shape) -> None:
 
 
 def available_memory() -> int:
-    """Bytes that can be had without swapping, by the kernel's own estimate."""
-    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+    """Bytes that can be had without swapping, by the kernel's own estimate and the limit on this process's group."""
+    for line in (PROC / "meminfo").read_text(encoding="ascii").splitlines():
         if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
+            return min([int(line.split()[1]) * 1024, *_group_room()])
     raise UsageError("/proc/meminfo: no MemAvailable line", remedy="run on Linux 3.14 or newer")
+
+
+def _group_room() -> list[int]:
+    """What a container may still take, where its control group says so."""
+    try:
+        limit = (CGROUP / "memory.max").read_text(encoding="ascii").strip()
+        used = int((CGROUP / "memory.current").read_text(encoding="ascii"))
+    except OSError:
+        return []
+    return [] if limit == "max" else [max(int(limit) - used, 0)]
 
 
 def observed_channel(

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def test_baked_gradient_is_that_of_the_smaller_distance() -> None:
     np.testing.assert_allclose(gradient[is_exact], exact.query(points[is_exact])[1], atol=1e-4)
 
 
-def test_threads_and_repeats_do_not_change_a_bit(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_threads_and_repeats_do_not_change_a_bit(tmp_path: Path) -> None:
     splats = splat_set(*cloud())
     for threads in (1, 2, 3):
         write_npz(tmp_path / f"{threads}.npz", bake(splats, BOX, CONFIG, threads=threads))
@@ -119,8 +120,21 @@ def test_a_grid_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     assert bake_module.grid_shape(BOX, CONFIG.voxel) == (27, 27, 19)
 
 
-def test_free_memory_is_some_bytes() -> None:
-    assert bake_module.available_memory() > 2**20
+def test_free_memory_is_what_the_machine_and_the_container_leave(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bake_module, "PROC", tmp_path)
+    monkeypatch.setattr(bake_module, "CGROUP", tmp_path)
+    (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:    5000 kB\n")
+    assert bake_module.available_memory() == 5000 * 1024
+    (tmp_path / "memory.max").write_text("3000\n")
+    (tmp_path / "memory.current").write_text("1000\n")
+    assert bake_module.available_memory() == 2000
+    (tmp_path / "memory.max").write_text("max\n")
+    assert bake_module.available_memory() == 5000 * 1024
+    (tmp_path / "meminfo").write_text("MemTotal: 9 kB\n")
+    with pytest.raises(UsageError, match="no MemAvailable line"):
+        bake_module.available_memory()
 
 
 def test_bad_boxes_voxels_and_splats_are_named() -> None:
