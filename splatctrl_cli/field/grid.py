@@ -7,6 +7,8 @@ from splatctrl_cli.field.distance import checked_points
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64
 
+ROUNDING = 1e-6  # [m] float32 values a metre or two from their origin
+
 
 class GridField:
     """Trilinear interpolation between cell centres, and the gradient of that very interpolant.
@@ -48,6 +50,3 @@ class GridField:
     def contains(self, points: Float64) -> Bool:
         """(Q,) True where a point lies in the box of the cell centres."""
         return self.box.contains(points)
-
-
-ROUNDING = 1e-6  # [m] float32 values a metre or two from their origin
