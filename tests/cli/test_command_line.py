@@ -1,0 +1,248 @@
+"""The command line as a person meets it, one process per test: help, exit codes, one line per error, nothing left."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.cli.main import COMMANDS
+from tests.io.make_log import LogRecipe, make_log
+
+HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "mcap", "rosbags", "clarabel")
+QUICK = (
+    *("--max-splats", "60", "--threads", "1", "--set", "scene.first_iterations=2"),
+    *("--set", "scene.iterations_per_step=1", "--box=-3,-3,-1,3,3,3", "--set", "occupancy.voxel=0.1"),
+)
+ARM = """<robot name="r"><link name="base"/><link name="a"/><link name="b">
+<collision><geometry><sphere radius="0.02"/></geometry></collision></link>
+<joint name="{0}" type="revolute"><parent link="base"/><child link="a"/><origin xyz="0 0 0.2"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" velocity="2" effort="9"/></joint>
+<joint name="{1}" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.2"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" velocity="2" effort="9"/></joint></robot>"""
+
+
+def splatctrl(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    command = [sys.executable, "-m", "splatctrl_cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+
+
+@dataclass(frozen=True)
+class Work:
+    """A folder in which a small log went through the main job once."""
+
+    folder: Path
+
+    @property
+    def log(self) -> Path:
+        return self.folder / "log.mcap"
+
+    def arguments(self, command: str, out: Path) -> list[object]:
+        """Arguments with which `command` succeeds and writes `out`."""
+        scene, urdf = self.folder / "scene", self.folder / "robot.urdf"
+        given: dict[str, list[object]] = {
+            "simulate": ["--duration", "1", "--width", "64", "--height", "48"],
+            "ingest": [self.log],
+            "reconstruct": [self.log, "--cameras", "cam0", *QUICK],
+            "export": [scene],
+            "sdf-bake": [scene, "--voxel", "0.5"],
+            "score": [scene, "--reference", self.log, "--cameras", "cam1", "--threads", "1"],
+            "replay": [self.log, "--scene", scene, "--urdf", urdf, "--max-unknown", "1"],
+            "demo": [],
+        }
+        return [command, *given[command], "-o", out]
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Work:
+    """A log of two cameras, its scene, and a two-joint arm whose joints are in the log."""
+    work = Work(tmp_path_factory.mktemp("work"))
+    make_log(work.log, LogRecipe(cameras=("cam0", "cam1")))
+    (work.folder / "robot.urdf").write_text(ARM.format("joint_a", "joint_b"))
+    done = splatctrl(*work.arguments("reconstruct", work.folder / "scene"), "-q")
+    assert done.returncode == 0, done.stderr
+    return work
+
+
+def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+    """It ended with `code` after one line on stderr that holds `words`, and nothing on stdout."""
+    assert (done.returncode, done.stdout) == (code, ""), done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("splatctrl: ")
+    for word in words:
+        assert word in done.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_subcommand_has_help(command: str) -> None:
+    done = splatctrl(command, "--help")
+    assert done.returncode == 0
+    assert done.stdout.startswith(f"usage: splatctrl {command}")
+    assert "show this help" in done.stdout
+    assert done.stderr == ""
+
+
+def test_the_list_of_commands_names_each_and_the_exit_codes() -> None:
+    done = splatctrl("--help")
+    assert done.returncode == 0
+    for command in COMMANDS:
+        assert f"    {command}" in done.stdout
+    assert "130 interrupted" in done.stdout
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = f"""
+import sys
+from splatctrl_cli.cli.main import main
+try:
+    main(["--help"])
+except SystemExit:
+    pass
+print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "usage: splatctrl" in done.stdout
+    assert done.stderr == "[]\n"
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c != "info"])
+def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, command: str) -> None:
+    done = splatctrl(*work.arguments(command, tmp_path / "out"), "--colour")
+    assert done.returncode == 2
+    assert "unrecognized arguments: --colour" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "sdf-bake", "replay"])
+def test_an_unknown_configuration_key_names_the_nearest(work: Work, tmp_path: Path, command: str) -> None:
+    arguments = work.arguments(command, tmp_path / "out")
+    assert_refused(splatctrl(*arguments, "--set", "scene.max_splat=9"), 2, "did you mean scene.max_splats?")
+    (tmp_path / "my.toml").write_text("[contrl]\nmargin = 0.1\n")
+    assert_refused(splatctrl(*arguments, "--config", tmp_path / "my.toml"), 2, "my.toml", "did you mean control?")
+    assert [path.name for path in tmp_path.iterdir()] == ["my.toml"]
+
+
+def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_path: Path) -> None:
+    arguments = work.arguments("reconstruct", tmp_path / "out")
+    assert_refused(splatctrl(*arguments, "--config", tmp_path / "none.toml"), 4, "none.toml: no such file")
+    (tmp_path / "bad.toml").write_text("[scene\n")
+    assert_refused(splatctrl(*arguments, "--config", tmp_path / "bad.toml"), 2, "bad.toml: not valid TOML")
+    assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, got 'many'")
+
+
+@pytest.mark.parametrize(
+    "command", ["ingest", "info", "reconstruct", "export", "sdf-bake", "score", "replay", "demo"]
+)
+def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command: str) -> None:
+    absent = tmp_path / "absent"
+    arguments: dict[str, Sequence[object]] = {
+        "score": (absent, "--reference", work.log),
+        "replay": (absent, "--scene", work.folder / "scene", "--urdf", work.folder / "robot.urdf"),
+        "demo": ("--data", absent),
+    }
+    output = () if command == "info" else ("-o", tmp_path / "out")
+    assert_refused(splatctrl(command, *arguments.get(command, (absent,)), *output), 4, "absent: ", "; ")
+    assert not list(tmp_path.iterdir())
+
+
+WRITERS = [command for command in COMMANDS if command != "info"]
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_an_output_that_exists_is_kept_without_force(work: Work, tmp_path: Path, command: str) -> None:
+    out = tmp_path / "out"
+    out.write_text("precious")
+    done = splatctrl(*work.arguments(command, out), "-q")
+    assert_refused(done, 2, "out: already exists; give --force")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("out", "precious")]
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_an_output_below_a_file_cannot_be_written(work: Work, tmp_path: Path, command: str) -> None:
+    (tmp_path / "file").write_text("no folder")
+    done = splatctrl(*work.arguments(command, tmp_path / "file" / "out"), "-q")
+    assert_refused(done, 2, "cannot be written", "another --out")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("command", ["export", "sdf-bake", "score", "replay"])
+def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path: Path, command: str) -> None:
+    done = splatctrl(*work.arguments(command, tmp_path / "out"), "--json")
+    assert done.returncode == 0, done.stderr
+    assert isinstance(json.loads(done.stdout), dict)
+    assert (tmp_path / "out").exists()
+
+
+def test_cuda_is_refused_where_there_is_none(work: Work, tmp_path: Path) -> None:
+    done = splatctrl(*work.arguments("reconstruct", tmp_path / "out"), "--device", "cuda")
+    assert_refused(done, 2, "--device cuda", "give --device cpu")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [
+        (LogRecipe(num_frames=0, has_tf=False), "holds no messages"),
+        (LogRecipe(has_depth=False), "no depth topic"),
+        (LogRecipe(has_info=False), "has no usable CameraInfo"),
+        (LogRecipe(has_tf=False), "no tf for frame"),
+        (LogRecipe(depth_encoding="32FC1", depth_m=1250.0), "implausible"),
+        (LogRecipe(depth_counts=1), "implausible"),
+        (LogRecipe(num_frames=0), "no image topics"),
+    ],
+)
+def test_a_log_that_cannot_be_reconstructed_is_one_line_and_leaves_nothing(
+    tmp_path: Path, recipe: LogRecipe, words: str
+) -> None:
+    log = make_log(tmp_path / "log.mcap", recipe)
+    assert_refused(splatctrl("reconstruct", log, *QUICK, "-o", tmp_path / "scene"), 4, "log.mcap", words, "; ")
+    assert [path.name for path in tmp_path.iterdir()] == ["log.mcap"]
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "sdf-bake", "replay"])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("<robot name='r'><link name='base'/></robot>", "expected movable joints, got none; an unexpanded xacro"),
+        ("<robot name='r'><link name='base'", "broken XML"),
+    ],
+)
+def test_a_robot_without_joints_is_refused(work: Work, tmp_path: Path, command: str, text: str, words: str) -> None:
+    (tmp_path / "bad.urdf").write_text(text)
+    arguments = [
+        tmp_path / "bad.urdf" if part == work.folder / "robot.urdf" else part
+        for part in work.arguments(command, tmp_path / "out")
+    ]
+    given = [] if command == "replay" else ["--urdf", tmp_path / "bad.urdf"]
+    assert_refused(splatctrl(*arguments, *given), 4, "bad.urdf", words)
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.urdf"]
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "replay"])
+def test_joints_that_are_not_in_the_log_are_named(work: Work, tmp_path: Path, command: str) -> None:
+    other = tmp_path / "other.urdf"
+    other.write_text(ARM.format("shoulder", "joint_b"))
+    arguments = [
+        other if part == work.folder / "robot.urdf" else part for part in work.arguments(command, tmp_path / "out")
+    ]
+    given = [] if command == "replay" else ["--urdf", other]
+    assert_refused(splatctrl(*arguments, *given), 4, "joints not in the log: shoulder", "; ", "joint_a")
+    assert [path.name for path in tmp_path.iterdir()] == ["other.urdf"]
+
+
+def test_a_failed_gate_is_exit_1_and_keeps_the_output(work: Work, tmp_path: Path) -> None:
+    done = splatctrl(*work.arguments("reconstruct", tmp_path / "scene"), "-q", "--require", "splats>1000000")
+    assert done.returncode == 1
+    assert "splats is " in done.stderr
+    assert (tmp_path / "scene" / "run.json").is_file()
+
+
+def test_an_error_with_v_shows_where_it_came_from(tmp_path: Path) -> None:
+    done = splatctrl("info", tmp_path / "absent", "-v")
+    assert done.returncode == 4
+    assert "Traceback" in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("splatctrl: ")
