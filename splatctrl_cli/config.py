@@ -24,20 +24,21 @@ class SceneConfig:
     lambda_color: float = 1.0
     lambda_depth: float = 1.0
     lambda_reg: float = 0.02
-    lambda_opacity: float = 0.1  # of the mean transmittance where there is depth; 0 in the paper
+    lambda_opacity: float = 0.3  # of the mean transmittance where there is depth; 0 in the paper
     depth_loss: str = "normalised"  # by accumulated opacity; "printed" (eq. 3) sets surfaces 12 mm too deep
     lambda_mde: float = 50.0  # III-C eq. 5 gives none; its source (SplaTAM) uses 50
     min_depth_error: float = 0.02  # [m] floor of lambda_mde * MDE, so that a perfect map is not re-seeded
     max_depth_error: float = 0.04  # [m] ceiling of it: above, a box on a table would never be added
     hole_opacity: float = 0.5  # accumulated opacity below which a pixel is a hole in the map
     min_opacity: float = 0.1  # III-C, alpha_min
-    min_spacing: float = 0.008  # [m] between seeds, however large the budget
+    radius_per_edge: float = 0.45  # of a seed, in edges of its cube
+    max_gap: float = 0.018  # [m] from a measured point to the nearest splat's sphere; beyond, one is added
     fill: float = 0.85  # share of the budget that the first time step may use; the rest is for what comes later
     iterations_per_step: int = 30  # K optimiser steps per time step
     first_iterations: int = 300  # optimiser steps on the first time step
     refine_iterations: int = 1500  # more of them, with annealed rates, where nothing moves (an image folder)
-    lr_center: float = 5e-4  # [m]
-    lr_log_radius: float = 1e-2
+    lr_center: float = 2e-4  # [m]
+    lr_log_radius: float = 3e-3
     lr_color: float = 1e-2
     lr_logit_opacity: float = 2e-2
     final_rate: float = 0.1  # share of the learning rates left at the end of refining
@@ -61,6 +62,7 @@ class OccupancyConfig:
     log_odds_limit: float = 2.0  # three cameras turn a full voxel free in two time steps
     max_range: float = 3.0  # [m]
     ray_stride: int = 2  # every second pixel and row carves free space
+    see_through: float = 0.015  # [m] by which a splat must stand before every depth around its pixel to be floating
     uncertain_patience: int = 10  # time steps a splat may stand in uncertain voxels
     robot_margin: float = 0.015  # [m] beyond the robot's spheres that still counts as robot
 

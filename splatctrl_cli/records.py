@@ -27,6 +27,9 @@ class Label(IntEnum):
     HUMAN = 0b10
 
 
+SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
+
+
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
     """Pinhole camera; pixel (0, 0) has its centre at u = v = 0 (the ROS and OpenCV convention).
@@ -173,7 +176,7 @@ class OccupancyGrid:
     """Log-odds voxels; voxel (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
 
     log_odds (X, Y, Z) float32; num_updates (X, Y, Z) uint16, 0 = never seen; entity (X, Y, Z) uint8 bits of
-    `Label`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is observed free, above 0.7 occupied.
+    `Label`, and `SWEPT`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is observed free, above 0.7 occupied.
     """
 
     origin: Float64
@@ -206,7 +209,8 @@ class DistanceGrid:
 
     channels: `sdf` (X, Y, Z) float32 [m], `hard` (X, Y, Z) float32 [m] the exact distance to the spheres,
     `gpdf` (X, Y, Z) float32 [m], `gradient` (X, Y, Z, 3) float32, `observed` (X, Y, Z) uint8 (0 never seen,
-    1 free, 2 occupied, 3 uncertain). header: sign, frame, units, kernel, length scale, digests.
+    1 free, 2 occupied, 3 uncertain, 4 never seen but swept by the robot). header: sign, frame, units, kernel,
+    length scale, digests.
     """
 
     origin: Float64

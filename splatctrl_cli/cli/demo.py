@@ -1,15 +1,160 @@
-"""``splatctrl demo``."""
+"""``splatctrl demo``: the whole main job on the sample recording, one command after the other, with pictures."""
 
 import argparse
+import shlex
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import Subparsers, add_command
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output
+from splatctrl_cli.errors import GateFailed, InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.evaluate.pictures import ComparisonRow
+    from splatctrl_cli.records import RgbdFrame, SplatSet
+
+TRAINING, SCORING = "cam0,cam1,cam2", "cam3"
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    add_command(subparsers, "demo", run, summary="demo")
+    parser = add_command(subparsers, "demo", run, summary="run the main job on a sample recording, with pictures")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=SAMPLE,
+        metavar="DIR",
+        help="what 'splatctrl simulate' wrote (default: sample_data)",
+    )
+    parser.add_argument("--threads", type=int, default=0, help="threads (default: one per core)")
+    add_output(parser, default="demo_output", what="folder for everything the demo makes")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    raise NotImplementedError
+    from splatctrl_cli.io.output import output_path
+
+    console, start = Console(args), time.perf_counter()
+    out = args.out or Path("demo_output")
+    missing = [
+        name
+        for name in ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
+        if not (args.data / name).is_file()
+    ]
+    if missing:
+        raise InputError(
+            f"{args.data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
+        )
+    if out.resolve() == args.data.resolve():
+        raise UsageError(f"{out}: is the input folder", remedy="give another --out")
+    with output_path(out, force=args.force, is_folder=True) as folder:
+        for command in _commands(args.data, folder, args.threads):
+            _run(command, console, folder, out)
+        pictures = _pictures(args.data, folder, args.threads)
+    seconds = time.perf_counter() - start
+    lines = [f"{description}: {out / name}" for name, description in pictures.items()]
+    console.result(
+        {"out": str(out), "seconds": round(seconds, 1), "pictures": [str(out / name) for name in pictures]},
+        ["", f"done in {seconds:.0f} s; look at", *lines, f"everything else is in {out}/"],
+    )
+    return 0
+
+
+def _commands(data: Path, out: Path, threads: int) -> list[list[str]]:
+    log, truth = str(data / "log.mcap"), str(data / "truth.json")
+    capture, scene, field = (str(out / name) for name in ("tabletop.capture", "scene", "field"))
+    robot = ["--urdf", str(data / "robot.urdf"), "--spheres", str(data / "robot_spheres.yaml")]
+    using = ["--threads", str(threads)]
+    return [
+        ["info", log],
+        ["ingest", log, "-o", capture],
+        ["reconstruct", capture, "--cameras", TRAINING, *robot, "-o", scene, *using],
+        ["export", scene, "-o", str(out / "tabletop.ply")],
+        ["sdf-bake", scene, *robot, "--truth", truth, "--seen-by", capture, "-o", field, *using],
+        ["score", scene, "--reference", capture, "--cameras", SCORING, "-o", str(out / "score"), *using],
+        ["replay", capture, "--scene", scene, *robot, "--truth", truth, "-o", str(out / "audit"), *using],
+        ["replay", capture, "--scene", scene, *robot, "--truth", truth, "--mode", "closed-loop", "-o",
+         str(out / "closed_loop"), *using],
+    ]  # fmt: skip
+
+
+def _run(command: Sequence[str], console: Console, folder: Path, out: Path) -> None:
+    """One subcommand as a person would type it; its error ends the demo."""
+    from splatctrl_cli.cli.main import build_parser
+
+    shown = [part.replace(str(folder), str(out)) for part in command]
+    console.log(f"\n$ splatctrl {shlex.join(shown)}")
+    args = build_parser().parse_args([*command, *(["-q"] if console.is_quiet or console.is_json else [])])
+    if console.is_json:
+        import contextlib
+        import io
+
+        with contextlib.redirect_stdout(io.StringIO()):
+            code = args.run(args)
+    else:
+        code = args.run(args)
+    if code:
+        raise GateFailed(f"splatctrl {command[0]}: ended with exit code {code}")
+
+
+def _pictures(data: Path, out: Path, threads: int) -> dict[str, str]:
+    """Draw what the demo shows; file names under `out`, with a description each."""
+    import numpy as np
+
+    from splatctrl_cli.evaluate.pictures import comparison_picture, field_slice_picture
+    from splatctrl_cli.io.grid import read_npz
+    from splatctrl_cli.io.scene_folder import open_scene
+    from splatctrl_cli.io.source import open_source
+    from splatctrl_cli.records import JointState, RgbdFrame
+    from splatctrl_cli.robot.model import RobotModel
+
+    newest: dict[str, RgbdFrame] = {}
+    joints: JointState | None = None
+    source = open_source(out / "tabletop.capture")
+    for record in source.records():
+        if isinstance(record, JointState):
+            joints = record
+        else:
+            newest[record.camera] = record
+    splats = open_scene(out / "scene").splats()
+    rows = [_comparison(frame, splats, threads) for frame in newest.values()]
+    comparison_picture(out / "renders.png", rows)
+    model = RobotModel.from_urdf(data / "robot.urdf", data / "robot_spheres.yaml")
+    assert joints is not None
+    centers = model.sphere_centers(joints.position[model.joint_order(source.joint_names)])
+    height = float(np.median(centers[model.moving_spheres][-4:, 2]))
+    field_slice_picture(
+        out / "field_slice.png",
+        read_npz(out / "field" / "field.npz"),
+        2,
+        height,
+        (centers, model.sphere_set.radii),
+        f"distance to the map at z = {height:.2f} m, with the arm's spheres",
+    )
+    return {
+        "renders.png": "photo, render and depth error of each camera",
+        "field_slice.png": "a slice of the distance field with the arm's spheres",
+        "audit/clearance.png": "clearance of the logged motion over time",
+        "closed_loop/clearance.png": "clearance of the controller's motion over time",
+    }
+
+
+def _comparison(frame: "RgbdFrame", splats: "SplatSet", threads: int) -> "ComparisonRow":
+    from splatctrl_cli.evaluate.images import psnr
+    from splatctrl_cli.evaluate.pictures import ComparisonRow
+    from splatctrl_cli.scene.render import render
+
+    view = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
+    is_mapped = view.opacity >= 0.5
+    figure = psnr(view.color, frame.color / 255.0, is_mapped)
+    role = "scoring only" if frame.camera in SCORING.split(",") else "training"
+    return ComparisonRow(
+        title=f"{frame.camera} ({role})",
+        figures=f"{figure:.1f} dB on mapped pixels",
+        photo=frame.color,
+        render=view.color,
+        photo_depth=frame.depth,
+        render_depth=view.normalised_depth(),
+    )

@@ -69,16 +69,16 @@ def from_grid(path: Path) -> KnownScene:
 def from_splats(path: Path, config: "Config", threads: int) -> KnownScene:
     """The scene of a reconstruction: at each stamp the fields of its newest snapshot not later.
 
-    Known space is what a camera saw, and what the robot itself fills at the end of the log.
+    Known space is what a camera saw, and what the robot itself was in at some time of the log.
     """
     from splatctrl_cli.control.audit import observed_lookup
     from splatctrl_cli.io.output import sha256
     from splatctrl_cli.io.scene_folder import open_scene
-    from splatctrl_cli.records import Label
+    from splatctrl_cli.records import SWEPT
 
     scene = open_scene(path)
     occupancy = scene.occupancy()
-    known = (occupancy.num_updates > 0) | ((occupancy.entity & int(Label.ROBOT)) > 0)
+    known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
     has_times = scene.has_clock and len(stamps) > 1
 

@@ -12,12 +12,12 @@ from splatctrl_cli.field.distance import GpdfField, SphereField
 from splatctrl_cli.field.health import field_health
 from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats, label_counts
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, OccupancyGrid, SplatSet, UInt8
+from splatctrl_cli.records import SWEPT, Box, DistanceGrid, Float64, Label, OccupancyGrid, SplatSet, UInt8
 
 FORMAT_VERSION = 1
 BYTES_PER_CELL = 25  # three distances and three gradient components of 4 bytes, one of observed
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
-NEVER_SEEN, FREE, OCCUPIED, UNCERTAIN = 0, 1, 2, 3
+NEVER_SEEN, FREE, OCCUPIED, UNCERTAIN, SWEPT_BY_ROBOT = 0, 1, 2, 3, 4
 
 Shape = tuple[int, int, int]
 
@@ -153,7 +153,9 @@ def _states(occupancy: OccupancyGrid, thresholds: OccupancyConfig) -> UInt8:
     states = np.full(occupancy.log_odds.shape, UNCERTAIN, dtype=np.uint8)
     states[occupancy.log_odds < _logit(thresholds.free_below)] = FREE
     states[occupancy.log_odds > _logit(thresholds.occupied_above)] = OCCUPIED
-    states[occupancy.num_updates == 0] = NEVER_SEEN
+    never_seen = occupancy.num_updates == 0
+    states[never_seen] = NEVER_SEEN
+    states[never_seen & (occupancy.entity & SWEPT > 0)] = SWEPT_BY_ROBOT
     return states
 
 

@@ -73,7 +73,7 @@ def _savez(path: Path, arrays: dict[str, NDArray[np.generic]]) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, array in arrays.items():
             buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+            np.lib.format.write_array(buffer, np.asarray(array), allow_pickle=False)
             entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, buffer.getvalue())
@@ -88,7 +88,7 @@ def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
         "origin": grid.origin.tolist(),
         "voxel": grid.voxel,
         "shape": list(grid.log_odds.shape),
-        "values": "log_odds of occupancy; num_updates 0 = never seen; entity bits 01 robot, 10 human",
+        "values": "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept",
     }
     arrays: dict[str, NDArray[np.generic]] = {
         "header": np.array(json.dumps(header)),

@@ -32,6 +32,13 @@ class Filled:
     relocated: int
     unmet: int
 
+    def __add__(self, other: "Filled") -> "Filled":
+        return Filled(
+            added=self.added + other.added,
+            relocated=self.relocated + other.relocated,
+            unmet=self.unmet + other.unmet,
+        )
+
 
 class SplatBuffer:
     """M slots; arrays are changed in place and never grow."""

@@ -22,9 +22,18 @@ from splatctrl_cli.records import Bool, Box, Float32, Intrinsics, Label, Occupan
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture, carried
-from splatctrl_cli.scene.removal import removals, robot_labels
+from splatctrl_cli.scene.removal import removals, robot_labels, seen_through
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seeding import add_mask, candidates, inside_workspace, seeds_at, spacing_for, world_points
+from splatctrl_cli.scene.seeding import (
+    SeedDensity,
+    add_mask,
+    candidates,
+    density_for,
+    gap_seeds,
+    inside_workspace,
+    seeds_at,
+    world_points,
+)
 from splatctrl_cli.scene.window import View, Window, make_view
 
 
@@ -73,7 +82,7 @@ class SceneFitter:
         self.window = Window(config)
         self.num_steps = 0
         self.num_iterations = 0
-        self.spacing = 0.0  # [m] between seeds, set by the first time step that has any
+        self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
         self._posture: RobotPosture | None = None
         self._raster = Rasteriser(self.num_threads)
         self._loss = ImageLoss(self.num_threads)
@@ -87,11 +96,15 @@ class SceneFitter:
             self.occupancy.integrate(frame)
         self._carry(robot)
         is_trail = self._label(robot)
-        removed = self._remove(is_trail)
-        filled = self._seed(views, rng)
+        removed = self._remove(is_trail, self._floating(frames))
+        filled = self._seed(views)
         self.window.advance(views)
         is_first = self.num_steps == 0
         self._optimise(self.config.first_iterations if is_first else self.config.iterations_per_step, rng)
+        self._prune(robot, frames, removed)
+        filled += self.buffer.fill(
+            gap_seeds(frames, self.workspace, self.splats(), self.config), self.config.initial_opacity
+        )
         self._label(robot)
         self.num_steps += 1
         terms = [self._evaluate(view, self._planes(view)) for view in views]
@@ -104,9 +117,11 @@ class SceneFitter:
         blocks = 10
         for block in range(blocks):
             self._optimise(num_iterations // blocks, rng, rate=final ** (block / (blocks - 1)))
-            self._remove(np.zeros(self.config.max_splats, bool))
+            views = [*self.window.newest, *self.window.keyframes]
+            nowhere = np.zeros(self.config.max_splats, bool)
+            self._remove(nowhere, self._floating([view.frame for view in views]))
             if block < blocks // 2:
-                self._seed([*self.window.newest, *self.window.keyframes], rng)
+                self._seed(views)
 
     def splats(self) -> SplatSet:
         """The live splats."""
@@ -138,14 +153,38 @@ class SceneFitter:
         slots = np.flatnonzero(self.buffer.is_alive & (self.buffer.labels == Label.ROBOT))
         self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
 
-    def _remove(self, is_trail: Bool) -> dict[str, int]:
-        reasons = removals(self.buffer, self.occupancy, self.workspace, self.config.min_opacity, is_trail)
+    def _floating(self, frames: Sequence[RgbdFrame]) -> Bool:
+        """Slots (M,) of splats that some frame sees through."""
+        tolerance = self.occupancy.config.see_through
+        is_floating = np.zeros(self.config.max_splats, bool)
+        for frame in frames:
+            is_floating |= seen_through(self.buffer.centers, frame, tolerance)
+        return is_floating & self.buffer.is_alive
+
+    def _prune(self, robot: RobotPosture | None, frames: Sequence[RgbdFrame], removed: dict[str, int]) -> None:
+        """Remove what the optimiser moved off the robot or into the air; adds to the counts in `removed`."""
+        drifted = self._label(robot)
+        self.buffer.kill(drifted)
+        floating = self._floating(frames)
+        self.buffer.kill(floating)
+        removed["trail"] += int(drifted.sum())
+        removed["free"] += int(floating.sum())
+
+    def _remove(self, is_trail: Bool, is_floating: Bool) -> dict[str, int]:
+        reasons = removals(
+            self.buffer,
+            self.occupancy,
+            self.workspace,
+            self.config.min_opacity,
+            is_trail=is_trail,
+            is_floating=is_floating,
+        )
         for mask in reasons.values():
             self.buffer.kill(mask)
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
-    def _seed(self, views: Sequence[View], rng: np.random.Generator) -> Filled:
-        """Fill dead slots at the pixels of M_add; the first time chooses the spacing that uses `fill` of them."""
+    def _seed(self, views: Sequence[View]) -> Filled:
+        """Fill dead slots at the pixels of M_add; the first time chooses the density that uses `fill` of them."""
         sources = []
         for view in views:
             mask = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
@@ -153,13 +192,10 @@ class SceneFitter:
                 sources.append(candidates(view.frame, world_points(view.frame), mask))
         if not sources:
             return Filled(added=0, relocated=0, unmet=0)
-        if self.spacing == 0.0:
-            points = np.concatenate([source[0] for source in sources])
-            self.spacing = max(
-                spacing_for(points, int(self.config.fill * self.config.max_splats), rng), self.config.min_spacing
-            )
+        if self.density is None:
+            self.density = density_for(sources, int(self.config.fill * self.config.max_splats), self.config)
         live = self.buffer.centers[self.buffer.is_alive]
-        seeds = seeds_at(sources, live, self.spacing, self.config, rng)
+        seeds = seeds_at(sources, live, self.density, self.config)
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _optimise(self, num_iterations: int, rng: np.random.Generator, rate: float = 1.0) -> None:
@@ -248,8 +284,9 @@ class SceneFitter:
             "num_updates": self.occupancy.num_updates,
             "entity": self.occupancy.entity,
             "counters": np.array([self.num_steps, self.num_iterations], np.int64),
-            "spacing": np.array(self.spacing),
         }
+        if self.density is not None:
+            arrays["density"] = np.array([self.density.edge, self.density.tolerance])
         if self._posture is not None:
             arrays |= {f"posture/{name}": getattr(self._posture, name) for name in POSTURE_NAMES}
         for kind, views in (("newest", self.window.newest), ("keyframe", self.window.keyframes)):
@@ -264,7 +301,9 @@ class SceneFitter:
         for name in ("log_odds", "num_updates", "entity"):
             getattr(self.occupancy, name)[...] = arrays[name]
         self.num_steps, self.num_iterations = (int(n) for n in arrays["counters"])
-        self.spacing = float(arrays["spacing"])
+        if "density" in arrays:
+            edge, tolerance = (float(x) for x in arrays["density"])
+            self.density = SeedDensity(edge=edge, tolerance=tolerance)
         if "posture/radii" in arrays:
             self._posture = RobotPosture(**{n: np.asarray(arrays[f"posture/{n}"], float) for n in POSTURE_NAMES})
         self.window = Window(self.config)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import integrate_depth, mark_spheres, pack_grid
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
+from splatctrl_cli.records import SWEPT, Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
 
 MAX_VOXELS = 400_000_000
 
@@ -52,9 +52,9 @@ class OccupancyMap:
         )
 
     def mark_robot(self, centers: Float64, radii: Float64) -> None:
-        """Set the robot bit in the voxels that spheres (S, 3), (S,) [m] meet, and in no other."""
+        """Set the robot bit in the voxels that spheres (S, 3), (S,) [m] meet, and in no other; mark them swept."""
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
-        mark_spheres(self._packed, self.entity, centers, radii, int(Label.ROBOT), self.num_threads)
+        mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
 
     def entity_at(self, points_world: Float32) -> NDArray[np.uint8]:
         """Entity bits (N,) of the voxels that hold points (N, 3); 0 outside the grid."""

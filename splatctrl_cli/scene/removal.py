@@ -1,9 +1,11 @@
 """Which splats must go, and why (III-C)."""
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label
+from splatctrl_cli.geometry import invert_transform, project, transform_points
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 
@@ -18,12 +20,42 @@ def inside_spheres(points: Float32, centers: Float64, radii: Float64, margin: fl
     return inside
 
 
+def seen_through(centers: Float32, frame: RgbdFrame, tolerance: float) -> Bool:
+    """Splats (N,) that float before what a frame measured: nearer than every valid depth around their pixel.
+
+    "Around" is within 1 cm at the splat's depth and "nearer" by more than `tolerance` [m], so that neither a
+    silhouette nor the sensor's noise takes a splat off its surface. Finer than the voxels: a voxel that holds both a
+    surface and the air before it stays occupied.
+    """
+    k = frame.intrinsics
+    points = transform_points(invert_transform(frame.T_world_camera), centers)
+    is_ahead = points[:, 2] > 0
+    pixels = np.floor(project(k, np.where(is_ahead[:, None], points, 1.0)) + 0.5)
+    is_inside = is_ahead & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
+    depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
+    valid = frame.depth[frame.depth > 0]
+    if not len(valid):
+        return np.zeros(len(centers), bool)
+    half = max(1, round(0.01 * k.fx / float(np.median(valid))))
+    nearest = minimum_filter(depth, size=2 * half + 1, mode="nearest")
+    u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
+    measured = nearest[v, u]
+    return np.asarray(is_inside & np.isfinite(measured) & (points[:, 2] < measured - tolerance))
+
+
 def removals(
-    buffer: SplatBuffer, occupancy: OccupancyMap, workspace: Box, min_opacity: float, is_trail: Bool
+    buffer: SplatBuffer,
+    occupancy: OccupancyMap,
+    workspace: Box,
+    min_opacity: float,
+    *,
+    is_trail: Bool,
+    is_floating: Bool,
 ) -> dict[str, Bool]:
     """Masks (M,) of live splats to remove, by reason; each splat under its first reason in `REASONS`.
 
-    broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free.
+    broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free, or
+    a camera sees through it.
     uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot, is no longer.
     Updates the buffer's count of uncertain time steps. Splats whose surroundings were never seen stay, unless the
     rule is "literal".
@@ -41,7 +73,7 @@ def removals(
         "broken": is_broken,
         "workspace": ~workspace.contains(centers),
         "opacity": buffer.opacities < min_opacity,
-        "free": is_free,
+        "free": is_free | is_floating,
         "uncertain": has_lost_patience,
         "trail": is_trail,
     }

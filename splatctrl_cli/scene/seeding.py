@@ -1,20 +1,23 @@
 """Where new splats come from: the first frames, and pixels that the map does not explain (M_add, eq. 5)."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.records import Bool, Box, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Box, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
+from splatctrl_cli.scene.cubes import CubeLevel, cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.render import Rendering
 
-RADIUS_PER_SPACING = 0.6  # between the 1/2 that leaves holes and the 1/sqrt(2) of a water-tight zero level, measured
-
-CROWDED = 0.7  # of the spacing: nearer than this to a live splat nothing is seeded
+NUM_LEVELS = 3  # cubes of one edge, half and a quarter of it
+NO_SEEDS = Seeds(
+    centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3), np.float32)
+)
+CROWDED = 0.7  # of the edge: nearer than this to a live splat nothing is seeded
 
 
 def world_points(frame: RgbdFrame) -> Float64:
@@ -42,50 +45,108 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
     return np.asarray(mappable & (is_hole | (error > threshold)))
 
 
-def candidates(frame: RgbdFrame, points_world: Float64, mask: Bool) -> tuple[Float32, Float32, Float32]:
-    """Points (K, 3) [m] world, colours (K, 3) in [0, 1] and pixel sizes D/f (K,) [m] of a mask (H, W)."""
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """Pixels to seed: points (K, 3) [m] world, colors (K, 3) in [0, 1], pixels (K,) their size D/f [m]."""
+
+    points: Float32
+    colors: Float32
+    pixels: Float32
+
+
+def candidates(frame: RgbdFrame, points_world: Float64, mask: Bool) -> Candidates:
+    """What the pixels of a mask (H, W) offer."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
     colors = frame.color[mask].astype(np.float32) / 255.0
-    return points_world[mask].astype(np.float32), colors, (frame.depth[mask] / focal).astype(np.float32)
+    return Candidates(
+        points=points_world[mask].astype(np.float32),
+        colors=colors,
+        pixels=(frame.depth[mask] / focal).astype(np.float32),
+    )
 
 
-def thin(points: Float32, spacing: float, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of one point of (K, 3) per cube of edge `spacing`, chosen at random, in random order."""
-    order = rng.permutation(len(points))
-    cubes = np.floor(points[order] / np.float32(spacing)).astype(np.int64)
-    keys = (cubes[:, 0] * 2_097_152 + cubes[:, 1]) * 2_097_152 + cubes[:, 2]
-    first = np.unique(keys, return_index=True)[1]
-    return order[np.sort(first)]
+@dataclass(frozen=True, kw_only=True)
+class SeedDensity:
+    """How densely to seed: edge [m] of the coarsest cubes, and the detail from which a cube is split."""
+
+    edge: float
+    tolerance: float
 
 
-def spacing_for(points: Float32, count: int, rng: np.random.Generator) -> float:
-    """The smallest cube edge [m] (to 1 %) at which thinning leaves at most `count` points."""
-    low, high = 1e-4, 1.0
-    while high / low > 1.01:
-        middle = float(np.sqrt(low * high))
-        low, high = (low, middle) if len(thin(points, middle, rng)) <= count else (middle, high)
-    return high
+def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig) -> SeedDensity:
+    """The density that spends at most `count` seeds on the candidates.
+
+    Cubes start at the edge at which splats of the largest radius still cover a surface; where that is too many
+    already, at the smallest larger edge (to 5 %) that is not.
+    """
+    points, colors, _ = _joined(sources)
+    edge = config.max_radius / config.radius_per_edge
+    while len(cube_levels(points, colors, edge, 1)[0].detail) > count:
+        edge *= 1.05
+    return SeedDensity(edge=edge, tolerance=tolerance_for(cube_levels(points, colors, edge, NUM_LEVELS), count))
 
 
 def seeds_at(
-    sources: Sequence[tuple[Float32, Float32, Float32]],
-    live_centers: Float32,
-    spacing: float,
-    config: SceneConfig,
-    rng: np.random.Generator,
+    sources: Sequence[Candidates], live_centers: Float32, density: SeedDensity, config: SceneConfig
 ) -> Seeds:
-    """One seed per cube of edge `spacing` [m] over the candidates of several views, in random order.
+    """One seed per standing cube over the candidates of several views, finest cubes first.
 
-    None within 0.7 spacings of a live splat (L, 3): silhouettes, where the blended depth is neither surface's, would
+    None within 0.7 edges of a live splat (L, 3): silhouettes, where the blended depth is neither surface's, would
     otherwise ask for new splats for ever.
 
     The paper's radius min(D/f, r_max) is one pixel; a budget far below the number of pixels needs the radius of its
-    spacing instead, so r = min(max(0.6 spacing, D/f), r_max).
+    cube instead, so r = min(max(radius_per_edge * edge, D/f), r_max).
     """
-    points, colors, pixels = (np.concatenate(parts) for parts in zip(*sources, strict=True))
-    chosen = thin(points, spacing, rng)
-    if len(live_centers):
-        distance = cKDTree(live_centers).query(points[chosen], distance_upper_bound=CROWDED * spacing)[0]
-        chosen = chosen[~np.isfinite(distance)]
-    radii = np.clip(np.maximum(RADIUS_PER_SPACING * spacing, pixels[chosen]), config.min_radius, config.max_radius)
-    return Seeds(centers=points[chosen], radii=radii.astype(np.float32), colors=colors[chosen])
+    points, colors, pixel = _joined(sources)
+    levels = cube_levels(points, colors, density.edge, NUM_LEVELS)
+    chosen = leaves(levels, density.tolerance)
+    parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)][
+        ::-1
+    ]
+    return Seeds(
+        centers=np.concatenate([part.centers for part in parts]),
+        radii=np.concatenate([part.radii for part in parts]),
+        colors=np.concatenate([part.colors for part in parts]),
+    )
+
+
+def gap_seeds(frames: Sequence[RgbdFrame], workspace: Box, splats: SplatSet, config: SceneConfig) -> Seeds:
+    """Seeds where a measured point lies further than `max_gap` [m] from every splat's sphere.
+
+    Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Every third pixel
+    and row is looked at, against the eight nearest splats.
+    """
+    sources = []
+    tree = cKDTree(splats.centers) if len(splats) else None
+    for frame in frames:
+        points = world_points(frame)
+        mask = inside_workspace(frame, points, workspace)
+        mask[np.arange(len(mask)) % 3 != 0] = False
+        mask[:, np.arange(mask.shape[1]) % 3 != 0] = False
+        if tree is not None:
+            count = min(8, len(splats))
+            distance, nearest = tree.query(points[mask], k=np.arange(1, count + 1))
+            mask[mask] = (distance - splats.radii[nearest]).min(axis=1) > config.max_gap
+        if mask.any():
+            sources.append(candidates(frame, points, mask))
+    if not sources:
+        return NO_SEEDS
+    all_points, colors, pixel = _joined(sources)
+    level = cube_levels(all_points, colors, config.max_radius / config.radius_per_edge, 1)[0]
+    everything, no_splats = np.ones(len(level.points), bool), np.zeros((0, 3), np.float32)
+    return _seeds_of(level, everything, pixel, no_splats, config)
+
+
+def _joined(sources: Sequence[Candidates]) -> tuple[Float32, Float32, float]:
+    points = np.concatenate([source.points for source in sources])
+    colors = np.concatenate([source.colors for source in sources])
+    return points, colors, float(np.median(np.concatenate([source.pixels for source in sources])))
+
+
+def _seeds_of(level: CubeLevel, mask: Bool, pixel: float, live_centers: Float32, config: SceneConfig) -> Seeds:
+    centers, colors = level.points[mask].astype(np.float32), level.colors[mask].astype(np.float32)
+    if len(live_centers) and len(centers):
+        is_free = ~np.isfinite(cKDTree(live_centers).query(centers, distance_upper_bound=CROWDED * level.edge)[0])
+        centers, colors = centers[is_free], colors[is_free]
+    radius = np.clip(max(config.radius_per_edge * level.edge, pixel), config.min_radius, config.max_radius)
+    return Seeds(centers=centers, radii=np.full(len(centers), radius, np.float32), colors=colors)

@@ -10,7 +10,7 @@ from splatctrl_cli.field import bake as bake_module
 from splatctrl_cli.field.bake import bake, bounding_box, grid_shape
 from splatctrl_cli.field.distance import GpdfField, SphereField
 from splatctrl_cli.io.grid import write_npz
-from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, OccupancyGrid
+from splatctrl_cli.records import SWEPT, Box, DistanceGrid, Float64, Label, OccupancyGrid
 from tests.field.scenes import cloud, splat_set
 from tests.reference import field as reference
 
@@ -103,6 +103,10 @@ def test_observed_comes_from_the_occupancy_voxel_of_the_cell() -> None:
     assert not observed[:, 1].any()  # outside the occupancy grid
     unseen = replace(occupancy, num_updates=np.zeros(shape, np.uint16))
     assert not bake(splats, box, config, occupancy=unseen).channels["observed"].any()
+    swept = replace(unseen, entity=np.array([0, SWEPT, 0], np.uint8).reshape(shape))
+    np.testing.assert_array_equal(
+        bake(splats, box, config, occupancy=swept).channels["observed"][:, 0, 0], [0, 0, 4, 0, 0]
+    )
     assert not bake(splats, box, config).channels["observed"].any()
 
 

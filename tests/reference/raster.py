@@ -1,4 +1,4 @@
-"""Eq. 1 to 3 of the paper, pixel by pixel in float64 torch, so that autograd is the reference of the backward pass."""
+"""Eq. 1 to 3 of the paper, pixel by pixel in float64 torch: autograd is the reference of the backward pass."""
 
 import torch
 

@@ -13,7 +13,7 @@ from splatctrl_cli.scene.posture import RobotPosture, carried
 from splatctrl_cli.scene.render import render
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
 
-CONFIG = SceneConfig(max_splats=1500, first_iterations=60, iterations_per_step=10)
+CONFIG = SceneConfig(max_splats=1500, first_iterations=100, iterations_per_step=10)
 OCCUPANCY = OccupancyConfig()
 
 

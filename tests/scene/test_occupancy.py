@@ -5,7 +5,7 @@ import pytest
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Box, Label
+from splatctrl_cli.records import SWEPT, Box, Label
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from tests.scene.wall import WORKSPACE, frame
 
@@ -59,12 +59,13 @@ def test_depth_beyond_the_range_says_nothing() -> None:
     assert not grid.num_updates.any()
 
 
-def test_robot_bits_are_set_where_a_sphere_is_and_nowhere_else() -> None:
+def test_robot_bits_are_where_a_sphere_is_and_swept_bits_where_one_was() -> None:
     grid = OccupancyMap(WORKSPACE, CONFIG, 1)
     grid.mark_robot(np.array([[0.3, 0.0, 0.3]]), np.array([0.1]))
     grid.mark_robot(np.array([[0.0, 0.0, 0.3]]), np.array([0.1]))
     points = np.float32([[0.0, 0.0, 0.3], [0.09, 0.0, 0.3], [0.3, 0.0, 0.3], [5.0, 0.0, 0.0]])
-    assert (grid.entity_at(points) == [Label.ROBOT, Label.ROBOT, 0, 0]).all()
+    robot = Label.ROBOT | SWEPT
+    assert (grid.entity_at(points) == [robot, robot, SWEPT, 0]).all()
 
 
 def test_a_workspace_too_large_for_its_voxels_is_refused() -> None:

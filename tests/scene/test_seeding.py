@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.records import Float32
+from splatctrl_cli.records import Float32, SplatSet
+from splatctrl_cli.scene.cubes import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seeding import (
+    SeedDensity,
     add_mask,
     candidates,
+    gap_seeds,
     inside_workspace,
     seeds_at,
-    spacing_for,
-    thin,
     world_points,
 )
 from tests.scene.wall import WORKSPACE, frame
@@ -61,41 +62,97 @@ def test_points_lie_on_the_floor_they_were_seen_on() -> None:
     assert np.abs(world_points(seen)[..., 2]).max() < 1e-6
 
 
-def test_thinning_keeps_one_point_per_cube() -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (5000, 3)).astype(np.float32)
-    kept = points[thin(points, 0.25, np.random.default_rng(1))]
-    cubes = {tuple(cube) for cube in np.floor(kept / 0.25).astype(int)}
-    assert len(cubes) == len(kept) == 512
+def coloured(count: int = 20000) -> tuple[Float32, Float32]:
+    """Points on the plane z = 0, grey but for a chequered square at x, y > 0.5."""
+    points = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32) * np.float32([1, 1, 0])
+    checks = (np.floor(points[:, 0] / 0.02) + np.floor(points[:, 1] / 0.02)) % 2
+    value = np.where((points[:, :2] > 0.5).all(axis=1), checks, 0.5)
+    return points, np.repeat(value[:, None], 3, axis=1).astype(np.float32)
 
 
-def test_the_spacing_uses_the_budget() -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (20000, 3)).astype(np.float32) * np.float32([1, 1, 0])
-    rng = np.random.default_rng(1)
-    count = len(thin(points, spacing_for(points, 1000, rng), rng))
-    assert 850 < count <= 1000  # 33 x 33 = 1089 cubes are too many, 30 x 30 to 31 x 31 fit
+def test_cubes_are_split_where_the_colour_varies_and_nowhere_else() -> None:
+    points, colors = coloured()
+    levels = cube_levels(points, colors, 0.1, 3)
+    coarse, middle, fine = leaves(levels, tolerance=1.0)
+    assert all((levels[0].points[coarse] < 0.51).any(axis=1))
+    assert not middle.any()
+    assert all((levels[2].points[fine, :2] > 0.5).all(axis=1))
+
+
+def test_cubes_are_split_at_an_edge_in_space() -> None:
+    points, _ = coloured()
+    grey = np.full_like(points, 0.5)
+    bent = np.concatenate([points, points[:, [2, 1, 0]] * np.float32([1, 1, 0.2])])
+    levels = cube_levels(bent + np.float32(0.03), np.concatenate([grey, grey]), 0.1, 2)
+    assert leaves(levels, tolerance=0.5)[1].any()
+    assert not leaves(cube_levels(points + np.float32(0.03), grey, 0.1, 2), tolerance=0.5)[1].any()
+
+
+def test_every_point_has_one_standing_cube() -> None:
+    points, colors = coloured(3000)
+    levels = cube_levels(points, colors, 0.1, 3)
+    for tolerance in (0.01, 0.1, 1.0, 100.0):
+        standing = leaves(levels, tolerance)
+        held = np.zeros(len(points), int)
+        for level, mask in zip(levels, standing, strict=True):
+            cubes = {tuple(c) for c in np.floor(level.points[mask].astype(float) / level.edge).astype(int)}
+            held += [tuple(c) in cubes for c in np.floor(points.astype(float) / level.edge).astype(int)]
+        assert (held == 1).all()
+
+
+def test_a_cube_stands_on_a_measured_point() -> None:
+    points, colors = coloured(500)
+    measured = {tuple(p) for p in points.tolist()}
+    assert all(tuple(p) in measured for p in cube_levels(points, colors, 0.2, 1)[0].points.tolist())
+
+
+def test_the_tolerance_uses_the_budget() -> None:
+    points, colors = coloured()
+    levels = cube_levels(points, colors, 0.1, 3)
+    count = sum(int(mask.sum()) for mask in leaves(levels, tolerance_for(levels, 900)))
+    assert 700 < count <= 900
 
 
 def test_nothing_is_seeded_beside_a_live_splat() -> None:
     seen = frame()
-    everywhere = np.ones(seen.depth.shape, bool)
-    source = candidates(seen, world_points(seen), everywhere)
-    rng = np.random.default_rng(0)
+    source = candidates(seen, world_points(seen), np.ones(seen.depth.shape, bool))
+    density = SeedDensity(edge=0.05, tolerance=1e9)
     nothing = np.zeros((0, 3), np.float32)
-    first = seeds_at([source], nothing, 0.05, CONFIG, rng).centers
-    second = seeds_at([source], first, 0.05, CONFIG, rng).centers
-    assert len(second) < 0.15 * len(first)  # only the gaps between the first ones
-    gaps = np.linalg.norm(second[:, None] - first[None], axis=2).min(axis=1)
-    assert gaps.min() >= 0.7 * 0.05 - 1e-6
+    first = seeds_at([source], nothing, density, CONFIG).centers
+    second = seeds_at([source], first, density, CONFIG).centers
+    assert len(second) == 0
+    half = first[first[:, 0] < 0]
+    again = seeds_at([source], half, density, CONFIG).centers
+    assert len(again) > 0.4 * len(first)
+    assert np.linalg.norm(again[:, None] - half[None], axis=2).min() >= 0.7 * 0.05 - 1e-6
 
 
-def test_the_radius_is_that_of_the_spacing_within_its_limits() -> None:
+def test_the_radius_is_that_of_the_cube_within_its_limits() -> None:
     seen = frame()
     source = candidates(seen, world_points(seen), np.ones(seen.depth.shape, bool))
-    nothing, rng = np.zeros((0, 3), np.float32), np.random.default_rng(0)
-    pixel = 1.0 / 80.0  # D / f
-    fine = seeds_at([source], nothing, 0.001, replace(CONFIG, max_radius=0.5), rng)
-    coarse = seeds_at([source], nothing, 0.1, replace(CONFIG, max_radius=0.5), rng)
-    capped = seeds_at([source], nothing, 0.1, CONFIG, rng)
-    assert np.allclose(fine.radii, pixel)
-    assert np.allclose(coarse.radii, 0.06)
+    nothing = np.zeros((0, 3), np.float32)
+    wide = replace(CONFIG, max_radius=0.5)
+    fine = seeds_at([source], nothing, SeedDensity(edge=0.004, tolerance=1e9), wide)
+    coarse = seeds_at([source], nothing, SeedDensity(edge=0.1, tolerance=1e9), wide)
+    capped = seeds_at([source], nothing, SeedDensity(edge=0.1, tolerance=1e9), CONFIG)
+    assert np.allclose(fine.radii, 1.0 / 80.0)  # one pixel: D / f
+    assert np.allclose(coarse.radii, 0.045)
     assert np.allclose(capped.radii, 0.02)
+
+
+def test_a_measured_surface_far_from_every_sphere_is_seeded() -> None:
+    seen = frame()
+    points = world_points(seen).reshape(-1, 3).astype(np.float32)
+    has_hole = points[np.linalg.norm(points[:, :2], axis=1) > 0.12]
+    count = len(has_hole)
+    splats = SplatSet(
+        centers=has_hole,
+        radii=np.full(count, 0.02, np.float32),
+        colors=np.zeros((count, 3), np.float32),
+        opacities=np.full(count, 0.9, np.float32),
+        labels=np.zeros(count, np.uint8),
+        density=np.zeros(count, np.float32),
+    )
+    seeds = gap_seeds([seen], WORKSPACE, splats, CONFIG)
+    assert 5 < len(seeds) < 60
+    assert np.linalg.norm(seeds.centers[:, :2], axis=1).max() < 0.12

@@ -12,8 +12,8 @@ namespace {
 
 constexpr std::uint8_t kMiss = 1, kHit = 2;
 
-void set_bit(std::uint8_t* voxel, std::uint8_t bit) {
-  if (!(__atomic_load_n(voxel, __ATOMIC_RELAXED) & bit)) __atomic_fetch_or(voxel, bit, __ATOMIC_RELAXED);
+void set_bits(std::uint8_t* voxel, std::uint8_t bits) {
+  if ((__atomic_load_n(voxel, __ATOMIC_RELAXED) & bits) != bits) __atomic_fetch_or(voxel, bits, __ATOMIC_RELAXED);
 }
 
 std::size_t index_of(const VoxelGrid& grid, const int* cell) {
@@ -57,7 +57,7 @@ void walk(const VoxelGrid& grid, const Segment& s, const int* end, std::uint8_t*
   }
   for (;;) {
     if (cell[0] == end[0] && cell[1] == end[1] && cell[2] == end[2]) return;
-    set_bit(marks + index_of(grid, cell), kMiss);
+    set_bits(marks + index_of(grid, cell), kMiss);
     const int axis = next[0] < next[1] ? (next[0] < next[2] ? 0 : 2) : (next[1] < next[2] ? 1 : 2);
     if (next[axis] > s.leave) return;
     cell[axis] += step[axis];
@@ -90,7 +90,7 @@ void integrate_depth(const VoxelGrid& grid, float* log_odds, std::uint16_t* num_
           end[axis] = static_cast<int>(std::floor(s.from[axis] + s.direction[axis]));
           ends_inside = ends_inside && end[axis] >= 0 && end[axis] < grid.size[axis];
         }
-        if (ends_inside) set_bit(marks + index_of(grid, end), kHit);
+        if (ends_inside) set_bits(marks + index_of(grid, end), kHit);
         if (u % settings.stride == 0 && v % settings.stride == 0 && s.clip(grid)) walk(grid, s, end, marks);
       }
     }
@@ -108,7 +108,7 @@ void integrate_depth(const VoxelGrid& grid, float* log_odds, std::uint16_t* num_
 }
 
 void mark_spheres(const VoxelGrid& grid, std::uint8_t* entity, const double* centers, const double* radii,
-                  int num_spheres, std::uint8_t bit, int num_threads) {
+                  int num_spheres, std::uint8_t bits, int num_threads) {
   const double half_diagonal = 0.5 * std::sqrt(3.0) * grid.voxel;
   parallel_for(num_spheres, num_threads, [&](int sphere) {
     const double* center = centers + 3 * sphere;
@@ -127,7 +127,7 @@ void mark_spheres(const VoxelGrid& grid, std::uint8_t* entity, const double* cen
             const double d = grid.origin[axis] + grid.voxel * cell[axis] - center[axis];
             squared += d * d;
           }
-          if (squared <= reach * reach) set_bit(entity + index_of(grid, cell), bit);
+          if (squared <= reach * reach) set_bits(entity + index_of(grid, cell), bits);
         }
       }
     }

@@ -25,8 +25,8 @@ void integrate_depth(const VoxelGrid& grid, float* log_odds, std::uint16_t* num_
                      const Camera& camera, const double* T_world_camera, const float* depth,
                      const OccupancySettings& settings, int num_threads);
 
-// ORs `bit` into every voxel whose centre lies within radius + half a voxel diagonal of a sphere.
+// ORs `bits` into every voxel whose centre lies within radius + half a voxel diagonal of a sphere.
 void mark_spheres(const VoxelGrid& grid, std::uint8_t* entity, const double* centers, const double* radii,
-                  int num_spheres, std::uint8_t bit, int num_threads);
+                  int num_spheres, std::uint8_t bits, int num_threads);
 
 }  // namespace splatctrl

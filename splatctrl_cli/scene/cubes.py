@@ -1,0 +1,91 @@
+"""Nested cubes over coloured points: where one splat will do, and where the image has detail that needs more.
+
+The paper seeds a splat per pixel. A budget far below the number of pixels has to choose; one splat per equal cube
+leaves objects as coarse as the floor. Here a cube is split in eight while its points disagree too much in colour or
+do not lie on a plane.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.records import Bool, Float32, Float64
+
+BEND = 2.0  # weight of the thickness of a cube's points, in squared edges, beside squared colour differences
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CubeLevel:
+    """The occupied cubes of one size: points (K, 3) [m], mean colors (K, 3), detail (K,), parent (K,).
+
+    A cube's point is the measured one nearest to the mean of its points: the mean itself would hang in the air of a
+    concave corner.
+
+    detail is the number of points times (colour variance + BEND * least variance of position / edge^2): what one
+    splat in the cube fails to explain. parent is the cube one level up that holds it.
+    """
+
+    edge: float
+    points: Float32
+    colors: Float64
+    detail: Float64
+    parent: Index
+
+
+def cube_levels(points: Float32, colors: Float32, edge: float, num_levels: int) -> list[CubeLevel]:
+    """Cubes of edges `edge`, `edge` / 2, … [m] over points (K, 3) with colours (K, 3)."""
+    levels: list[CubeLevel] = []
+    above: Index = np.zeros(len(points), np.int64)
+    for level in range(num_levels):
+        size = edge / 2**level
+        cell = np.floor(points.astype(np.float64) / size).astype(np.int64)
+        key = (cell[:, 0] * 2_097_152 + cell[:, 1]) * 2_097_152 + cell[:, 2]
+        first, cube = np.unique(key, return_index=True, return_inverse=True)[1:]
+        levels.append(_level(points, colors, cube, above[first], size))
+        above = cube
+    return levels
+
+
+def _level(points: Float32, colors: Float32, cube: Index, parent: Index, edge: float) -> CubeLevel:
+    count = np.bincount(cube).astype(np.float64)
+
+    def mean(values: NDArray[np.floating]) -> Float64:
+        columns = [np.bincount(cube, weights=column) / count for column in values.reshape(len(values), -1).T]
+        return np.stack(columns, 1)
+
+    center, color = mean(points), mean(colors)
+    color_variance = (mean(colors.astype(np.float64) ** 2) - color**2).sum(axis=1)
+    offset = points - center[cube]
+    covariance = mean(offset[:, :, None] * offset[:, None, :]).reshape(-1, 3, 3)
+    thickness = np.maximum(np.linalg.eigvalsh(covariance)[:, 0], 0.0)
+    detail = count * (np.maximum(color_variance, 0.0) + BEND * thickness / edge**2)
+    order = np.lexsort((np.sum(offset**2, axis=1), cube))
+    nearest = order[np.searchsorted(cube[order], np.arange(len(count)))]
+    return CubeLevel(edge=edge, points=points[nearest], colors=color, detail=detail, parent=parent)
+
+
+def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
+    """Masks (K,) per level of the cubes that stand: a cube is split while its detail exceeds `tolerance`."""
+    masks = []
+    is_reached = np.ones(len(levels[0].detail), bool)
+    for level, below in zip(levels, [*levels[1:], None], strict=True):
+        is_split = is_reached & (level.detail > tolerance) & (below is not None)
+        masks.append(is_reached & ~is_split)
+        if below is not None:
+            is_reached = is_split[below.parent]
+    return masks
+
+
+def tolerance_for(levels: Sequence[CubeLevel], count: int) -> float:
+    """The smallest tolerance (to 1 %) that leaves at most `count` cubes; infinite where the coarsest are too many."""
+    if len(levels[0].detail) > count:
+        return float("inf")
+    low, high = 1e-6, float(max(level.detail.max() for level in levels)) + 1e-6
+    while high / low > 1.01:
+        middle = float(np.sqrt(low * high))
+        fits = sum(int(mask.sum()) for mask in leaves(levels, middle)) <= count
+        low, high = (low, middle) if fits else (middle, high)
+    return high
