@@ -1,0 +1,151 @@
+"""Writes docs/cli.md from the parser and docs/config.md from config.py. Run by `make docs`; a test holds both to it.
+
+The pages are made from the parser itself and not from its printed help, whose wrapping depends on the terminal and on
+the version of Python.
+"""
+
+import argparse
+import ast
+import io
+import tokenize
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli import config
+from splatctrl_cli.cli.main import EXIT_CODES, build_parser
+
+DOCS = Path(__file__).parent
+NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
+
+
+def main() -> None:
+    """Write both pages."""
+    for name, text in pages().items():
+        (DOCS / name).write_text(text, encoding="utf-8")
+
+
+def pages() -> dict[str, str]:
+    """The text of each generated page, by file name."""
+    return {"cli.md": cli_page(), "config.md": config_page()}
+
+
+def cli_page() -> str:
+    """One section per subcommand, with every argument that its --help shows."""
+    parser = build_parser()
+    commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    summaries = {action.dest: action.help for action in commands._choices_actions}
+    lines = [
+        NOTICE,
+        "# The command line",
+        "",
+        f"`splatctrl COMMAND ...`: {parser.description}",
+        "",
+        *_table(("command", "what it does"), [(f"[{n}](#{n})", summaries[n]) for n in commands.choices]),
+        "",
+        "Results go to stdout, as a table or with `--json` as one JSON object; progress and log lines go to stderr.",
+        "An error is one line on stderr with its remedy. Options cannot be abbreviated. Relative paths start at the",
+        "folder you are in; missing folders above an output are made.",
+        "",
+        EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
+    ]
+    for name, command in commands.choices.items():
+        lines += ["", f"## {name}", "", _usage(name, command), "", command.description, ""]
+        lines += _table(("argument", "meaning"), _rows(command))
+    return "\n".join(lines) + "\n"
+
+
+def _usage(name: str, parser: argparse.ArgumentParser) -> str:
+    groups = parser._mutually_exclusive_groups
+    grouped = {id(action) for group in groups for action in group._group_actions}
+    required = [f"({' | '.join(_invocation(a) for a in group._group_actions)})" for group in groups if group.required]
+    required += [_invocation(a) for a in parser._actions if a.option_strings and a.required and id(a) not in grouped]
+    places = [_placed(a) for a in parser._actions if not a.option_strings]
+    return f"`{' '.join(['splatctrl', name, *places, *required, '[options]'])}`"
+
+
+def _placed(action: argparse.Action) -> str:
+    name = str(action.metavar or action.dest).upper()
+    return f"[{name}]" if action.nargs == "?" else name
+
+
+def _rows(parser: argparse.ArgumentParser) -> list[tuple[str, str]]:
+    formatter = parser._get_formatter()
+    actions = [a for group in parser._action_groups for a in group._group_actions if a.dest != "help"]
+    return [(f"`{_invocation(a)}`", formatter._expand_help(a) if a.help else "") for a in actions]
+
+
+def _invocation(action: argparse.Action) -> str:
+    """``-o, --out PATH``, the same in every version of Python."""
+    if not action.option_strings:
+        return _placed(action)
+    names = ", ".join(action.option_strings)
+    if action.nargs == 0:
+        return names
+    if action.choices:
+        return f"{names} {{{','.join(map(str, action.choices))}}}"
+    return f"{names} {action.metavar or action.dest.upper()}"
+
+
+def config_page() -> str:
+    """One table per section of the configuration: key, default, and the comment beside it."""
+    comments, docstrings = _config_source()
+    lines = [
+        NOTICE,
+        "# Configuration",
+        "",
+        "Give a TOML file with `--config FILE.toml`, single values with `--set section.key=value` (these win). An",
+        "unknown key is an error that names the nearest good one. What a run used stands in its `run.json`.",
+        "",
+        "```toml",
+        "[scene]",
+        f"max_splats = {config.SceneConfig.max_splats}",
+        "",
+        "[control]",
+        f"margin = {config.ControlConfig.margin}",
+        "```",
+        "",
+        "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it.",
+    ]
+    for section in fields(config.Config):
+        values: Any = getattr(config.Config(), section.name)
+        kind = type(values).__name__
+        rows = [
+            (f"`{key.name}`", f"`{_toml(getattr(values, key.name))}`", comments[kind, key.name])
+            for key in fields(values)
+        ]
+        lines += ["", f"## [{section.name}]", "", docstrings[kind], "", *_table(("key", "default", "meaning"), rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _config_source() -> tuple[dict[tuple[str, str], str], dict[str, str]]:
+    """Comments by (class, key) and docstrings by class, from the text of config.py."""
+    source = Path(config.__file__).read_text(encoding="utf-8")
+    by_line = {
+        token.start[0]: token.string.lstrip("# ")
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    classes = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
+    comments = {
+        (node.name, item.target.id): by_line.get(item.lineno, "")
+        for node in classes
+        for item in node.body
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
+    }
+    return comments, {node.name: ast.get_docstring(node) or "" for node in classes}
+
+
+def _toml(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    escaped = [[cell.replace("|", "\\|") for cell in row] for row in [header, *rows]]
+    lines = [f"| {' | '.join(row)} |" for row in escaped]
+    lines.insert(1, f"|{' --- |' * len(header)}")
+    return lines
+
+
+if __name__ == "__main__":
+    main()
