@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 import tomllib
 import types
 import typing
@@ -129,8 +130,8 @@ T = TypeVar("T")
 def load_config(path: Path | None, assignments: typing.Sequence[str]) -> Config:
     """Defaults, then the TOML file, then each ``section.key=value``.
 
-    Raises UsageError for an unknown section or key (naming the nearest), a value of the wrong type, or TOML that
-    does not parse; InputError for a file that is not there.
+    Raises UsageError for an unknown section or key (naming the nearest), a value of the wrong type or out of range,
+    or TOML that does not parse; InputError for a file that is not there.
     """
     config = Config()
     if path is not None:
@@ -141,7 +142,32 @@ def load_config(path: Path | None, assignments: typing.Sequence[str]) -> Config:
         if not separator or not dot:
             raise UsageError(f"--set {assignment}: expected section.key=value")
         config = _merge(config, {section: {name: _parse_value(text.strip())}}, where=f"--set {assignment}")
+    _check_ranges(config)
     return config
+
+
+_POSITIVE = (
+    *("scene.max_splats", "scene.snapshot_every", "scene.min_radius", "scene.max_radius", "scene.radius_per_edge"),
+    *("occupancy.voxel", "occupancy.max_range", "occupancy.ray_stride"),
+)
+_SHARES = ("scene.initial_opacity", "scene.min_opacity", "occupancy.free_below", "occupancy.occupied_above")
+
+
+def _check_ranges(config: Config) -> None:
+    """Raise UsageError for a scene or occupancy value that nothing can be fitted with.
+
+    What a field or a controller can run with is checked where those are made.
+    """
+    values = {f"{section}.{key}": value for section, keys in config.as_dict().items() for key, value in keys.items()}
+    for name in _POSITIVE:
+        if not values[name] > 0:
+            raise UsageError(f"{name}: expected above 0, got {values[name]:g}")
+    for name in _SHARES:
+        if not 0 < values[name] < 1:
+            raise UsageError(f"{name}: expected between 0 and 1, got {values[name]:g}")
+    for low, high in (("scene.min_radius", "scene.max_radius"), ("occupancy.free_below", "occupancy.occupied_above")):
+        if values[low] > values[high]:
+            raise UsageError(f"{low}: expected at most {high} = {values[high]:g}, got {values[low]:g}")
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -187,4 +213,6 @@ def _checked(value: Any, hint: Any, where: str) -> Any:
     if not any(type(value) is option for option in options):
         names = " or ".join(getattr(option, "__name__", str(option)) for option in options)
         raise UsageError(f"{where}: expected {names}, got {value!r}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise UsageError(f"{where}: expected a finite number, got {value}")
     return value

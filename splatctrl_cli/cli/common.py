@@ -55,9 +55,12 @@ def add_gates(parser: argparse.ArgumentParser) -> None:
 
 
 def configured(args: argparse.Namespace) -> "Config":
-    """The configuration that --config and --set give."""
+    """The configuration that --config and --set give. Raises UsageError for it, or a seed or threads below 0."""
     from splatctrl_cli.config import load_config
 
+    for option in ("seed", "threads"):
+        if getattr(args, option) < 0:
+            raise UsageError(f"--{option}: expected 0 or more, got {getattr(args, option)}")
     return load_config(args.config, args.set)
 
 

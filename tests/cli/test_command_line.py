@@ -1,8 +1,10 @@
 """The command line as a person meets it, one process per test: help, exit codes, one line per error, nothing left."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,6 +134,9 @@ def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_p
     (tmp_path / "bad.toml").write_text("[scene\n")
     assert_refused(splatctrl(*arguments, "--config", tmp_path / "bad.toml"), 2, "bad.toml: not valid TOML")
     assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, got 'many'")
+    assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=-5"), 2, "expected above 0, got -5")
+    assert_refused(splatctrl(*arguments, "--seed=-1"), 2, "--seed: expected 0 or more, got -1")
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 
 
 @pytest.mark.parametrize(
@@ -232,6 +237,26 @@ def test_joints_that_are_not_in_the_log_are_named(work: Work, tmp_path: Path, co
     given = [] if command == "replay" else ["--urdf", other]
     assert_refused(splatctrl(*arguments, *given), 4, "joints not in the log: shoulder", "; ", "joint_a")
     assert [path.name for path in tmp_path.iterdir()] == ["other.urdf"]
+
+
+def test_an_interrupted_run_is_exit_130_and_leaves_only_what_is_partial(sample_data: Path, tmp_path: Path) -> None:
+    # The handler is set by hand: a shell starts background jobs with SIGINT ignored, which a child inherits.
+    program = """
+import signal, sys
+from splatctrl_cli.cli.main import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.exit(main(sys.argv[1:]))
+"""
+    out, partial = tmp_path / "scene", tmp_path / "scene.partial"
+    arguments = ["reconstruct", str(sample_data / "tabletop" / "log.mcap"), "--threads", "1", "-o", str(out)]
+    running = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.PIPE, text=True)
+    end = time.monotonic() + 30.0
+    while not partial.is_dir() and time.monotonic() < end:
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    stderr = running.communicate(timeout=30)[1]
+    assert (running.returncode, stderr) == (130, "splatctrl: interrupted\n")
+    assert [path.name for path in tmp_path.iterdir()] == [partial.name]
 
 
 def test_a_failed_gate_is_exit_1_and_keeps_the_output(work: Work, tmp_path: Path) -> None:

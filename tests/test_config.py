@@ -1,0 +1,80 @@
+"""What a configuration may say, and what it is told when it may not."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.errors import InputError, UsageError
+
+
+def test_nothing_given_is_the_defaults() -> None:
+    assert load_config(None, []) == Config()
+
+
+def test_assignments_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "my.toml"
+    path.write_text("[scene]\nmax_splats = 7\nlambda_depth = 2\n[control]\nmargin = 0.03\n")
+    config = load_config(path, ["scene.max_splats=9", "occupancy.rule=literal"])
+    assert config.scene.max_splats == 9
+    assert config.scene.lambda_depth == 2.0
+    assert isinstance(config.scene.lambda_depth, float)
+    assert config.control.margin == 0.03
+    assert config.occupancy.rule == "literal"
+
+
+def test_what_is_written_reads_back(tmp_path: Path) -> None:
+    config = load_config(None, ["scene.fill=0.5", "scene.depth_loss=printed"])
+    path = tmp_path / "again.toml"
+    lines = []
+    for section, values in config.as_dict().items():
+        lines += [f"[{section}]", *(f"{key} = {value!r}" for key, value in values.items())]
+    path.write_text("\n".join(lines))
+    assert load_config(path, []) == config
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("scene.max_splat=9", "unknown key scene.max_splat; did you mean scene.max_splats?"),
+        ("scen.max_splats=9", "unknown key scen; did you mean scene?"),
+        ("scene.zzz=9", "unknown key scene.zzz; known here: max_splats"),
+        ("scene=9", "expected section.key=value"),
+        ("scene.max_splats", "expected section.key=value"),
+        ("scene.max_splats=2.5", "expected int, got 2.5"),
+        ("scene.max_splats=true", "expected int, got True"),
+        ("scene.fill=many", "expected float, got 'many'"),
+        ("scene.fill=nan", "expected a finite number, got nan"),
+        ("scene.max_splats=-5", "scene.max_splats: expected above 0, got -5"),
+        ("scene.snapshot_every=0", "scene.snapshot_every: expected above 0, got 0"),
+        ("scene.initial_opacity=2", "scene.initial_opacity: expected between 0 and 1, got 2"),
+        ("scene.min_radius=0.5", "scene.min_radius: expected at most scene.max_radius = 0.02, got 0.5"),
+        ("occupancy.ray_stride=0", "occupancy.ray_stride: expected above 0, got 0"),
+        (
+            "occupancy.free_below=0.9",
+            "occupancy.free_below: expected at most occupancy.occupied_above = 0.7, got 0.9",
+        ),
+    ],
+)
+def test_what_cannot_be_is_named(assignment: str, words: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        load_config(None, [assignment])
+    assert words in str(refused.value)
+
+
+def test_files_that_are_missing_or_no_toml_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none.toml: no such file"):
+        load_config(tmp_path / "none.toml", [])
+    (tmp_path / "bad.toml").write_text("[scene\n")
+    with pytest.raises(UsageError, match=r"bad.toml: not valid TOML"):
+        load_config(tmp_path / "bad.toml", [])
+    (tmp_path / "flat.toml").write_text("scene = 3\n")
+    with pytest.raises(UsageError, match="scene: expected a table, got 3"):
+        load_config(tmp_path / "flat.toml", [])
+
+
+def test_every_number_is_of_one_plain_type() -> None:
+    for section in fields(Config):
+        for key, value in Config().as_dict()[section.name].items():
+            assert isinstance(value, int | float | str), key
