@@ -1,0 +1,73 @@
+"""One step of the controller, and the audit of logged states."""
+
+from collections.abc import Callable
+from functools import partial
+from itertools import cycle
+
+import numpy as np
+
+from benchmarks.measure import Options, Result, medians
+from benchmarks.scenes import sample_fitter, sample_robot, sample_states
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.audit import audit
+from splatctrl_cli.control.step import QpIkController
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.distance import GpdfField, SafeField, SphereField
+from splatctrl_cli.field.grid import GridField
+from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.records import Box, DistanceField, Float64
+
+NUM_STEPS = 200
+
+
+def run(options: Options) -> Result:
+    """The sample log's arm and map: steps from its logged states towards the last one's pose, and their audit."""
+    config, model = Config(), sample_robot()
+    splats = field_splats(sample_fitter().splats())
+    exact = SphereField(splats.centers, splats.radii)
+    analytic = SafeField(exact, GpdfField(splats.centers, splats.radii, config.field.length_scale))
+    reach = model.reach()
+    workspace = Box(lower=model.base_position - reach, upper=model.base_position + reach)
+    grid = GridField(bake(splats, workspace, config.field))
+    fields: dict[str, DistanceField] = {"grid": grid, "analytic": analytic}
+    steps: dict[str, Callable[[], object]] = {name: _step(field) for name, field in fields.items()}
+    points = np.ascontiguousarray(model.sphere_centers(sample_states()[0].position))
+    queries = {f"{name}_query": partial(field.query, points) for name, field in fields.items()}
+    times = medians(steps | queries, options.rounds(NUM_STEPS))
+    audits = medians({name: _audit(field) for name, field in fields.items()}, options.rounds(4))
+    names = {"grid": "baked grid, 2 cm", "analytic": f"analytic field, {len(splats)} splats"}
+    num_states = len(sample_states())
+    return Result(
+        title=f"control: an arm of {len(model.joint_names)} joints and {len(points)} spheres",
+        columns=("field", "QP-IK step [ms]", "steps/s", "of it one field query [ms]", "audit [states/s]"),
+        rows=[
+            [title, f"{1e3 * times[name]:.2f}", f"{1 / times[name]:.0f}", f"{1e3 * times[f'{name}_query']:.2f}",
+             f"{num_states / audits[name]:.0f}"]
+            for name, title in names.items()
+        ],
+        figures={
+            **{f"{name}_step_ms": 1e3 * times[name] for name in names},
+            **{f"{name}_query_ms": 1e3 * times[f"{name}_query"] for name in names},
+            **{f"{name}_audit_states_per_s": num_states / audits[name] for name in names},
+        },
+        ratios={"grid_step_over_analytic": times["analytic"] / times["grid"]},
+        notes=["a step: kinematics, one query for the rows, clarabel, one query or more that checks the promise"],
+    )  # fmt: skip
+
+
+def _step(field: DistanceField) -> Callable[[], object]:
+    """The next logged state's step, each time it is called."""
+    model, states = sample_robot(), sample_states()
+    frame = model.frame_names[-1]
+    goal = model.frame_pose(states[-1].position, frame)
+    controller = QpIkController(model, Config().control, field, frame=frame)
+    chosen = cycle(states[:: max(len(states) // NUM_STEPS, 1)])
+    return lambda: controller.step(next(chosen).position, goal)
+
+
+def _audit(field: DistanceField) -> Callable[[], object]:
+    def distance(points: Float64) -> Float64:
+        return field.query(points)[0]
+
+    distances = {"field": distance}
+    return lambda: audit(sample_robot(), sample_states(), lambda stamp_ns: distances)

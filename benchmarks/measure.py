@@ -1,0 +1,116 @@
+"""Medians of wall time, and what a benchmark hands back."""
+
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from splatctrl_cli.kernels import num_threads
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_data" / "tabletop"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """is_quick: fewer repeats, small sizes only. with_demo: time `splatctrl demo` as well."""
+
+    is_quick: bool
+    with_demo: bool
+
+    def rounds(self, full: int) -> int:
+        """How often to repeat what a full run repeats `full` times."""
+        return max(3, full // 4) if self.is_quick else full
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """A bound that a figure has to keep: at most it, or (`is_least`) at least it."""
+
+    figure: str
+    bound: float
+    is_least: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Whether `value` keeps the bound."""
+        return value >= self.bound if self.is_least else value <= self.bound
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What one benchmark measured.
+
+    columns and rows make the table for people; figures the same numbers by name, with the unit as last part of the
+    name. ratios: how many times faster than a reference of the same run (larger is better), which is what two
+    machines, or two days, can be compared by.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    figures: Mapping[str, float]
+    ratios: Mapping[str, float] = field(default_factory=dict)
+    limits: Sequence[Limit] = ()
+    notes: Sequence[str] = ()
+
+
+def seconds(task: Callable[[], object]) -> float:
+    """Wall time of one call."""
+    start = time.perf_counter()
+    task()
+    return time.perf_counter() - start
+
+
+def medians(tasks: Mapping[str, Callable[[], object]], rounds: int, *, num_untimed: int = 1) -> dict[str, float]:
+    """Median seconds of each task over `rounds`, after `num_untimed` more.
+
+    The tasks take turns, so that what slows the machine for a while slows all of them.
+    """
+    times: dict[str, list[float]] = {name: [] for name in tasks}
+    for index in range(num_untimed + rounds):
+        for name, task in tasks.items():
+            elapsed = seconds(task)
+            if index >= num_untimed:
+                times[name].append(elapsed)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+class OtherLoad:
+    """How many cores other processes keep busy, from its making on: on a shared machine, part of every figure."""
+
+    def __init__(self) -> None:
+        self._start, self._before = time.perf_counter(), _others_seconds()
+
+    def cores(self) -> float:
+        """Mean number of cores; 0 where the system does not say."""
+        return max(0.0, _others_seconds() - self._before) / (time.perf_counter() - self._start)
+
+
+def _others_seconds() -> float:
+    """Seconds of all cores that went to anything but this process and the children it has waited for."""
+    stat = Path("/proc/stat")
+    if not stat.is_file():
+        return 0.0
+    user, nice, system, _, _, irq, soft_irq, steal = map(
+        int, stat.read_text(encoding="ascii").splitlines()[0].split()[1:9]
+    )
+    busy = (user + nice + system + irq + soft_irq + steal) / os.sysconf("SC_CLK_TCK")
+    return busy - sum(os.times()[:4])
+
+
+def machine() -> dict[str, str | int]:
+    """What the figures were measured on."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text(encoding="utf-8").splitlines()
+        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
+    return {
+        "processor": model,
+        "cores": num_threads(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+    }
