@@ -91,7 +91,7 @@ def settings(num_splats: int) -> OptimiserSettings:
 
 
 def run(options: Options) -> Result:
-    """5,000 and 10,000 splats at 640x480 and the sample log's own map, on 1 and 2 threads, beside plain torch on 1."""
+    """5,000 and 10,000 splats at 640x480 and the sample log's own map; plain torch on one thread beside them."""
     walls = [wall_problem(count) for count in ((5000,) if options.is_quick else (5000, 10000))]
     problems = {f"wall_{len(wall.parameters)}": wall for wall in walls} | {"sample": sample_problem()}
     cases = {(key, threads): KernelIteration(p, threads) for key, p in problems.items() for threads in (1, 2)}
@@ -139,6 +139,7 @@ def _measured(
     cases: dict[tuple[str, int], KernelIteration], walls: dict[str, FitProblem], options: Options
 ) -> tuple[Times, TorchTimes]:
     """Every case in turn, round by round, with the reference in between."""
+    torch.set_num_threads(1)  # on two, its barriers take seconds whenever another process has one of the cores
     references = {key: TorchIteration(wall, weights(), settings(len(wall.parameters))) for key, wall in walls.items()}
     times: Times = defaultdict(list)
     torch_times: TorchTimes = defaultdict(list)
