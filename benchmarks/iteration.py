@@ -5,6 +5,7 @@ import time
 from collections import defaultdict
 
 import numpy as np
+import torch
 
 from benchmarks.measure import Limit, Options, Result, seconds
 from benchmarks.plain_torch import TorchIteration
