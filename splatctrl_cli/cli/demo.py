@@ -1,7 +1,10 @@
 """``splatctrl demo``: the whole main job on the sample recording, one command after the other, with pictures."""
 
 import argparse
+import contextlib
+import io
 import shlex
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -87,15 +90,17 @@ def _run(command: Sequence[str], console: Console, folder: Path, out: Path) -> N
 
     shown = [part.replace(str(folder), str(out)) for part in command]
     console.log(f"\n$ splatctrl {shlex.join(shown)}")
-    args = build_parser().parse_args([*command, *(["-q"] if console.is_quiet or console.is_json else [])])
-    if console.is_json:
-        import contextlib
-        import io
-
-        with contextlib.redirect_stdout(io.StringIO()):
+    is_silent = console.is_quiet or console.is_json
+    args = build_parser().parse_args([*command, *(["-q"] if is_silent else [])])
+    text, arguments = io.StringIO(), sys.argv
+    sys.argv = [arguments[0], *shown]  # what run.json records
+    try:
+        with contextlib.redirect_stdout(text):
             code = args.run(args)
-    else:
-        code = args.run(args)
+    finally:
+        sys.argv = arguments
+    if not is_silent:
+        print(text.getvalue().replace(str(folder), str(out)), end="", flush=True)
     if code:
         raise GateFailed(f"splatctrl {command[0]}: ended with exit code {code}")
 

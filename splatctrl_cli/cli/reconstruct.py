@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
             ]
         ],
     )  # fmt: skip
-    lines.append("removed: " + ", ".join(f"{count} {name}" for name, count in removed.items() if count))
+    lines.append("removed: " + (", ".join(f"{n} {reason}" for reason, n in removed.items() if n) or "none"))
     lines += [f"note: {note}" for note in source.loss.notes]
     console.result({"scene": str(out), "metrics": metrics, "removed": removed}, [*lines, f"wrote {out}"])
     check_gates(args.require, {k: float(v) for k, v in metrics.items() if isinstance(v, int | float)})
@@ -112,13 +112,15 @@ def _open(args: argparse.Namespace) -> "RecordSource":
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
     if args.dtu is None:
         return open_source(args.source, source_options(args))
-    from splatctrl_cli.io.dtu_source import DtuSource
+    from splatctrl_cli.io.dtu_source import DtuSource, view_numbers
 
-    return DtuSource(args.dtu, args.scan, [int(view) for view in (args.holdout or "").split(",") if view])
+    return DtuSource(args.dtu, args.scan, view_numbers([word for word in (args.holdout or "").split(",") if word]))
 
 
 def _robot(args: argparse.Namespace, source: "RecordSource") -> "RobotModel | None":
     if args.urdf is None:
+        if args.spheres is not None:
+            raise UsageError(f"--spheres {args.spheres}: belongs to a robot", remedy="give its --urdf as well")
         return None
     from splatctrl_cli.robot.model import RobotModel
 
@@ -150,6 +152,7 @@ class _Reconstruction:
         self.writer = SceneWriter(folder, {"format": FORMAT, "frame": "world", "units": "m", "source": source.name})
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
+        self.stamps: list[int] = []
 
     def run(self, console: Console) -> None:
         """Step through the log."""
@@ -161,6 +164,7 @@ class _Reconstruction:
             if self.fitter is None:
                 self.fitter = self._new_fitter(step)
             row = self.fitter.step(step.frames, self._posture(step))
+            self.stamps.extend(frame.stamp_ns for frame in step.frames)
             self.rows.append(row)
             self.writer.audit(row)
             if index % scene.snapshot_every == 0 and self.source.has_clock:
@@ -169,6 +173,11 @@ class _Reconstruction:
             raise InputError(
                 f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
                 remedy="'splatctrl info' says what the input lacks",
+            )
+        if not any(row.alive for row in self.rows):
+            raise InputError(
+                f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
+                remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
             )
         if not self.source.has_clock:
             self.fitter.refine(scene.refine_iterations)
@@ -231,6 +240,7 @@ class _Reconstruction:
             "cameras": self.cameras,
             "has_clock": self.source.has_clock,
             "stamp_ns": last.stamp_ns,
+            "training_stamps_ns": [] if self.source.has_clock else self.stamps,
             "time_steps": len(self.rows),
             "iterations": self.fitter.num_iterations,
             "splats": last.alive,

@@ -164,6 +164,11 @@ def _score_views(
     splats_at = _SplatsAt(scene, use_snapshots=has_clock and args.snapshots == "newest")
     scores = _Scores(has_clock=has_clock)
     for view in views_to_score(source, scoring=cameras, training=scene.cameras, has_clock=has_clock):
+        if view.frame.stamp_ns in scene.training_stamps_ns and not args.allow_training:
+            raise UsageError(
+                f"{view.name}: trained the scene, its score says nothing about other views",
+                remedy="give the --holdout that reconstruct was given, or --allow-training",
+            )
         if has_clock and not splats_at.is_known(view.frame.stamp_ns):
             scores.skipped.append(view.name)
             continue

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import platform
 import shutil
 import sys
@@ -32,8 +31,8 @@ def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
         partial.parent.mkdir(parents=True, exist_ok=True)
         if is_folder:
             partial.mkdir()
-        elif not os.access(partial.parent, os.W_OK):
-            raise PermissionError(13, "Permission denied")
+        else:
+            partial.touch()
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
     try:

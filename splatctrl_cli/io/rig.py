@@ -48,15 +48,13 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
     for name in (*names, *options.camera_poses):
         if name not in known:
             raise InputError(f"{log.path}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")
-    others = [name for name in known if name not in names]
     try:
         cameras = tuple(_Builder(log, survey, options, known[name]).build() for name in names)
     except InputError as error:
-        if len(names) < 2 or others:
+        usable = [name for name in known if not _Builder(log, survey, options, known[name]).problems()]
+        if not usable:
             raise
-        raise InputError(
-            error.message, remedy=f"{error.remedy}; or choose with --cameras {','.join(names)}"
-        ) from None
+        raise InputError(error.message, remedy=f"{error.remedy}; or give --cameras {','.join(usable)}") from None
     worlds = {camera.world_frame for camera in cameras if camera.fixed_pose is None}
     if len(worlds) > 1:
         raise InputError(

@@ -102,7 +102,7 @@ def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
 def read_occupancy(path: Path) -> OccupancyGrid:
     """Read ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             header = json.loads(str(archive["header"]))
             return OccupancyGrid(
                 origin=np.array(header["origin"], np.float64),
@@ -136,6 +136,11 @@ class SceneFolder:
     def cameras(self) -> tuple[str, ...]:
         """The cameras that trained the scene."""
         return tuple(self.run["metrics"]["cameras"])
+
+    @property
+    def training_stamps_ns(self) -> frozenset[int]:
+        """The views that trained a scene without a clock, by their made-up stamps."""
+        return frozenset(self.run["metrics"].get("training_stamps_ns", ()))
 
     @property
     def has_clock(self) -> bool:

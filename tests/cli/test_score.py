@@ -90,6 +90,7 @@ class FakeScene:
     has_clock: bool = True
     cameras: tuple[str, ...] = ("cam0",)
     snapshots: tuple[FakeSnapshot, ...] = (FakeSnapshot(stamp_ns=SECOND), FakeSnapshot(stamp_ns=2 * SECOND))
+    training_stamps_ns: frozenset[int] = frozenset()
 
     def splats(self) -> SplatSet:
         return wall()

@@ -1,0 +1,71 @@
+"""Outputs appear whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.io.output import output_path
+
+
+def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
+    with output_path(tmp_path / "out", force=False, is_folder=True) as partial:
+        (partial / "a").write_text("1")
+        assert not (tmp_path / "out").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    assert (tmp_path / "out" / "a").read_text() == "1"
+
+
+def test_an_existing_output_is_refused_untouched_without_force(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("old")
+    with pytest.raises(UsageError, match="--force"), output_path(tmp_path / "out", force=False, is_folder=False):
+        pytest.fail("must not get here")
+    assert (tmp_path / "out").read_text() == "old"
+
+
+def test_force_replaces_a_folder_whole(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "old").write_text("x")
+    with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
+        (partial / "new").write_text("y")
+        assert (tmp_path / "out" / "old").exists()
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_refused_input_leaves_nothing(tmp_path: Path) -> None:
+    with (
+        pytest.raises(InputError),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        (partial / "a").write_text("1")
+        raise InputError("bad")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_leaves_only_a_partial(tmp_path: Path) -> None:
+    with (
+        pytest.raises(KeyboardInterrupt),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        (partial / "a").write_text("1")
+        raise KeyboardInterrupt
+    assert [p.name for p in tmp_path.iterdir()] == ["out.partial"]
+
+
+def test_a_parent_that_is_a_file_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with (
+        pytest.raises(UsageError, match="cannot be written"),
+        output_path(tmp_path / "file" / "out", force=False, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+
+
+def test_a_full_disk_is_a_write_error_and_leaves_nothing(tmp_path: Path) -> None:
+    with (
+        pytest.raises(WriteError, match="No space left"),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        raise OSError(28, "No space left on device", str(partial / "a"))
+    assert not list(tmp_path.iterdir())

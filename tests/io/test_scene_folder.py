@@ -1,0 +1,100 @@
+"""The scene folder reads back what was written, and says what is wrong with others."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.io.output import write_json
+from splatctrl_cli.io.scene_folder import SceneWriter, open_scene, read_occupancy, write_occupancy
+from splatctrl_cli.records import OccupancyGrid, SplatSet
+
+
+@dataclass(frozen=True)
+class Row:
+    stamp_ns: int
+
+
+def splats(count: int) -> SplatSet:
+    rng = np.random.default_rng(count)
+    return SplatSet(
+        centers=rng.normal(size=(count, 3)).astype(np.float32),
+        radii=rng.uniform(0.01, 0.02, count).astype(np.float32),
+        colors=rng.uniform(0, 1, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.1, 0.9, count).astype(np.float32),
+        labels=np.zeros(count, np.uint8),
+        density=np.zeros(count, np.float32),
+    )
+
+
+def grid() -> OccupancyGrid:
+    rng = np.random.default_rng(0)
+    return OccupancyGrid(
+        origin=np.array([-0.1, 0.2, 0.3]),
+        voxel=0.05,
+        log_odds=rng.normal(size=(3, 4, 5)).astype(np.float32),
+        num_updates=rng.integers(0, 9, (3, 4, 5)).astype(np.uint16),
+        entity=rng.integers(0, 4, (3, 4, 5)).astype(np.uint8),
+    )
+
+
+def written(folder: Path) -> Path:
+    folder.mkdir()
+    writer = SceneWriter(folder, {"frame": "world"})
+    for stamp in (100, 200, 300):
+        writer.audit(Row(stamp))
+        writer.snapshot(stamp, splats(stamp // 100))
+    writer.finish(300, splats(3), grid(), {"a": np.arange(4), "scalar": np.array(2.5)})
+    write_json(folder / "run.json", {"metrics": {"cameras": ["cam0"], "has_clock": True, "stamp_ns": 300}})
+    return folder
+
+
+def test_a_scene_is_known_by_its_newest_snapshot(tmp_path: Path) -> None:
+    scene = open_scene(written(tmp_path / "scene"))
+    assert [len(scene.splats_at(stamp)) for stamp in (100, 199, 200, 10_000)] == [1, 1, 2, 3]
+    with pytest.raises(NotEvaluableError, match="no snapshot"):
+        scene.splats_at(99)
+    assert scene.cameras == ("cam0",)
+    assert scene.stamp_ns == 300
+
+
+def test_occupancy_comes_back_bit_by_bit(tmp_path: Path) -> None:
+    write_occupancy(tmp_path / "occupancy.npz", grid())
+    again = read_occupancy(tmp_path / "occupancy.npz")
+    want = grid()
+    assert again.voxel == want.voxel
+    for name in ("origin", "log_odds", "num_updates", "entity"):
+        assert getattr(again, name).tobytes() == getattr(want, name).tobytes()
+
+
+def test_the_same_scene_gives_the_same_bytes(tmp_path: Path) -> None:
+    one, two = written(tmp_path / "one"), written(tmp_path / "two")
+    for path in sorted(p.relative_to(one) for p in one.rglob("*") if p.is_file()):
+        assert (one / path).read_bytes() == (two / path).read_bytes()
+
+
+def test_a_checkpoint_keeps_scalars_scalar(tmp_path: Path) -> None:
+    with np.load(written(tmp_path / "scene") / "checkpoint" / "state.npz", allow_pickle=False) as state:
+        assert state["scalar"].shape == ()
+        assert state["a"].tolist() == [0, 1, 2, 3]
+
+
+def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such scene"):
+        open_scene(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="expected a scene folder"):
+        open_scene(tmp_path)
+
+
+def test_a_foreign_or_cut_occupancy_grid_is_refused(tmp_path: Path) -> None:
+    foreign, cut = tmp_path / "foreign.npz", tmp_path / "cut.npz"
+    np.savez(foreign, x=np.zeros(3))
+    write_occupancy(cut, grid())
+    cut.write_bytes(cut.read_bytes()[:-40])
+    pickled = tmp_path / "pickled.npz"
+    np.savez(pickled, header=np.array({"a": 1}, dtype=object))
+    for path in (foreign, cut, pickled):
+        with pytest.raises(InputError, match="not an occupancy grid"):
+            read_occupancy(path)

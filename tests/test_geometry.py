@@ -1,0 +1,64 @@
+"""Rigid transforms and the pinhole camera."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from splatctrl_cli.geometry import (
+    back_project,
+    interpolate_transform,
+    invert_transform,
+    look_at,
+    project,
+    quat_from_rotation,
+    rotation_from_quat,
+    transform_from,
+    transform_points,
+)
+from splatctrl_cli.records import Intrinsics
+
+RNG = np.random.default_rng(0)
+CAMERA = Intrinsics(fx=50.0, fy=60.0, cx=20.3, cy=14.8, width=40, height=30)
+
+
+@pytest.mark.parametrize("index", range(20))
+def test_rotations_agree_with_scipy_both_ways(index: int) -> None:
+    rotation = Rotation.random(rng=index) if index else Rotation.from_rotvec([np.pi, 0, 0])
+    R = rotation.as_matrix()
+    assert np.allclose(rotation_from_quat(rotation.as_quat()), R, atol=1e-12)
+    quat = quat_from_rotation(R)
+    assert quat[3] >= 0
+    assert np.allclose(rotation_from_quat(quat), R, atol=1e-12)
+
+
+def test_inverse_undoes() -> None:
+    T = transform_from([0.1, -2.0, 3.0], [0.1, 0.2, -0.3, 0.9])
+    points = RNG.normal(size=(7, 3))
+    assert np.allclose(transform_points(invert_transform(T), transform_points(T, points)), points)
+
+
+def test_interpolation_meets_its_ends_and_halves_the_angle() -> None:
+    a, b = transform_from([0, 0, 0], [0, 0, 0, 1]), transform_from([1, 2, 3], [0, 0, np.sin(0.6), np.cos(0.6)])
+    assert np.allclose(interpolate_transform(a, b, 0.0), a)
+    assert np.allclose(interpolate_transform(a, b, 1.0), b)
+    middle = interpolate_transform(a, b, 0.5)
+    assert np.allclose(middle[:3, 3], [0.5, 1, 1.5])
+    assert np.allclose(middle[:3, :3], Rotation.from_rotvec([0, 0, 0.6]).as_matrix())
+    assert np.allclose(interpolate_transform(a, a, 0.3), a)
+
+
+def test_pixels_come_back_to_where_they_were_projected_from() -> None:
+    depth = RNG.uniform(0.5, 2.0, (30, 40))
+    points = back_project(CAMERA, depth)
+    v, u = np.mgrid[:30, :40]
+    assert np.allclose(project(CAMERA, points), np.stack([u, v], -1))
+    assert np.allclose(points[..., 2], depth)
+
+
+def test_a_camera_looks_at_its_target_with_down_pointing_down() -> None:
+    T = look_at([1.0, 2.0, 1.5], [0.2, 0.1, 0.0])
+    target = transform_points(invert_transform(T), np.array([[0.2, 0.1, 0.0]]))[0]
+    assert np.allclose(target[:2], 0.0)
+    assert target[2] > 0
+    assert T[2, 1] < 0  # image down is world down
+    assert np.isclose(np.linalg.det(T[:3, :3]), 1.0)
