@@ -42,6 +42,7 @@ class SceneConfig:
     lr_log_radius: float = 3e-3
     lr_color: float = 1e-2
     lr_logit_opacity: float = 2e-2
+    refine_geometry: float = 5.0  # factor on the rates of centre and radius while refining
     final_rate: float = 0.1  # share of the learning rates left at the end of refining
     noise: float = 5e5  # lambda_noise of 3DGS-MCMC; a step is capped at half a radius
     window: int = 12  # keyframes kept beside the newest frame of each camera
@@ -61,6 +62,7 @@ class OccupancyConfig:
     log_odds_hit: float = 0.85
     log_odds_miss: float = -0.4
     log_odds_limit: float = 2.0  # three cameras turn a full voxel free in two time steps
+    min_range: float = 0.2  # [m]; nearer depth is what carries the camera, or noise
     max_range: float = 3.0  # [m]
     ray_stride: int = 2  # every second pixel and row carves free space
     see_through: float = 0.015  # [m] by which a splat must stand before every depth around its pixel to be floating

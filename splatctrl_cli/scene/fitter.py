@@ -100,10 +100,11 @@ class SceneFitter:
         filled = self._seed(views)
         self.window.advance(views)
         is_first = self.num_steps == 0
-        self._optimise(self.config.first_iterations if is_first else self.config.iterations_per_step, rng)
+        num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
+        self._optimise(num_iterations, rng, self._settings())
         self._prune(robot, frames, removed)
         filled += self.buffer.fill(
-            gap_seeds(frames, self.workspace, self.splats(), self.config), self.config.initial_opacity
+            gap_seeds([(v.frame, v.mappable) for v in views], self.splats(), self.config), self.config.initial_opacity
         )
         self._label(robot)
         self.num_steps += 1
@@ -116,7 +117,8 @@ class SceneFitter:
         final = self.config.final_rate
         blocks = 10
         for block in range(blocks):
-            self._optimise(num_iterations // blocks, rng, rate=final ** (block / (blocks - 1)))
+            rate = final ** (block / (blocks - 1))
+            self._optimise(num_iterations // blocks, rng, self._settings(rate, rate * self.config.refine_geometry))
             views = [*self.window.newest, *self.window.keyframes]
             nowhere = np.zeros(self.config.max_splats, bool)
             self._remove(nowhere, self._floating([view.frame for view in views]))
@@ -132,7 +134,8 @@ class SceneFitter:
         return self.occupancy.grid()
 
     def _view(self, frame: RgbdFrame) -> View:
-        return make_view(frame, inside_workspace(frame, world_points(frame), self.workspace))
+        min_range = self.occupancy.config.min_range
+        return make_view(frame, inside_workspace(frame, world_points(frame), self.workspace, min_range))
 
     def _label(self, robot: RobotPosture | None) -> Bool:
         """Label the robot's splats; returns those (M,) that were robot and no longer are: its trail."""
@@ -198,8 +201,7 @@ class SceneFitter:
         seeds = seeds_at(sources, live, self.density, self.config)
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
-    def _optimise(self, num_iterations: int, rng: np.random.Generator, rate: float = 1.0) -> None:
-        settings = self._settings(rate)
+    def _optimise(self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings) -> None:
         for view in self.window.schedule(num_iterations, rng):
             planes = self._planes(view)
             plane_gradients = np.empty_like(planes)
@@ -233,11 +235,12 @@ class SceneFitter:
             normalised=c.depth_loss == "normalised",
         )
 
-    def _settings(self, rate: float) -> OptimiserSettings:
+    def _settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
+        """Learning rates times `rate`, those of centre and radius times `geometry`."""
         c = self.config
         return OptimiserSettings(
-            lr_center=c.lr_center * rate,
-            lr_log_radius=c.lr_log_radius * rate,
+            lr_center=c.lr_center * geometry,
+            lr_log_radius=c.lr_log_radius * geometry,
             lr_color=c.lr_color * rate,
             lr_logit_opacity=c.lr_logit_opacity * rate,
             regulariser=c.lambda_reg / max(int(self.buffer.is_alive.sum()), 1),

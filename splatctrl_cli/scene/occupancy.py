@@ -42,7 +42,7 @@ class OccupancyMap:
             self._marks,
             np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64),
             np.ascontiguousarray(frame.T_world_camera, np.float64),
-            np.ascontiguousarray(frame.depth, np.float32),
+            np.where(frame.depth >= self.config.min_range, frame.depth, np.float32(0.0)).astype(np.float32),
             hit=self.config.log_odds_hit,
             miss=self.config.log_odds_miss,
             limit=self.config.log_odds_limit,

@@ -25,9 +25,10 @@ def world_points(frame: RgbdFrame) -> Float64:
     return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth))
 
 
-def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box) -> Bool:
-    """Pixels (H, W) with a valid depth in the workspace."""
-    return np.asarray((frame.depth > 0) & workspace.contains(points_world))
+def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
+    """Pixels (H, W) with a valid depth, not nearer than `min_range` [m], in the workspace."""
+    is_valid = (frame.depth > 0) & (frame.depth >= min_range)
+    return np.asarray(is_valid & workspace.contains(points_world))
 
 
 def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: SceneConfig) -> Bool:
@@ -110,17 +111,16 @@ def seeds_at(
     )
 
 
-def gap_seeds(frames: Sequence[RgbdFrame], workspace: Box, splats: SplatSet, config: SceneConfig) -> Seeds:
+def gap_seeds(views: Sequence[tuple[RgbdFrame, Bool]], splats: SplatSet, config: SceneConfig) -> Seeds:
     """Seeds where a measured point lies further than `max_gap` [m] from every splat's sphere.
 
-    Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Every third pixel
-    and row is looked at, against the eight nearest splats.
+    Each view is a frame and its mappable pixels (H, W). Blending can cover a pixel from splats that are not near its
+    surface; a distance field cannot. Every third pixel and row is looked at, against the eight nearest splats.
     """
     sources = []
     tree = cKDTree(splats.centers) if len(splats) else None
-    for frame in frames:
-        points = world_points(frame)
-        mask = inside_workspace(frame, points, workspace)
+    for frame, mappable in views:
+        points, mask = world_points(frame), mappable.copy()
         mask[np.arange(len(mask)) % 3 != 0] = False
         mask[:, np.arange(mask.shape[1]) % 3 != 0] = False
         if tree is not None:

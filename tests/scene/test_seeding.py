@@ -57,6 +57,15 @@ def test_invalid_depth_is_never_asked_for() -> None:
     assert not add_mask(seen, rendering(seen.depth, 0.0), mappable, CONFIG)[:30].any()
 
 
+def test_what_is_nearer_than_the_least_range_is_not_mapped() -> None:
+    seen = frame(block=0.4)
+    points = world_points(seen)
+    far = inside_workspace(seen, points, WORKSPACE, 0.7)
+    assert inside_workspace(seen, points, WORKSPACE)[seen.depth < 0.7].all()
+    assert not far[seen.depth < 0.7].any()
+    assert far.any()
+
+
 def test_points_lie_on_the_floor_they_were_seen_on() -> None:
     seen = frame(x=0.1, y=-0.05)
     assert np.abs(world_points(seen)[..., 2]).max() < 1e-6
@@ -153,6 +162,6 @@ def test_a_measured_surface_far_from_every_sphere_is_seeded() -> None:
         labels=np.zeros(count, np.uint8),
         density=np.zeros(count, np.float32),
     )
-    seeds = gap_seeds([seen], WORKSPACE, splats, CONFIG)
+    seeds = gap_seeds([(seen, inside_workspace(seen, world_points(seen), WORKSPACE))], splats, CONFIG)
     assert 5 < len(seeds) < 60
     assert np.linalg.norm(seeds.centers[:, :2], axis=1).max() < 0.12
