@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Sequence
 
 from splatctrl_cli import __version__
+from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.errors import SplatCtrlError
 
 COMMANDS = ("simulate", "ingest", "info", "reconstruct", "export", "sdf-bake", "score", "replay", "demo")
@@ -21,7 +22,7 @@ damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 7
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser with every subcommand registered."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="splatctrl",
         description="What did the robot's cameras know, and would this controller have kept it safe?",
         epilog=EXIT_CODES,
@@ -38,9 +39,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    args = build_parser().parse_args(argv)
-    verbose = getattr(args, "verbose", 0)
+    verbose = 0
     try:
+        args = build_parser().parse_args(argv)
+        verbose = args.verbose
         code: int = args.run(args)
         sys.stdout.flush()
         return code

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.cli.main import COMMANDS
+from splatctrl_cli.cli.main import COMMANDS, main
 from tests.io.make_log import LogRecipe, make_log
 
 HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "mcap", "rosbags", "clarabel")
@@ -114,9 +114,31 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c != "info"])
 def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, command: str) -> None:
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--colour")
-    assert done.returncode == 2
-    assert "unrecognized arguments: --colour" in done.stderr
+    assert_refused(done, 2, f"{command}: unrecognized arguments: --colour; ")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("scor",), "did you mean score?"),
+        (("score", "a", "--reference", "b", "--thread", "3"), "--thread 3; did you mean --threads?"),
+        (("score", "a", "--refrence", "b"), "--refrence; did you mean --reference?"),
+        (("score", "a", "--reference", "b", "--snapshots", "fin"), "did you mean final?"),
+        (("score", "--reference", "b"), "required: SCENE; see splatctrl score --help"),
+        ((), "required: COMMAND; see splatctrl --help"),
+        (("sdf-bake", "a", "--box", "-1,-1,0,1,1,1"), "expected one argument; write --box=VALUE"),
+        (("sdf-bake", "a", "-o", "-x"), "expected one argument; write --out=VALUE"),
+    ],
+)
+def test_wrong_arguments_are_one_line_with_a_remedy(
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], words: str
+) -> None:
+    assert main(arguments) == 2
+    done = capsys.readouterr()
+    assert (done.out, done.err.count("\n")) == ("", 1)
+    assert done.err.startswith("splatctrl: ")
+    assert words in done.err
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "sdf-bake", "replay"])
