@@ -34,6 +34,7 @@ class SceneConfig:
     min_opacity: float = 0.1  # III-C, alpha_min
     radius_per_edge: float = 0.45  # of a seed, in edges of its cube
     max_gap: float = 0.018  # [m] from a measured point to the nearest splat's sphere; beyond, one is added
+    gap_reserve: float = 0.02  # share of the budget that only such gaps may use
     fill: float = 0.85  # share of the budget that the first time step may use; the rest is for what comes later
     iterations_per_step: int = 30  # K optimiser steps per time step
     first_iterations: int = 300  # optimiser steps on the first time step

@@ -1,7 +1,7 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,11 +79,11 @@ def run(args: argparse.Namespace) -> int:
     last = fitted.rows[-1]
     removed = {name: sum(row.removed[name] for row in fitted.rows) for name in last.removed}
     lines = table(
-        ["time steps", "splats", "robot", "added", "relocated", "unmet", "PSNR [dB]", "seconds"],
+        ["time steps", "splats", "robot", "added", "relocated", "unmet", "training dB", "seconds"],
         [
             [
-                len(fitted.rows), last.alive, last.robot, metrics["added"], metrics["relocated"], metrics["unmet"],
-                f"{metrics['psnr']:.2f}", f"{stopwatch.seconds['fit']:.1f}",
+                metrics["time_steps"], last.alive, last.robot, metrics["added"], metrics["relocated"],
+                metrics["unmet"], f"{metrics['psnr']:.2f}", f"{stopwatch.seconds['fit']:.1f}",
             ]
         ],
     )  # fmt: skip
@@ -167,6 +167,10 @@ class _Reconstruction:
             self.stamps.extend(frame.stamp_ns for frame in step.frames)
             self.rows.append(row)
             self.writer.audit(row)
+            if index % 10 == 0 and not steps.disable:
+                steps.set_postfix(splats=row.alive, dB=row.psnr)
+            if steps.disable and index % 10 == 0:
+                console.log(f"time step {index}: {row.alive} splats, {row.psnr:.1f} dB on its own views")
             if index % scene.snapshot_every == 0 and self.source.has_clock:
                 self.writer.snapshot(step.stamp_ns, self.fitter.splats())
         if self.fitter is None:
@@ -180,8 +184,14 @@ class _Reconstruction:
                 remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
             )
         if not self.source.has_clock:
-            self.fitter.refine(scene.refine_iterations)
+            row = self.fitter.refine(scene.refine_iterations, progress=self._refined(console))
+            self.rows.append(row)
+            self.writer.audit(row)
             self.writer.snapshot(self.rows[-1].stamp_ns, self.fitter.splats())
+
+    def _refined(self, console: Console) -> "Callable[[int], None]":
+        total = self.config.scene.refine_iterations
+        return lambda done: console.log(f"refined {done} of {total} iterations")
 
     def _steps(self) -> "Iterator[TimeStep]":
         from splatctrl_cli.scene.time_steps import time_steps
@@ -241,7 +251,7 @@ class _Reconstruction:
             "has_clock": self.source.has_clock,
             "stamp_ns": last.stamp_ns,
             "training_stamps_ns": [] if self.source.has_clock else self.stamps,
-            "time_steps": len(self.rows),
+            "time_steps": self.fitter.num_steps,
             "iterations": self.fitter.num_iterations,
             "splats": last.alive,
             "robot_splats": last.robot,

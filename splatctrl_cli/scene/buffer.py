@@ -73,9 +73,13 @@ class SplatBuffer:
         self.labels[slots] = Label.OBJECT
         self._reset(np.flatnonzero(slots))
 
-    def fill(self, seeds: Seeds, opacity: float) -> Filled:
-        """Put seeds into dead slots, in slot order, with `opacity`; seeds beyond the number of slots are unmet."""
-        slots = np.flatnonzero(~self.is_alive)[: len(seeds)]
+    def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0) -> Filled:
+        """Put seeds into dead slots, in slot order, with `opacity`; seeds beyond them are unmet.
+
+        The last `keep_free` dead slots are left alone.
+        """
+        dead = np.flatnonzero(~self.is_alive)
+        slots = dead[: max(min(len(seeds), len(dead) - keep_free), 0)]
         count = len(slots)
         self.parameters[slots, CENTER] = seeds.centers[:count]
         self.parameters[slots, LOG_RADIUS] = np.log(seeds.radii[:count])

@@ -1,6 +1,7 @@
 """`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to an up-to-date splat set."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,8 @@ from splatctrl_cli.scene.seeding import (
     world_points,
 )
 from splatctrl_cli.scene.window import View, Window, make_view
+
+NUM_BLOCKS = 10  # of refining; splats are removed after each, seeded after each of the first half
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,27 +106,31 @@ class SceneFitter:
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         self._optimise(num_iterations, rng, self._settings())
         self._prune(robot, frames, removed)
-        filled += self.buffer.fill(
-            gap_seeds([(v.frame, v.mappable) for v in views], self.splats(), self.config), self.config.initial_opacity
-        )
+        filled += self._fill_gaps(views)
         self._label(robot)
         self.num_steps += 1
-        terms = [self._evaluate(view, self._planes(view)) for view in views]
-        return self._audit(frames, filled, removed, terms)
+        return self._audit(views, filled, removed)
 
-    def refine(self, num_iterations: int) -> None:
-        """Optimise over the window with learning rates that fall to `final_rate`; for scenes that do not move."""
+    def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
+        """Optimise over the window with learning rates that fall to `final_rate`; for scenes that do not move.
+
+        `progress` is called with the number of iterations done, ten times.
+        """
         rng = np.random.default_rng([self.seed, self.num_steps, 1])
-        final = self.config.final_rate
-        blocks = 10
-        for block in range(blocks):
-            rate = final ** (block / (blocks - 1))
-            self._optimise(num_iterations // blocks, rng, self._settings(rate, rate * self.config.refine_geometry))
-            views = [*self.window.newest, *self.window.keyframes]
-            nowhere = np.zeros(self.config.max_splats, bool)
-            self._remove(nowhere, self._floating([view.frame for view in views]))
-            if block < blocks // 2:
-                self._seed(views)
+        views = [*self.window.newest, *self.window.keyframes]
+        nowhere = np.zeros(self.config.max_splats, bool)
+        filled, removed = Filled(added=0, relocated=0, unmet=0), Counter[str]()
+        for block in range(NUM_BLOCKS):
+            rate = self.config.final_rate ** (block / (NUM_BLOCKS - 1))
+            done = num_iterations * block // NUM_BLOCKS
+            count = num_iterations * (block + 1) // NUM_BLOCKS - done
+            self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
+            removed.update(self._remove(nowhere, self._floating([view.frame for view in views])))
+            if block < NUM_BLOCKS // 2:
+                filled += self._seed(views)
+            progress(done + count)
+        filled += self._fill_gaps(views)
+        return self._audit(views, filled, dict(removed))
 
     def splats(self) -> SplatSet:
         """The live splats."""
@@ -199,6 +206,18 @@ class SceneFitter:
             self.density = density_for(sources, int(self.config.fill * self.config.max_splats), self.config)
         live = self.buffer.centers[self.buffer.is_alive]
         seeds = seeds_at(sources, live, self.density, self.config)
+        reserve = int(self.config.gap_reserve * self.config.max_splats)
+        return self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve)
+
+    def _fill_gaps(self, views: Sequence[View]) -> Filled:
+        """Put splats where a measured surface is far from every sphere."""
+        seeds = gap_seeds(
+            [(view.frame, view.mappable) for view in views],
+            self.occupancy.occupied_centers(),
+            self.occupancy.config.voxel,
+            self.splats(),
+            self.config,
+        )
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _optimise(self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings) -> None:
@@ -250,14 +269,9 @@ class SceneFitter:
             max_radius=c.max_radius,
         )
 
-    def _audit(
-        self,
-        frames: Sequence[RgbdFrame],
-        filled: Filled,
-        removed: dict[str, int],
-        terms: Sequence[LossTerms],
-    ) -> AuditRow:
+    def _audit(self, views: Sequence[View], filled: Filled, removed: dict[str, int]) -> AuditRow:
         c, buffer = self.config, self.buffer
+        terms = [self._evaluate(view, self._planes(view)) for view in views]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
         image = [
             c.lambda_color * ((1 - c.lambda_dssim) * t.l1 + c.lambda_dssim * t.dssim)
@@ -267,8 +281,8 @@ class SceneFitter:
         ]
         squared = float(np.mean([t.squared for t in terms]))
         return AuditRow(
-            stamp_ns=max(frame.stamp_ns for frame in frames),
-            cameras=tuple(frame.camera for frame in frames),
+            stamp_ns=max(view.frame.stamp_ns for view in views),
+            cameras=tuple(view.frame.camera for view in views),
             alive=int(buffer.is_alive.sum()),
             dead=int((buffer.was_used & ~buffer.is_alive).sum()),
             added=filled.added,

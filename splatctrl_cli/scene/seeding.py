@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
@@ -111,30 +112,53 @@ def seeds_at(
     )
 
 
-def gap_seeds(views: Sequence[tuple[RgbdFrame, Bool]], splats: SplatSet, config: SceneConfig) -> Seeds:
-    """Seeds where a measured point lies further than `max_gap` [m] from every splat's sphere.
+def gap_seeds(
+    views: Sequence[tuple[RgbdFrame, Bool]],
+    occupied: Float32,
+    voxel: float,
+    splats: SplatSet,
+    config: SceneConfig,
+) -> Seeds:
+    """Seeds where a measured surface lies further than `max_gap` [m] from every splat's sphere.
 
-    Each view is a frame and its mappable pixels (H, W). Blending can cover a pixel from splats that are not near its
-    surface; a distance field cannot. Every third pixel and row is looked at, against the eight nearest splats.
+    Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Looked at are every
+    third pixel and row of the views (a frame and its mappable pixels (H, W)), and the centres (K, 3) of occupied
+    voxels, which remember surfaces that nothing shows now; a centre may be half a voxel off its surface.
     """
     sources = []
-    tree = cKDTree(splats.centers) if len(splats) else None
     for frame, mappable in views:
         points, mask = world_points(frame), mappable.copy()
         mask[np.arange(len(mask)) % 3 != 0] = False
         mask[:, np.arange(mask.shape[1]) % 3 != 0] = False
-        if tree is not None:
-            count = min(8, len(splats))
-            distance, nearest = tree.query(points[mask], k=np.arange(1, count + 1))
-            mask[mask] = (distance - splats.radii[nearest]).min(axis=1) > config.max_gap
+        mask[mask] = _gap(points[mask], splats) > config.max_gap
         if mask.any():
             sources.append(candidates(frame, points, mask))
+    forgotten = occupied[_gap(occupied, splats) > config.max_gap + 0.5 * voxel]
+    if len(forgotten):
+        sources.append(_of_voxels(forgotten, splats))
     if not sources:
         return NO_SEEDS
     all_points, colors, pixel = _joined(sources)
     level = cube_levels(all_points, colors, config.max_radius / config.radius_per_edge, 1)[0]
     everything, no_splats = np.ones(len(level.points), bool), np.zeros((0, 3), np.float32)
     return _seeds_of(level, everything, pixel, no_splats, config)
+
+
+def _gap(points: NDArray[np.floating], splats: SplatSet) -> Float64:
+    """Distance (K,) [m] of points (K, 3) to the nearest sphere among the eight splats with the nearest centres."""
+    if not len(splats) or not len(points):
+        return np.full(len(points), np.inf)
+    count = min(8, len(splats))
+    distance, nearest = cKDTree(splats.centers).query(points, k=np.arange(1, count + 1))
+    return np.asarray((distance - splats.radii[nearest]).min(axis=1), np.float64)
+
+
+def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:
+    """Voxel centres (K, 3) in the colour of the nearest splat, grey where there is none."""
+    colors = np.full((len(centers), 3), 0.5, np.float32)
+    if len(splats):
+        colors = splats.colors[cKDTree(splats.centers).query(centers)[1]]
+    return Candidates(points=centers, colors=colors, pixels=np.zeros(len(centers), np.float32))
 
 
 def _joined(sources: Sequence[Candidates]) -> tuple[Float32, Float32, float]:

@@ -124,3 +124,15 @@ def test_no_splat_of_a_robot_that_left_stays_behind() -> None:
 def test_voxels_smaller_than_the_largest_radius_are_refused() -> None:
     with pytest.raises(UsageError, match="at least as large"):
         SceneFitter(CONFIG, OccupancyConfig(voxel=0.01), WORKSPACE)
+
+
+def test_refining_a_scene_that_stands_still_improves_it_and_is_audited() -> None:
+    target = fitter()
+    views = [frame(k, block=0.2, x=x, camera="camera") for k, x in enumerate((-0.1, 0.0, 0.1))]
+    before = target.step(views)
+    done: list[int] = []
+    row = target.refine(55, done.append)
+    assert done == [5, 11, 16, 22, 27, 33, 38, 44, 49, 55]
+    assert row.psnr > before.psnr
+    assert row.alive == len(target.splats())
+    assert row.alive == before.alive + row.added + row.relocated - sum(row.removed.values())

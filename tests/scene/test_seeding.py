@@ -162,6 +162,10 @@ def test_a_measured_surface_far_from_every_sphere_is_seeded() -> None:
         labels=np.zeros(count, np.uint8),
         density=np.zeros(count, np.float32),
     )
-    seeds = gap_seeds([(seen, inside_workspace(seen, world_points(seen), WORKSPACE))], splats, CONFIG)
+    views = [(seen, inside_workspace(seen, world_points(seen), WORKSPACE))]
+    nothing = np.zeros((0, 3), np.float32)
+    seeds = gap_seeds(views, nothing, 0.02, splats, CONFIG)
     assert 5 < len(seeds) < 60
     assert np.linalg.norm(seeds.centers[:, :2], axis=1).max() < 0.12
+    forgotten = np.float32([[0.3, 0.3, 0.4], [0.3, 0.3, 0.0]])
+    assert gap_seeds([], forgotten, 0.02, splats, CONFIG).centers.tolist() == forgotten[:1].tolist()
