@@ -54,9 +54,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return 0
     except OSError as error:
-        return _fail(error, f"{error.filename or 'system'}: {error.strerror or error}", 6, verbose)
+        return _fail_to_read_or_write(error, verbose)
     except Exception as error:
         return _fail(error, f"internal error: {type(error).__name__}: {error}; please report it", 70, verbose)
+
+
+def _fail_to_read_or_write(error: OSError, verbose: int) -> int:
+    from splatctrl_cli.io.output import is_write_failure
+
+    reason = error.strerror or error
+    if is_write_failure(error):
+        return _fail(error, f"{error.filename or 'output'}: writing failed: {reason}; make room", 6, verbose)
+    line = f"{error.filename or 'input'}: cannot be read: {reason}; check the path and its permissions"
+    return _fail(error, line, 4, verbose)
 
 
 def _fail(error: BaseException, line: str, code: int, verbose: int) -> int:

@@ -1,5 +1,6 @@
 """Outputs that appear whole or not at all, and the ``run.json`` in every output folder."""
 
+import errno
 import hashlib
 import json
 import platform
@@ -13,15 +14,27 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import SplatCtrlError, UsageError, WriteError
+from splatctrl_cli.errors import UsageError, WriteError
+
+_WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG})
+
+
+def is_write_failure(error: OSError, output: Path | None = None) -> bool:
+    """Whether `error` came from writing: a disk that is full or broken, or a file in `output`. Else from reading."""
+    if error.errno in _WRITE_FAILURES:
+        return True
+    if output is None or not isinstance(error.filename, str):
+        return False
+    return Path(error.filename).absolute().is_relative_to(output.absolute())
 
 
 @contextmanager
 def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
     """Yield ``NAME.partial`` (an empty folder, or a file name to write to); rename it to `path` on success.
 
-    Refused input (a SplatCtrlError) leaves nothing behind; an interrupted run leaves ``NAME.partial``.
-    Raises UsageError when `path` exists without `force`, or its parent cannot be written; WriteError on a full disk.
+    A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``.
+    Raises UsageError when `path` exists without `force`, or its parent cannot be written; WriteError where
+    `is_write_failure` (a full disk); every other error as it is.
     """
     if path.exists() and not force:
         raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
@@ -38,12 +51,14 @@ def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
     try:
         yield partial
         _replace(partial, path)
-    except SplatCtrlError:
+    except Exception as error:
         _remove(partial)
+        if isinstance(error, OSError) and is_write_failure(error, partial):
+            raise WriteError(
+                f"{error.filename or path}: writing failed: {error.strerror or error}",
+                remedy="make room, or give another --out",
+            ) from error
         raise
-    except OSError as error:
-        _remove(partial)
-        raise WriteError(f"{error.filename or path}: writing failed: {error.strerror or error}") from error
 
 
 def _replace(partial: Path, path: Path) -> None:

@@ -155,6 +155,7 @@ def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_p
     assert_refused(splatctrl(*arguments, "--config", tmp_path / "none.toml"), 4, "none.toml: no such file")
     (tmp_path / "bad.toml").write_text("[scene\n")
     assert_refused(splatctrl(*arguments, "--config", tmp_path / "bad.toml"), 2, "bad.toml: not valid TOML")
+    assert_refused(splatctrl(*arguments, "--config", tmp_path), 4, "cannot be read: Is a directory; check the path")
     assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, got 'many'")
     assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=-5"), 2, "expected above 0, got -5")
     assert_refused(splatctrl(*arguments, "--seed=-1"), 2, "--seed: expected 0 or more, got -1")
@@ -279,6 +280,14 @@ sys.exit(main(sys.argv[1:]))
     stderr = running.communicate(timeout=30)[1]
     assert (running.returncode, stderr) == (130, "splatctrl: interrupted\n")
     assert [path.name for path in tmp_path.iterdir()] == [partial.name]
+
+
+def test_results_that_cannot_be_printed_are_exit_6(work: Work) -> None:
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "splatctrl_cli", "info", str(work.log)]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
+    assert done.returncode == 6
+    assert done.stderr == "splatctrl: output: writing failed: No space left on device; make room\n"
 
 
 def test_a_failed_gate_is_exit_1_and_keeps_the_output(work: Work, tmp_path: Path) -> None:

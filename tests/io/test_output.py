@@ -69,3 +69,29 @@ def test_a_full_disk_is_a_write_error_and_leaves_nothing(tmp_path: Path) -> None
     ):
         raise OSError(28, "No space left on device", str(partial / "a"))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_of_the_output_that_cannot_be_written_is_a_write_error(tmp_path: Path) -> None:
+    with (
+        pytest.raises(WriteError, match=r"Is a directory.*another --out"),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        partial.write_text("a folder")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_input_that_cannot_be_read_is_no_write_error_and_leaves_nothing(tmp_path: Path) -> None:
+    with (
+        pytest.raises(FileNotFoundError),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        (partial / "a").write_text("1")
+        (tmp_path / "input").read_text()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fault_of_our_own_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), output_path(tmp_path / "out", force=False, is_folder=False) as partial:
+        partial.write_text("1")
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
