@@ -44,7 +44,14 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="one setting (repeatable)"
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
-    parser.add_argument("--threads", type=int, default=0, help="threads (default: one per core)")
+    add_threads(parser)
+
+
+def add_threads(parser: argparse.ArgumentParser) -> None:
+    """``--threads``."""
+    parser.add_argument(
+        "--threads", type=int, default=0, help="threads, at most 16 or one per core (default: one per core)"
+    )
 
 
 def add_gates(parser: argparse.ArgumentParser) -> None:

@@ -7,7 +7,16 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_gates, add_output, check_gates, table
+from splatctrl_cli.cli.common import (
+    Console,
+    Subparsers,
+    add_command,
+    add_gates,
+    add_output,
+    add_threads,
+    check_gates,
+    table,
+)
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 
@@ -45,7 +54,7 @@ def register(subparsers: Subparsers) -> None:
         help="render each view from the newest snapshot not later than it, or all from the final splats",
     )
     parser.add_argument("--allow-training", action="store_true", help="also score cameras that trained the scene")
-    parser.add_argument("--threads", type=int, default=0, help="threads (default: one per core)")
+    add_threads(parser)
     add_source(parser)
     add_output(parser, default="none, the scores are only printed", what="folder for scores and pictures")
     add_gates(parser)

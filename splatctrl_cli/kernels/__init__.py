@@ -19,6 +19,14 @@ def _best() -> Any:
 native: Any = _best()
 
 
+MIN_CAP = 16  # threads that may be asked for on any machine
+
+
 def num_threads(requested: int = 0) -> int:
-    """`requested`, or one thread per processor this process may use when it is 0."""
-    return requested if requested > 0 else len(os.sched_getaffinity(0))
+    """`requested`, but at most 16 or one per processor, whichever is more; one per processor where it is 0.
+
+    A processor is one that this process may use. The cap keeps thousands of threads from taking minutes to start;
+    results are the same for any number.
+    """
+    processors = len(os.sched_getaffinity(0))
+    return min(requested, max(MIN_CAP, processors)) if requested > 0 else processors
