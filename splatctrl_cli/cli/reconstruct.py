@@ -58,6 +58,8 @@ def run(args: argparse.Namespace) -> int:
     console, stopwatch, config = Console(args), Stopwatch(), _config(args)
     source = _open(args)
     robot = _robot(args, source)
+    for doubt in () if robot is None else robot.doubts:
+        console.log(f"warning: {doubt}")
     out = args.out or Path("scene")
     with output_path(out, force=args.force, is_folder=True) as partial:
         fitted = _Reconstruction(args, config, source, robot, partial)

@@ -85,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
     with output_path(out, force=args.force, is_folder=True) as folder:
         with stopwatch.stage("read"):
             inputs = _read(args, config)
+        for doubt in inputs.model.doubts:
+            console.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
             replayed = _audited(inputs, config) if args.mode == "audit" else _driven(args, inputs, config, console)
         with stopwatch.stage("truth"):

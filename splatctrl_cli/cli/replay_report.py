@@ -48,6 +48,8 @@ def metrics_of(replay: Replay) -> Metrics:
     audit = replay.audit
     exact = audit.clearance["exact"].distance
     metrics: Metrics = {
+        "num_spheres": len(replay.model.sphere_set.radii),
+        "num_bare_links": len(replay.model.bare_links),
         "num_states": len(audit.stamp_ns),
         "num_before_scene": replay.num_before_scene,
         "duration_s": float(audit.stamp_ns[-1] - audit.stamp_ns[0]) * 1e-9,

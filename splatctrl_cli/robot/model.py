@@ -22,7 +22,8 @@ class RobotModel:
     """Kinematics, limits and collision spheres of one arm; everything in the world frame, SI units, float64.
 
     joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: what
-    `frame_pose` knows; urdf: the file it came from; left_out: links of the sphere file that the URDF does not have.
+    `frame_pose` knows; urdf: the file it came from; left_out: links of the sphere file that the URDF does not have;
+    bare_links: links with a body in the URDF and no sphere.
     """
 
     def __init__(
@@ -32,6 +33,8 @@ class RobotModel:
         spheres: SphereSet,
         T_world_base: Float64,
         left_out: Sequence[str],
+        *,
+        are_links_renamed: bool,
     ) -> None:
         self._model = model
         self._data = model.createData()
@@ -39,7 +42,10 @@ class RobotModel:
         self.T_world_base = T_world_base
         self.joint_names: tuple[str, ...] = tuple(str(name) for name in model.names)[1:]
         self.sphere_set = spheres
-        self.left_out = left_out
+        self.left_out = tuple(left_out)
+        self.are_links_renamed = are_links_renamed
+        covered = set(spheres.links)
+        self.bare_links = tuple(link for link in urdf.solid_links if link not in covered)
         self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
         rows = [joint.idx_q for joint in model.joints][1:]
         self.lower: Float64 = np.where(self._is_wrapped, -np.inf, model.lowerPositionLimit[rows])
@@ -75,12 +81,30 @@ class RobotModel:
         except (ValueError, RuntimeError) as error:
             raise InputError(f"{urdf}: not a URDF that can be built: {error}") from None
         model = _without(model, dict(locked or {}), urdf)
-        left_out: tuple[str, ...] = ()
+        T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
-            sphere_set = spheres_of(file)
-        else:
-            sphere_set, left_out = matched_links(read_spheres(spheres), file, spheres)
-        return cls(file, model, sphere_set, np.eye(4) if T_world_base is None else T_world_base, left_out)
+            return cls(file, model, spheres_of(file), T, (), are_links_renamed=False)
+        asked = read_spheres(spheres)
+        sphere_set, left_out = matched_links(asked, file, spheres)
+        is_renamed = not set(asked.links) & set(file.links)
+        return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What a person should know before trusting a clearance of these spheres; a sentence each."""
+        sentences = []
+        if self.bare_links:
+            sentences.append(
+                f"{self.urdf.path.name}: no sphere stands for {', '.join(self.bare_links)}; "
+                "nothing is said of the clearance of these links"
+            )
+        if self.left_out:
+            sentences.append(
+                f"spheres of {', '.join(self.left_out)} are left out: {self.urdf.path.name} has no such link"
+            )
+        if self.are_links_renamed:
+            sentences.append("sphere links were matched without the first part of their names; is it the same robot?")
+        return tuple(sentences)
 
     @property
     def num_joints(self) -> int:

@@ -30,7 +30,8 @@ class Shape:
 class UrdfFile:
     """The checked text of a URDF, its link names, (parent, child) links of its joints and its collision shapes.
 
-    num_meshes counts the collision meshes, which are not among the shapes.
+    num_meshes counts the collision meshes, which are not among the shapes. solid_links have a collision or visual
+    element: there is something to bump into.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class UrdfFile:
     parents: tuple[tuple[str, str], ...]
     shapes: tuple[Shape, ...]
     num_meshes: int
+    solid_links: tuple[str, ...]
 
 
 def read_urdf(path: Path) -> UrdfFile:
@@ -68,8 +70,21 @@ def read_urdf(path: Path) -> UrdfFile:
                 num_meshes += 1
             else:
                 shapes.append(shape)
+    solid = tuple(
+        str(link.get("name"))
+        for link in root.findall("link")
+        if link.find("collision") is not None or link.find("visual") is not None
+    )
     parents = tuple((joint.find("parent").get("link"), joint.find("child").get("link")) for joint in joints)
-    return UrdfFile(path=path, text=text, links=links, parents=parents, shapes=tuple(shapes), num_meshes=num_meshes)
+    return UrdfFile(
+        path=path,
+        text=text,
+        links=links,
+        parents=parents,
+        shapes=tuple(shapes),
+        num_meshes=num_meshes,
+        solid_links=solid,
+    )
 
 
 def _parse(path: Path) -> tuple[str, Any]:

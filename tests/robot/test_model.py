@@ -202,3 +202,19 @@ def test_a_sphere_set_for_a_sister_robot_fits_by_link_number(real_data: Path) ->
     fingers = {"fr3_finger_joint1": 0.04, "fr3_finger_joint2": 0.04}
     hand = RobotModel.from_urdf(real_data / "franka_description/expanded/fr3_hand.urdf", yaml, locked=fingers)
     assert (hand.num_joints, hand.left_out, len(hand.sphere_set.radii)) == (7, (), 61)
+
+
+def test_links_without_a_sphere_are_said(sample_data: Path, real_data: Path, tmp_path: Path) -> None:
+    urdf = sample_data / "tabletop" / "robot.urdf"
+    assert RobotModel.from_urdf(urdf, sample_data / "tabletop" / "robot_spheres.yaml").doubts == ()
+    few = tmp_path / "few.yaml"
+    few.write_text(
+        "collision_spheres: {link3: [{center: [0, 0, 0], radius: 0.05}], gripper: [{center: [0, 0, 0], radius: 0.1}]}"
+    )
+    model = RobotModel.from_urdf(urdf, few)
+    assert "link3" not in model.bare_links
+    assert {"link0", "link7", "hand"} <= set(model.bare_links)
+    assert "no sphere stands for link0" in model.doubts[0]
+    assert "gripper" in model.doubts[1]
+    foreign = real_data / "robot_spheres/curobo/curobo/content/configs/robot/franka.yml"
+    assert any("same robot" in doubt for doubt in RobotModel.from_urdf(urdf, foreign).doubts)
