@@ -1,11 +1,13 @@
 """What subcommands share: common options, tables and JSON on stdout, log lines on stderr, gates."""
 
 import argparse
+import difflib
 import json
+import math
 import operator
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +59,12 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
 def add_gates(parser: argparse.ArgumentParser) -> None:
     """``--require 'metric>=value'``."""
     parser.add_argument(
-        "--require", action="append", default=[], metavar="METRIC>=VALUE", help="fail (exit 1) unless it holds"
+        "--require",
+        action="append",
+        default=[],
+        type=_gate,
+        metavar="METRIC>=VALUE",
+        help="fail (exit 1) unless it holds",
     )
 
 
@@ -107,20 +114,25 @@ def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 
 
+def check_gate_names(requirements: Sequence[str], names: Collection[str]) -> None:
+    """Raise UsageError for a requirement on a metric that is not among `names`; to be called before the work."""
+    for requirement in requirements:
+        name, _, _ = _parse_gate(requirement)
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
+            choices = ", ".join(list(names)[:8]) + (", ..." if len(names) > 8 else "")
+            raise UsageError(
+                f"--require {requirement}: unknown metric",
+                remedy=f"did you mean {near[0]}?" if near else f"known here: {choices}",
+            )
+
+
 def check_gates(requirements: Sequence[str], metrics: Mapping[str, float | None]) -> None:
     """Raise GateFailed naming every requirement that does not hold; a metric that is None fails its gate."""
+    check_gate_names(requirements, metrics)
     failed = []
     for requirement in requirements:
-        match = re.fullmatch(r"\s*([\w.]+)\s*(>=|<=|>|<)\s*(\S+)\s*", requirement)
-        if not match:
-            raise UsageError(f"--require {requirement}: expected METRIC>=VALUE (or <=, >, <)")
-        name, comparison, text = match.groups()
-        if name not in metrics:
-            raise UsageError(f"--require {requirement}: unknown metric", remedy=f"known here: {', '.join(metrics)}")
-        try:
-            bound = float(text)
-        except ValueError:
-            raise UsageError(f"--require {requirement}: {text!r} is not a number") from None
+        name, comparison, bound = _parse_gate(requirement)
         value = metrics[name]
         if value is None or not _COMPARISONS[comparison](value, bound):
             failed.append(
@@ -128,6 +140,27 @@ def check_gates(requirements: Sequence[str], metrics: Mapping[str, float | None]
             )
     if failed:
         raise GateFailed("gate failed: " + "; ".join(failed))
+
+
+def _gate(text: str) -> str:
+    """`text` itself, for argparse. Raises UsageError where it is no requirement."""
+    _parse_gate(text)
+    return text
+
+
+def _parse_gate(requirement: str) -> tuple[str, str, float]:
+    """Metric, comparison and bound."""
+    match = re.fullmatch(r"\s*([\w.]+)\s*(>=|<=|>|<)\s*(\S+)\s*", requirement)
+    try:
+        bound = float(match[3]) if match else math.nan
+    except ValueError:
+        bound = math.nan
+    if not match or not math.isfinite(bound):
+        raise UsageError(
+            f"--require {requirement}: expected METRIC>=NUMBER (or <=, >, <)",
+            remedy="quote it for the shell, like --require 'psnr_seen>=20'",
+        )
+    return match[1], match[2], bound
 
 
 def _plain(value: object) -> object:

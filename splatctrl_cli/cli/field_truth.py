@@ -16,6 +16,7 @@ from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Bool, DistanceGrid, Float64, RgbdFrame
 from splatctrl_cli.simulate.truth import Truth, load_truth
 
+FIELDS = ("hard", "gpdf")  # channels of the grid that are compared
 MAX_CELLS = 200_000  # a larger grid is compared at this many cells, drawn with the seed
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
@@ -60,7 +61,7 @@ def compare_with_truth(
         raise NotEvaluableError(f"{truth_path}: no cell of the grid lies within {BANDS[-1][1]} m outside an object")
     seen = _seen(surface[is_near], log, source.cameras, stamp_ns)
     in_workspace = np.ones_like(seen) if source.workspace is None else source.workspace.contains(surface[is_near])
-    fields = {name: grid.channels[name].reshape(-1)[drawn[is_near]].astype(np.float64) for name in ("hard", "gpdf")}
+    fields = {name: grid.channels[name].reshape(-1)[drawn[is_near]].astype(np.float64) for name in FIELDS}
     health: Any = grid.header["health"]
     return Comparison(
         accuracy=field_accuracy(fields, distance[is_near], seen & in_workspace, median_radius=health["radius"]),

@@ -14,6 +14,7 @@ from splatctrl_cli.cli.common import (
     add_gates,
     add_output,
     add_threads,
+    check_gate_names,
     check_gates,
     table,
 )
@@ -62,9 +63,11 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
+    from splatctrl_cli.evaluate.score import metric_names
     from splatctrl_cli.io.output import Stopwatch, output_path
     from splatctrl_cli.io.scene_folder import open_scene
 
+    check_gate_names(args.require, (*metric_names(), "num_skipped"))
     console, stopwatch = Console(args), Stopwatch()
     scene = open_scene(args.scene)
     source = _open_reference(args)

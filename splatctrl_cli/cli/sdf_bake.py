@@ -13,6 +13,7 @@ from splatctrl_cli.cli.common import (
     add_config,
     add_gates,
     add_output,
+    check_gate_names,
     check_gates,
     configured,
     table,
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
     from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 
 FORMATS = ("npz", "vti")
+SUMMARY_METRICS = (
+    *("num_splats", "num_splats_left_out", "num_cells", "voxel", "length_scale", "median_radius", "median_spacing"),
+    *("never_seen_share", "num_warnings"),
+)
 
 
 def register(subparsers: Subparsers) -> None:
@@ -67,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
     formats, labels = _names(args.formats, FORMATS, "--formats"), _labels(args.include)
     if (args.truth is None) != (args.seen_by is None):
         raise UsageError("--truth and --seen-by: expected both or neither")
+    check_gate_names(args.require, _metric_names(with_truth=args.truth is not None))
     config = configured(args)
     config = replace(config, field=_field_config(config.field, args))
     out = args.out or Path("field")
@@ -203,17 +209,25 @@ def _shown(value: Any) -> str:
     return " x ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
+def _metric_names(*, with_truth: bool) -> tuple[str, ...]:
+    """The names of `_metrics`, known before anything is baked."""
+    from splatctrl_cli.cli.field_truth import FIELDS
+    from splatctrl_cli.evaluate.field_accuracy import metric_names
+
+    return (*SUMMARY_METRICS, *(metric_names(FIELDS) if with_truth else ()))
+
+
 def _metrics(result: Mapping[str, Any]) -> dict[str, float | None]:
     """Numbers a gate can name: those of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
-    metrics: dict[str, float | None] = {
-        name: value for name, value in result.items() if isinstance(value, int | float)
-    }
+    from splatctrl_cli.evaluate.field_accuracy import band_name
+
+    metrics: dict[str, float | None] = {name: result[name] for name in SUMMARY_METRICS}
     accuracy = result.get("accuracy")
     if accuracy is None:
         return metrics
     for where in ("everywhere", "seen"):
         for field, bands in accuracy[where].items():
             for band in bands:
-                place = f"{where}.{field}.{band['lower'] * 100:g}_{band['upper'] * 100:g}cm"
+                place = f"{where}.{field}.{band_name(band['lower'], band['upper'])}"
                 metrics |= {f"{place}.{name}": band[name] for name in band if name not in {"lower", "upper"}}
     return metrics | {f"over_estimate.{name}": value for name, value in accuracy["over_estimate"].items()}

@@ -1,7 +1,7 @@
 """How far a distance field is from the true distance, by band of true distance."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,20 @@ class FieldAccuracy:
     def as_dict(self) -> dict[str, object]:
         """Plain values, as written to ``accuracy.json``."""
         return {**asdict(self), "holds": self.over_estimate.holds}
+
+
+def metric_names(field_names: Sequence[str]) -> tuple[str, ...]:
+    """Flat names of the numbers in a FieldAccuracy: ``seen.hard.0_2cm.rmse``, ``over_estimate.count``."""
+    figures = [f.name for f in fields(BandAccuracy) if f.name not in {"lower", "upper"}]
+    bands = [band_name(lower, upper) for lower, upper in BANDS]
+    places = [f"{where}.{name}.{band}" for where in ("everywhere", "seen") for name in field_names for band in bands]
+    over = [f"over_estimate.{f.name}" for f in fields(OverEstimate)]
+    return (*(f"{place}.{figure}" for place in places for figure in figures), *over)
+
+
+def band_name(lower: float, upper: float) -> str:
+    """``0_2cm`` for a band of true distance [m]."""
+    return f"{lower * 100:g}_{upper * 100:g}cm"
 
 
 def field_accuracy(

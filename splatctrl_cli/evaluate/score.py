@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -89,6 +89,15 @@ def score_view(*, view: str, color: Float32, depth: Float32, frame: RgbdFrame, s
         seen=score_region(seen),
         all=score_region(np.ones(frame.depth.shape, dtype=np.bool_)),
     )
+
+
+def metric_names() -> tuple[str, ...]:
+    """The names of `total_score`, known before anything is scored."""
+    depth = ("pixels", *(f.name for f in fields(DepthErrors) if f.name != "num_pixels"), "coverage")
+    names = ["num_views", "valid_share", "seen_share"]
+    for region in ("seen", "all"):
+        names += [f"psnr_{region}", f"ssim_{region}", *(f"depth_{name}_{region}" for name in depth)]
+    return tuple(names)
 
 
 def total_score(views: Sequence[ViewScore]) -> dict[str, float]:

@@ -210,6 +210,13 @@ def test_a_gate_that_fails_leaves_the_scores_and_exits_1(scored: Path, capsys: p
     assert (scored / "score" / "score.json").is_file()
 
 
+def test_a_gate_on_an_unknown_metric_is_refused_before_anything_is_rendered(
+    scored: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakeScene, "splats_at", lambda scene, stamp_ns: pytest.fail("rendered"))
+    assert run(scored, "--require", "num_skipped<=1", "--require", "sharpness>=1") == 2
+
+
 def test_a_view_whose_psnr_is_infinite_lets_no_gate_pass(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scored, "--json", "--require", "psnr_all>=1") == 1
     done = capsys.readouterr()
@@ -235,7 +242,10 @@ def test_a_training_camera_is_scored_only_when_allowed(scored: Path, capsys: pyt
     [
         (["--cameras", "cam9"], 2, "has no camera 'cam9'; known here: cam0, cam3"),
         (["--cameras", ","], 2, "has no camera ','"),
-        (["--require", "sharpness>=1"], 2, "unknown metric"),
+        (["--require", "sharpness>=1"], 2, "unknown metric; known here: num_views, valid_share, "),
+        (["--require", "psnr_sen>=1"], 2, "unknown metric; did you mean psnr_seen?"),
+        (["--require", "psnr_seen"], 2, "--require psnr_seen: expected METRIC>=NUMBER"),
+        (["--require", "psnr_seen>=nan"], 2, "--require psnr_seen>=nan: expected METRIC>=NUMBER"),
         (["--scan", "scan1"], 2, "--scan scan1: only with --dtu"),
         (["--dtu", "root"], 2, "not allowed with argument"),
     ],

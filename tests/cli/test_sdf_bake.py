@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.cli.field_truth import FIELDS
+from splatctrl_cli.cli.sdf_bake import SUMMARY_METRICS
+from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.io.grid import read_npz
 from splatctrl_cli.io.scene_folder import SceneWriter
 from splatctrl_cli.io.splats import write_ply
@@ -66,6 +69,9 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
     [
         (["--box=1,2"], 2, "expected six numbers"),
         (["--box=a,b,c,d,e,f"], 2, "expected six numbers"),
+        (["--require", "num_cell>1"], 2, "unknown metric; did you mean num_cells?"),
+        (["--require", "seen.hard.0_2cm.rmse<1"], 2, "unknown metric; known here: num_splats"),
+        (["--require", "num_cells=1"], 2, "expected METRIC>=NUMBER (or <=, >, <); quote it for the shell"),
         (["--formats", "obj"], 2, "--formats obj: expected some of: npz, vti"),
         (["--include", "cat"], 2, "--include cat: expected some of: robot, human"),
         (["--voxel", "0.0001"], 2, "is free; give a larger --voxel"),
@@ -109,6 +115,8 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     )
     assert result.returncode == 0, result.stderr
     accuracy = json.loads((tmp_path / "field" / "accuracy.json").read_text())
+    metrics = json.loads((tmp_path / "field" / "run.json").read_text())["metrics"]
+    assert sorted(metrics) == sorted((*SUMMARY_METRICS, *metric_names(FIELDS))), "as checked before baking"
     assert accuracy["num_seen"] > 50
     assert accuracy["holds"] is True
     assert f"of {accuracy['num_seen']} seen cells" in result.stdout

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.evaluate.score import PROTOCOL, ViewScore, as_json, score_view, total_score
+from splatctrl_cli.evaluate.score import PROTOCOL, ViewScore, as_json, metric_names, score_view, total_score
 from splatctrl_cli.records import Bool, Float32, Intrinsics, RgbdFrame
 
 H, W = 20, 30
@@ -115,3 +115,8 @@ def test_json_holds_none_for_what_is_no_number() -> None:
 
 def test_the_protocol_names_every_kind_of_figure() -> None:
     assert {"average", "all", "seen", "mask", "psnr", "ssim", "depth"} <= set(PROTOCOL)
+
+
+def test_the_names_of_the_totals_are_known_beforehand() -> None:
+    total = total_score([score(perfect(), np.ones((H, W), np.float32), NONE)])
+    assert sorted(metric_names()) == sorted(total)
