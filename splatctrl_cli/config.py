@@ -143,7 +143,9 @@ def load_config(path: Path | None, assignments: typing.Sequence[str]) -> Config:
         key, separator, text = assignment.partition("=")
         section, dot, name = key.strip().partition(".")
         if not separator or not dot:
-            raise UsageError(f"--set {assignment}: expected section.key=value")
+            raise UsageError(
+                f"--set {assignment}: expected section.key=value", remedy="write it like --set scene.max_splats=3000"
+            )
         config = _merge(config, {section: {name: _parse_value(text.strip())}}, where=f"--set {assignment}")
     _check_ranges(config)
     return config
@@ -151,26 +153,71 @@ def load_config(path: Path | None, assignments: typing.Sequence[str]) -> Config:
 
 _POSITIVE = (
     *("scene.max_splats", "scene.snapshot_every", "scene.min_radius", "scene.max_radius", "scene.radius_per_edge"),
-    *("occupancy.voxel", "occupancy.max_range", "occupancy.ray_stride"),
+    *("scene.fill", "scene.final_rate", "occupancy.voxel", "occupancy.max_range", "occupancy.ray_stride"),
+    *("occupancy.log_odds_hit", "occupancy.log_odds_limit", "field.voxel", "field.length_scale"),
 )
-_SHARES = ("scene.initial_opacity", "scene.min_opacity", "occupancy.free_below", "occupancy.occupied_above")
+_AT_LEAST_ZERO = (
+    *("scene.lambda_dssim", "scene.lambda_color", "scene.lambda_depth", "scene.lambda_reg", "scene.lambda_opacity"),
+    *("scene.lambda_mde", "scene.min_depth_error", "scene.max_gap", "scene.gap_reserve", "scene.hole_opacity"),
+    *("scene.iterations_per_step", "scene.first_iterations", "scene.refine_iterations", "scene.refine_geometry"),
+    *("scene.lr_center", "scene.lr_log_radius", "scene.lr_color", "scene.lr_logit_opacity", "scene.window"),
+    *("scene.keyframe_distance", "scene.keyframe_angle", "occupancy.min_range", "occupancy.see_through"),
+    *("occupancy.uncertain_patience", "occupancy.robot_margin", "field.noise", "field.padding", "scene.noise"),
+)
+_SHARES = (
+    *("scene.initial_opacity", "scene.min_opacity"),
+    *("occupancy.free_below", "occupancy.occupied_above"),
+)
+_AT_MOST_ONE = ("scene.lambda_dssim", "scene.hole_opacity", "scene.gap_reserve", "scene.fill", "scene.final_rate")
+_ORDERED = (
+    ("scene.min_radius", "scene.max_radius"),
+    ("scene.min_depth_error", "scene.max_depth_error"),
+    ("occupancy.free_below", "occupancy.occupied_above"),
+)
 
 
 def _check_ranges(config: Config) -> None:
-    """Raise UsageError for a scene or occupancy value that nothing can be fitted with.
+    """Raise UsageError for a scene, occupancy or field value that nothing can be made with.
 
-    What a field or a controller can run with is checked where those are made.
+    What a controller can run with is checked where it is made.
     """
     values = {f"{section}.{key}": value for section, keys in config.as_dict().items() for key, value in keys.items()}
     for name in _POSITIVE:
-        if not values[name] > 0:
-            raise UsageError(f"{name}: expected above 0, got {values[name]:g}")
+        _check(values[name] > 0, name, "above 0", values[name])
+    for name in _AT_LEAST_ZERO:
+        _check(values[name] >= 0, name, "0 or more", values[name])
     for name in _SHARES:
-        if not 0 < values[name] < 1:
-            raise UsageError(f"{name}: expected between 0 and 1, got {values[name]:g}")
-    for low, high in (("scene.min_radius", "scene.max_radius"), ("occupancy.free_below", "occupancy.occupied_above")):
-        if values[low] > values[high]:
-            raise UsageError(f"{low}: expected at most {high} = {values[high]:g}, got {values[low]:g}")
+        _check(0 < values[name] < 1, name, "between 0 and 1", values[name])
+    for name in _AT_MOST_ONE:
+        _check(values[name] <= 1, name, "at most 1", values[name])
+    for low, high in _ORDERED:
+        _check(values[low] <= values[high], low, f"at most {high} = {values[high]:g}", values[low])
+    _check_occupancy(config.occupancy)
+
+
+def _check_occupancy(config: OccupancyConfig) -> None:
+    _check(config.log_odds_miss < 0, "occupancy.log_odds_miss", "below 0", config.log_odds_miss)
+    _check(
+        config.max_range > config.min_range,
+        "occupancy.max_range",
+        f"above occupancy.min_range = {config.min_range:g}",
+        config.max_range,
+    )
+    needed = max(
+        math.log(config.occupied_above / (1 - config.occupied_above)),
+        math.log((1 - config.free_below) / config.free_below),
+    )  # a voxel's log-odds must be able to pass both thresholds
+    _check(
+        config.log_odds_limit > needed,
+        "occupancy.log_odds_limit",
+        f"above {needed:.3g}, the log-odds of the thresholds",
+        config.log_odds_limit,
+    )
+
+
+def _check(holds: bool, name: str, expected: str, value: float) -> None:
+    if not holds:
+        raise UsageError(f"{name}: expected {expected}, got {value:g}", remedy="see docs/config.md")
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -197,7 +244,7 @@ def _merge(target: T, values: dict[str, Any], *, where: str, prefix: str = "") -
     for name, value in values.items():
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-            choices = f"did you mean {prefix}{near[0]}?" if near else f"known here: {', '.join(known)}"
+            choices = f"did you mean {prefix}{near[0]}?" if near else f"known here: {_some(known)}"
             raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
         current = getattr(target, name)
         if is_dataclass(current) and not isinstance(current, type):
@@ -207,6 +254,11 @@ def _merge(target: T, values: dict[str, Any], *, where: str, prefix: str = "") -
         else:
             changes[name] = _checked(value, hints[name], f"{where}: {prefix}{name}")
     return replace(target, **changes)
+
+
+def _some(names: typing.Collection[str]) -> str:
+    """The first eight; the rest is in docs/config.md."""
+    return ", ".join(list(names)[:8]) + (", ... (docs/config.md has all)" if len(names) > 8 else "")
 
 
 def _checked(value: Any, hint: Any, where: str) -> Any:

@@ -40,7 +40,7 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         ("scene.max_splat=9", "unknown key scene.max_splat; did you mean scene.max_splats?"),
         ("scen.max_splats=9", "unknown key scen; did you mean scene?"),
         ("scene.zzz=9", "unknown key scene.zzz; known here: max_splats"),
-        ("scene=9", "expected section.key=value"),
+        ("scene=9", "expected section.key=value; write it like --set scene.max_splats=3000"),
         ("scene.max_splats", "expected section.key=value"),
         ("scene.max_splats=2.5", "expected int, got 2.5"),
         ("scene.max_splats=true", "expected int, got True"),
@@ -51,6 +51,20 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         ("scene.initial_opacity=2", "scene.initial_opacity: expected between 0 and 1, got 2"),
         ("scene.min_radius=0.5", "scene.min_radius: expected at most scene.max_radius = 0.02, got 0.5"),
         ("occupancy.ray_stride=0", "occupancy.ray_stride: expected above 0, got 0"),
+        ("scene.fill=1.5", "scene.fill: expected at most 1, got 1.5"),
+        ("scene.noise=-1", "scene.noise: expected 0 or more, got -1"),
+        ("scene.window=-1", "scene.window: expected 0 or more, got -1"),
+        ("scene.lambda_depth=-0.1", "scene.lambda_depth: expected 0 or more, got -0.1"),
+        ("scene.lr_center=-1", "scene.lr_center: expected 0 or more, got -1"),
+        ("scene.max_depth_error=0.01", "scene.min_depth_error: expected at most scene.max_depth_error = 0.01"),
+        ("occupancy.log_odds_miss=0", "occupancy.log_odds_miss: expected below 0, got 0"),
+        ("occupancy.log_odds_hit=-1", "occupancy.log_odds_hit: expected above 0, got -1"),
+        ("occupancy.log_odds_limit=0.8", "occupancy.log_odds_limit: expected above 0.847, the log-odds of"),
+        ("occupancy.min_range=-1", "occupancy.min_range: expected 0 or more, got -1"),
+        ("occupancy.max_range=0.2", "occupancy.max_range: expected above occupancy.min_range = 0.2, got 0.2"),
+        ("field.voxel=0", "field.voxel: expected above 0, got 0"),
+        ("field.length_scale=-1", "field.length_scale: expected above 0, got -1; see docs/config.md"),
+        ("field.noise=-1e-6", "field.noise: expected 0 or more, got -1e-06"),
         (
             "occupancy.free_below=0.9",
             "occupancy.free_below: expected at most occupancy.occupied_above = 0.7, got 0.9",
@@ -61,6 +75,13 @@ def test_what_cannot_be_is_named(assignment: str, words: str) -> None:
     with pytest.raises(UsageError) as refused:
         load_config(None, [assignment])
     assert words in str(refused.value)
+
+
+def test_an_unknown_key_that_is_near_none_is_told_a_few_of_the_known() -> None:
+    with pytest.raises(UsageError) as refused:
+        load_config(None, ["scene.zzz=9"])
+    assert str(refused.value).count(",") == 8
+    assert str(refused.value).endswith("... (docs/config.md has all)")
 
 
 def test_files_that_are_missing_or_no_toml_are_named(tmp_path: Path) -> None:
