@@ -30,7 +30,7 @@ def integrate_depth(
     stride: int,
     num_threads: int,
 ) -> None:
-    """Add one depth image (H, W) [m] to log_odds and num_updates (X, Y, Z); marks (X, Y, Z) is zeroed scratch.
+    """Add one depth image (H, W) [m] to log_odds and num_updates (X, Y, Z); marks (2, X, Y, Z) is zeroed scratch.
 
     intrinsics (6,): fx, fy, cx, cy, width, height.
     """

@@ -29,7 +29,7 @@ class OccupancyMap:
         self.log_odds: Float32 = np.zeros(shape, np.float32)
         self.num_updates: NDArray[np.uint16] = np.zeros(shape, np.uint16)
         self.entity: NDArray[np.uint8] = np.zeros(shape, np.uint8)
-        self._marks: NDArray[np.uint8] = np.zeros(shape, np.uint8)
+        self._marks: NDArray[np.uint8] = np.zeros((2, *shape), np.uint8)
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
     def integrate(self, frame: RgbdFrame) -> None:

@@ -38,7 +38,7 @@ void bind_occupancy(nb::module_& m) {
         camera.cy = static_cast<float>(k[3]);
         camera.width = static_cast<int>(k[4]);
         camera.height = static_cast<int>(k[5]);
-        if (num_updates.size() != log_odds.size() || marks.size() != log_odds.size() || intrinsics.size() != 6 ||
+        if (num_updates.size() != log_odds.size() || marks.size() != 2 * log_odds.size() || intrinsics.size() != 6 ||
             T_world_camera.size() != 16 ||
             depth.size() != static_cast<std::size_t>(camera.width) * camera.height || stride < 1) {
           throw std::invalid_argument("expected voxel arrays of one shape, intrinsics (6,), T (4, 4), depth (H, W)");

@@ -10,7 +10,10 @@
 namespace splatctrl {
 namespace {
 
-constexpr std::uint8_t kMiss = 1, kHit = 2;
+// Marks are only ever set to one, so that threads may set the same one: no order, no lost update.
+void mark(std::uint8_t* voxel) {
+  if (!__atomic_load_n(voxel, __ATOMIC_RELAXED)) __atomic_store_n(voxel, std::uint8_t{1}, __ATOMIC_RELAXED);
+}
 
 void set_bits(std::uint8_t* voxel, std::uint8_t bits) {
   if ((__atomic_load_n(voxel, __ATOMIC_RELAXED) & bits) != bits) __atomic_fetch_or(voxel, bits, __ATOMIC_RELAXED);
@@ -40,28 +43,34 @@ struct Segment {
 };
 
 // Amanatides and Woo's walk: marks every voxel the segment passes, up to but not including the end voxel.
-void walk(const VoxelGrid& grid, const Segment& s, const int* end, std::uint8_t* marks) {
-  int cell[3], step[3];
+void walk(const VoxelGrid& grid, const Segment& s, const int* end, std::uint8_t* misses) {
+  int cell[3], step[3], border[3];
+  std::ptrdiff_t stride[3] = {static_cast<std::ptrdiff_t>(grid.size[1]) * grid.size[2], grid.size[2], 1};
   double next[3], delta[3];
   for (int axis = 0; axis < 3; ++axis) {
     const double start = s.from[axis] + s.enter * s.direction[axis];
     cell[axis] = std::clamp(static_cast<int>(std::floor(start)), 0, grid.size[axis] - 1);
     step[axis] = s.direction[axis] > 0.0 ? 1 : -1;
+    border[axis] = step[axis] > 0 ? grid.size[axis] : -1;
+    stride[axis] *= step[axis];
     if (s.direction[axis] == 0.0) {
       next[axis] = delta[axis] = std::numeric_limits<double>::infinity();
     } else {
-      const double border = cell[axis] + (step[axis] > 0 ? 1.0 : 0.0);
-      next[axis] = (border - s.from[axis]) / s.direction[axis];
+      next[axis] = (cell[axis] + (step[axis] > 0 ? 1.0 : 0.0) - s.from[axis]) / s.direction[axis];
       delta[axis] = std::abs(1.0 / s.direction[axis]);
     }
   }
-  for (;;) {
-    if (cell[0] == end[0] && cell[1] == end[1] && cell[2] == end[2]) return;
-    set_bits(marks + index_of(grid, cell), kMiss);
+  std::uint8_t* voxel = misses + index_of(grid, cell);
+  const bool ends_inside = end[0] >= 0 && end[0] < grid.size[0] && end[1] >= 0 && end[1] < grid.size[1] &&
+                           end[2] >= 0 && end[2] < grid.size[2];
+  const std::uint8_t* last = ends_inside ? misses + index_of(grid, end) : nullptr;
+  while (voxel != last) {
+    mark(voxel);
     const int axis = next[0] < next[1] ? (next[0] < next[2] ? 0 : 2) : (next[1] < next[2] ? 1 : 2);
     if (next[axis] > s.leave) return;
     cell[axis] += step[axis];
-    if (cell[axis] < 0 || cell[axis] >= grid.size[axis]) return;
+    if (cell[axis] == border[axis]) return;
+    voxel += stride[axis];
     next[axis] += delta[axis];
   }
 }
@@ -74,6 +83,8 @@ void integrate_depth(const VoxelGrid& grid, float* log_odds, std::uint16_t* num_
   const double scale = 1.0 / grid.voxel;
   double eye[3];
   for (int axis = 0; axis < 3; ++axis) eye[axis] = (T[4 * axis + 3] - grid.origin[axis]) * scale + 0.5;
+  const std::size_t slab = static_cast<std::size_t>(grid.size[1]) * grid.size[2];
+  std::uint8_t *hits = marks, *misses = marks + slab * grid.size[0];
   constexpr int kRows = 8;
   parallel_for((camera.height + kRows - 1) / kRows, num_threads, [&](int chunk) {
     for (int v = chunk * kRows; v < std::min(camera.height, (chunk + 1) * kRows); ++v) {
@@ -90,19 +101,18 @@ void integrate_depth(const VoxelGrid& grid, float* log_odds, std::uint16_t* num_
           end[axis] = static_cast<int>(std::floor(s.from[axis] + s.direction[axis]));
           ends_inside = ends_inside && end[axis] >= 0 && end[axis] < grid.size[axis];
         }
-        if (ends_inside) set_bits(marks + index_of(grid, end), kHit);
-        if (u % settings.stride == 0 && v % settings.stride == 0 && s.clip(grid)) walk(grid, s, end, marks);
+        if (ends_inside) mark(hits + index_of(grid, end));
+        if (u % settings.stride == 0 && v % settings.stride == 0 && s.clip(grid)) walk(grid, s, end, misses);
       }
     }
   });
-  const std::size_t slab = static_cast<std::size_t>(grid.size[1]) * grid.size[2];
   parallel_for(grid.size[0], num_threads, [&](int i) {
     for (std::size_t k = i * slab; k < (i + 1) * slab; ++k) {
-      if (!marks[k]) continue;
-      const float change = marks[k] & kHit ? settings.hit : settings.miss;
+      if (!hits[k] && !misses[k]) continue;
+      const float change = hits[k] ? settings.hit : settings.miss;
       log_odds[k] = std::clamp(log_odds[k] + change, -settings.limit, settings.limit);
       if (num_updates[k] < 65535) ++num_updates[k];
-      marks[k] = 0;
+      hits[k] = misses[k] = 0;
     }
   });
 }

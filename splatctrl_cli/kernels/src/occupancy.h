@@ -20,7 +20,7 @@ struct OccupancySettings {
 };
 
 // Walks a ray from the camera to each pixel's depth: voxels passed are misses, the last one a hit; a hit outweighs
-// every miss of the same image. marks (X Y Z) uint8 is scratch and must be zero; it is zero again afterwards.
+// every miss of the same image. marks (2 X Y Z) uint8 is scratch and must be zero; it is zero again afterwards.
 void integrate_depth(const VoxelGrid& grid, float* log_odds, std::uint16_t* num_updates, std::uint8_t* marks,
                      const Camera& camera, const double* T_world_camera, const float* depth,
                      const OccupancySettings& settings, int num_threads);
