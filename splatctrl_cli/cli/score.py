@@ -19,7 +19,7 @@ from splatctrl_cli.cli.common import (
     table,
 )
 from splatctrl_cli.cli.source_options import add_source, source_options
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.evaluate.pictures import ComparisonRow
@@ -143,16 +143,13 @@ def _cameras_to_score(
         if args.allow_training and recorded:
             return recorded
         raise UsageError(
-            f"{where}: every camera trained the scene ({', '.join(recorded)})",
-            remedy="hold one out of reconstruct, or give --allow-training",
+            f"{where}: each camera is called like one that trained the scene ({', '.join(recorded)})",
+            remedy="give the views that reconstruct left out as --holdout, or --allow-training",
         )
     cameras = tuple(dict.fromkeys(_words(args.cameras)))
     unknown = [name for name in cameras if name not in recorded]
-    if unknown or not cameras:
-        raise UsageError(
-            f"--cameras {args.cameras}: {where} has no camera {unknown[0] if unknown else args.cameras!r}",
-            remedy=f"known here: {', '.join(recorded)}",
-        )
+    if unknown:
+        raise InputError(f"{where}: no camera {unknown[0]!r}", remedy=f"use one of: {', '.join(recorded)}")
     trained = [name for name in cameras if name in training]
     if trained and not args.allow_training:
         raise UsageError(
@@ -194,6 +191,12 @@ def _score_views(
             f"{args.reference or args.dtu}: no view of {', '.join(cameras)} to score; {num_early} lie before the "
             "first snapshot of the scene",
             remedy="give the recording that the scene was reconstructed from, or other --cameras",
+        )
+    if not any(view.seen.share for view in scores.views):
+        raise NotEvaluableError(
+            f"{args.reference or args.dtu}: no pixel of {', '.join(cameras)} was seen by a training camera "
+            f"({', '.join(scene.cameras)})",
+            remedy="is it the same world and the same scene? give the recording that reconstruct was given",
         )
     return scores
 
@@ -294,10 +297,14 @@ def _lines(result: dict[str, Any]) -> list[str]:
     lines.insert(len(lines) - 1, lines[1])
     lines.append("")
     lines.append(
-        f"{metrics['num_views']:.0f} views scored, {metrics['num_skipped']:.0f} before the first snapshot; "
+        f"{_count(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
         f"depth: median of the absolute error; seen: by {', '.join(result['training_cameras'])} within 2 cm"
     )
     return lines
+
+
+def _count(number: float, noun: str) -> str:
+    return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
 
 
 def _cells(figures: dict[str, Any]) -> list[str]:
