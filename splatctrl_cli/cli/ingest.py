@@ -6,6 +6,7 @@ from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
 from splatctrl_cli.cli.source_options import add_source, source_options
+from splatctrl_cli.errors import UsageError
 
 
 def register(subparsers: Subparsers) -> None:
@@ -19,6 +20,7 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.io.capture import write_capture
+    from splatctrl_cli.io.image_folder import HOLDOUT
     from splatctrl_cli.io.output import Stopwatch, output_path, write_run
     from splatctrl_cli.io.source import open_source
 
@@ -27,6 +29,10 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path(args.source.stem + ".capture")
     with stopwatch.stage("survey"):
         source = open_source(args.source, options)
+    if set(source.cameras) == {HOLDOUT}:
+        raise UsageError(
+            f"--cameras {args.cameras}: leaves no camera to train with", remedy="name another, or leave it out"
+        )
     console.log(f"{source.name}: cameras {', '.join(source.cameras)}; {len(source.joint_names)} joints")
 
     def progress(num_frames: int) -> None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def add_source(parser: argparse.ArgumentParser) -> None:
     """The options of a source, in a group of their own."""
     group = parser.add_argument_group("input")
-    group.add_argument("--cameras", metavar="A,B", help="only these cameras")
+    group.add_argument("--cameras", type=_Listed("--cameras"), metavar="A,B", help="only these cameras")
     group.add_argument(
         "--camera",
         action="append",
@@ -36,7 +36,12 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--joint-topic", metavar="TOPIC", help="JointState topic (default: /joint_states)")
     group.add_argument("--root", type=Path, metavar="DIR", help="folder of the images that a .toml describes")
-    group.add_argument("--holdout", metavar="0,6", help="frames of an image folder that become camera 'holdout'")
+    group.add_argument(
+        "--holdout",
+        type=_Listed("--holdout"),
+        metavar="0,6",
+        help="frames of an image folder that become camera 'holdout'",
+    )
 
 
 def source_options(args: argparse.Namespace) -> "SourceOptions":
@@ -60,8 +65,20 @@ def source_options(args: argparse.Namespace) -> "SourceOptions":
     )
 
 
+class _Listed:
+    """Lets argparse take a list that names something, as it is. Raises UsageError for one that names nothing."""
+
+    def __init__(self, option: str) -> None:
+        self.option = option
+
+    def __call__(self, text: str) -> str:
+        if not _names(text):
+            raise UsageError(f"{self.option} {text!r}: expected names, got none", remedy="leave the option out")
+        return text
+
+
 def _names(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(name for name in text.split(",") if name)
+    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _topics(text: str) -> "CameraTopics":

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.io.folder_description import (
     CameraTable,
     Description,
@@ -286,6 +286,11 @@ def _views(description: Description, camera: str, options: SourceOptions, loss: 
             f"{description.path}: {description.poses.file} has no pose for any image ({names[0]}, ...)",
             remedy="check [poses] format and the numbers in the file names",
         )
+    if held and all(view.camera == HOLDOUT for view in views):
+        remedy = "leave some to train with"
+        if options.holdout is not None:
+            raise UsageError(f"--holdout: all {len(views)} views are held out", remedy=remedy)
+        raise InputError(f"{description.path}: [split] holds all {len(views)} views out", remedy=remedy)
     return sorted(views, key=lambda view: (view.stamp_ns, view.name))
 
 

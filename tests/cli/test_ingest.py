@@ -8,6 +8,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.io.source import open_source
 from tests.io.make_log import LogRecipe, make_log
+from tests.io.test_image_folder import described
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -38,6 +39,34 @@ def test_an_existing_capture_is_kept_without_force(tmp_path: Path, capsys: pytes
     assert (out / "precious").exists()
     assert run(capsys, "ingest", log, "-o", out, "--force")[0] == 0
     assert not (out / "precious").exists()
+
+
+@pytest.mark.parametrize("option", ["--cameras", "--holdout"])
+@pytest.mark.parametrize("text", ["", ",", " , "])
+def test_a_list_that_names_nothing_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, text: str
+) -> None:
+    code, printed, error = run(capsys, "ingest", tmp_path / "log.mcap", f"{option}={text}")
+    assert (code, printed) == (2, "")
+    assert (
+        error
+        == f"splatctrl: {option} {' '.join(repr(text).split())}: expected names, got none; leave the option out\n"
+    )
+
+
+def test_spaces_around_names_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    assert run(capsys, "ingest", log, "--cameras", "cam1, cam0", "-o", tmp_path / "x.capture")[0] == 0
+
+
+def test_a_capture_without_a_camera_to_train_with_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views, out = described(tmp_path, "[split]\nholdout = [7]\n"), tmp_path / "x.capture"
+    code, _, error = run(capsys, "ingest", views, "--cameras", "holdout", "-o", out)
+    assert code == 2
+    assert error == "splatctrl: --cameras holdout: leaves no camera to train with; name another, or leave it out\n"
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

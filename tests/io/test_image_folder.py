@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, project, transform_points
 from splatctrl_cli.io.source import SourceOptions, open_source
 from splatctrl_cli.records import Record, RgbdFrame
@@ -77,6 +77,13 @@ def test_held_out_frames_belong_to_another_camera(tmp_path: Path, entry: str) ->
     assert [frame.camera for frame in frames] == ["camera", "camera", "holdout"]  # name 8 is at position 2
     kept = frames_of(list(open_source(path, SourceOptions(holdout=(entry,), cameras=("camera",))).records()))
     assert len(kept) == 2
+
+
+def test_holding_every_view_out_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--holdout: all 3 views are held out; leave some"):
+        open_source(described(tmp_path / "a"), SourceOptions(holdout=("0", "1", "2")))
+    path = described(tmp_path / "b", "[split]\nholdout = [7, 8, 12]\n")
+    assert "[split] holds all 3 views out; leave some to train with" in refusal(path)
 
 
 def test_pixel_centres_at_a_half_move_the_principal_point(tmp_path: Path) -> None:
