@@ -26,7 +26,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="NAME,...",
         help="only splats of these labels: object, robot, human (default: all)",
     )
-    add_output(parser, default="SCENE with the suffix .ply", what="the PLY file to write")
+    add_output(parser, default="SCENE.ply, beside SCENE", what="the PLY file to write")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.io.splats import read_ply, write_ply
 
     source = _splat_file(args.scene)
-    out = args.out or Path(f"{args.scene.resolve().name.removesuffix('.ply')}.ply")
+    out = args.out or _beside(args.scene)
     if out.resolve() == source.resolve():
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
     splats, comments = read_ply(source)
@@ -71,6 +71,11 @@ def _lines(result: dict[str, Any]) -> list[str]:
         f"read back and rendered from {result['num_views_compared']} views ({100 * result['covered_share']:.0f} % of "
         f"their pixels covered): largest pixel difference {result['largest_pixel_difference']:.2g}",
     ]
+
+
+def _beside(scene: Path) -> Path:
+    place = scene if scene.name.strip(".") else scene.resolve()  # . and .. have no name of their own
+    return place.with_name(f"{place.name.removesuffix('.ply')}.ply")
 
 
 def _splat_file(scene: Path) -> Path:

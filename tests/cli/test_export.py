@@ -54,6 +54,21 @@ def test_a_scene_is_exported_and_renders_the_same(scene: Path, capsys: pytest.Ca
     assert comments["exported_from"].startswith("splats.ply sha256 ")
 
 
+@pytest.mark.parametrize(("place", "given"), [("elsewhere", "../scene"), ("scene", "."), ("scene/below", "..")])
+def test_without_out_the_file_lies_beside_the_scene(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, place: str, given: str
+) -> None:
+    (scene.parent / place).mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(scene.parent / place)
+    assert run(given) == 0
+    assert len(read_ply(scene.parent / "scene.ply")[0]) == 400
+
+
+def test_without_out_a_splat_file_is_not_written_over_itself(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(scene / "splats.ply") == 2
+    assert "is the input itself; give another --out" in capsys.readouterr().err
+
+
 def test_labels_choose_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = scene.parent / "out.ply"
     assert run(scene / "splats.ply", "--labels", "object,human", "-o", out) == 0
