@@ -100,7 +100,7 @@ def accuracy_lines(compared: Comparison) -> list[str]:
     header = ("cells", "field", "true cm", "count", "mean mm", "rmse mm", "median mm", "95 % mm", "max mm")
     rows: list[tuple[object, ...]] = []
     accuracy = compared.accuracy
-    for where, fields in (("all", accuracy.everywhere), ("seen", accuracy.seen)):
+    for where, fields in (("seen", accuracy.seen), ("all", accuracy.everywhere)):
         for name, bands in fields.items():
             for band in bands:
                 values = (band.mean, band.rmse, band.median, band.over_95, band.over_max)
@@ -118,4 +118,9 @@ def accuracy_lines(compared: Comparison) -> list[str]:
         )
     if compared.num_outside_workspace:
         verdict += f"; {compared.num_outside_workspace} cells before seen surfaces outside the workspace do not count"
-    return ["error = field - truth, positive where clearance is over-estimated", *table(header, rows), verdict]
+    return [
+        "error = field - truth, positive where clearance is over-estimated",
+        *table(header, rows),
+        "seen: cells whose nearest true surface a camera saw; all: also those before backs that none saw",
+        verdict,
+    ]

@@ -92,11 +92,12 @@ def run(args: argparse.Namespace) -> int:
             )
         grid.header["digests"] = source.digests
         grid.header["stamp_ns"] = source.stamp_ns
-        for warning in _warnings(grid):
+        warnings = _warnings(grid, has_occupancy=source.occupancy is not None)
+        for warning in warnings:
             console.log(f"warning: {warning}")
         with stopwatch.stage("write"):
             _write(partial, grid, formats)
-        result = _summary(grid)
+        result = _summary(grid, len(warnings))
         lines = table(("field", ""), [(name.replace("_", " "), _shown(value)) for name, value in result.items()])
         if args.truth is not None:
             with stopwatch.stage("accuracy"):
@@ -156,6 +157,10 @@ def _box(args: argparse.Namespace, splats: "SplatSet", labels: "frozenset[Label]
             raise UsageError(f"--box {args.box}: expected six numbers x0,y0,z0,x1,y1,z1") from None
         if numbers.shape != (6,):
             raise UsageError(f"--box {args.box}: expected six numbers x0,y0,z0,x1,y1,z1, got {len(numbers)}")
+        if not (np.isfinite(numbers).all() and (numbers[:3] < numbers[3:]).all()):
+            raise UsageError(
+                f"--box {args.box}: expected x0 < x1, y0 < y1, z0 < z1", remedy="give the lower corner first"
+            )
         return Box(lower=numbers[:3], upper=numbers[3:])
     if args.urdf is not None:
         from splatctrl_cli.robot.model import RobotModel
@@ -177,13 +182,15 @@ def _write(folder: Path, grid: "DistanceGrid", formats: tuple[str, ...]) -> None
     write_json(folder / "field.json", {**grid.header, **place})
 
 
-def _warnings(grid: "DistanceGrid") -> tuple[str, ...]:
+def _warnings(grid: "DistanceGrid", *, has_occupancy: bool) -> tuple[str, ...]:
     health = grid.header["health"]
     assert isinstance(health, dict)
+    if has_occupancy and not grid.channels["observed"].any():
+        return (*health["warnings"], "no cell of the grid was ever seen by a camera; check --box")
     return tuple(health["warnings"])
 
 
-def _summary(grid: "DistanceGrid") -> dict[str, Any]:
+def _summary(grid: "DistanceGrid", num_warnings: int) -> dict[str, Any]:
     import numpy as np
 
     observed, used = grid.channels["observed"], grid.header["splats_used"]
@@ -199,7 +206,7 @@ def _summary(grid: "DistanceGrid") -> dict[str, Any]:
         "median_radius": health["radius"],
         "median_spacing": health["spacing"],
         "never_seen_share": float(np.mean(observed == 0)),
-        "num_warnings": len(health["warnings"]),
+        "num_warnings": num_warnings,
     }
 
 

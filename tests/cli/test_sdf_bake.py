@@ -69,6 +69,8 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
     [
         (["--box=1,2"], 2, "expected six numbers"),
         (["--box=a,b,c,d,e,f"], 2, "expected six numbers"),
+        (["--box=0,0,0,1,1,0"], 2, "--box 0,0,0,1,1,0: expected x0 < x1, y0 < y1, z0 < z1; give the lower"),
+        (["--box=0,0,0,1,1,nan"], 2, "--box 0,0,0,1,1,nan: expected x0 < x1"),
         (["--require", "num_cell>1"], 2, "unknown metric; did you mean num_cells?"),
         (["--require", "seen.hard.0_2cm.rmse<1"], 2, "unknown metric; known here: num_splats"),
         (["--require", "num_cells=1"], 2, "expected METRIC>=NUMBER (or <=, >, <); quote it for the shell"),
@@ -120,6 +122,9 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     assert accuracy["num_seen"] > 50
     assert accuracy["holds"] is True
     assert f"of {accuracy['num_seen']} seen cells" in result.stdout
+    rows = [line.split()[:2] for line in result.stdout.splitlines() if line.startswith(("seen  ", "all   "))]
+    assert rows == [[where, name] for where in ("seen", "all") for name in FIELDS for _ in range(4)]
+    assert "all: also those before backs that none saw" in result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -157,6 +162,15 @@ def test_a_scene_is_baked_as_it_was_known_then(
     digests = grid.header["digests"]
     assert isinstance(digests, dict)
     assert ("occupancy.npz" in digests) == (at is None)
+
+
+def test_a_box_that_no_camera_saw_is_warned_about(tmp_path: Path, scene: Path) -> None:
+    result = sdf_bake(scene, "-o", tmp_path / "field", "--box=7,7,7,8,8,8", "--voxel", 0.5, "--json")
+    assert result.returncode == 0, result.stderr
+    assert "warning: no cell of the grid was ever seen by a camera; check --box" in result.stderr
+    assert json.loads(result.stdout)["num_warnings"] == result.stderr.count("warning: ")
+    inside = sdf_bake(scene, "-o", tmp_path / "seen", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1)
+    assert "was ever seen" not in inside.stderr
 
 
 def test_a_time_before_the_scene_was_known_is_refused(tmp_path: Path, scene: Path) -> None:
