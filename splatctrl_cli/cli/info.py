@@ -42,16 +42,17 @@ def _lines(summary: "Summary") -> Iterator[str]:
 
 def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
     for key, value in facts.items():
-        name = str(key).replace("_", " ")
         if isinstance(value, dict):
-            yield f"{indent}{name}:"
+            yield f"{indent}{key}:"
             yield from _facts(value, indent + "  ")
         elif isinstance(value, list):
-            yield f"{indent}{name}: {', '.join(map(str, value)) or '-'}"
+            yield f"{indent}{key}: {', '.join(map(_shown, value)) or '-'}"
         else:
-            yield f"{indent}{name}: {_number(value) if isinstance(value, float) else value}"
+            yield f"{indent}{key}: {_shown(value)}"
 
 
-def _number(value: float) -> str:
-    """Up to six decimals; more digits where the number is small."""
+def _shown(value: object) -> str:
+    """A float with up to six decimals, more digits where it is small; a dash for nothing."""
+    if not isinstance(value, float):
+        return "-" if value is None else str(value)
     return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"

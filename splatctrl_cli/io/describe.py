@@ -1,5 +1,6 @@
 """What a file or folder is and holds, for every kind that the tool reads or writes."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -117,16 +118,39 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
             f"{path}: a folder of no known kind",
             remedy="expected a capture, ROS 2 bag, MVSNet scan or output of splatctrl; for images give their .toml",
         )
+    field = _field_facts(path / "field.json") if "field.json" in names else {}
     kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
+    kind = "field folder" if field else kind
     top = sorted(p for p in path.iterdir())
     rows: list[list[object]] = [[p.name + "/" if p.is_dir() else p.name, _count(p), _size(p)] for p in top]
     facts: dict[str, object] = {"files": len(files), "bytes": sum(p.stat().st_size for p in files)}
     if "splats.ply" in names:
         facts["splats"] = describe_file(path / "splats.ply").facts
-    if "run.json" in names:
-        facts["run"] = describe_file(path / "run.json").facts
+    facts |= field
+    if "run.json" in names and not field:
+        run = describe_file(path / "run.json").facts
+        facts["run"] = {key: value for key, value in run.items() if key != "config"}  # `info run.json` shows it
     grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
     return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
+
+
+FIELD_FORMAT = "splatctrl distance grid"  # as the header of a baked field says
+_FIELD_FACTS = ("voxel", "kernel", "length_scale", "sign", "frame", "labels", "splats_used", "observed", "stamp_ns")
+
+
+def _field_facts(path: Path) -> dict[str, object]:
+    """What a distance grid covers and how it was made; empty where the file is none of ours."""
+    header: Mapping[str, Any] = describe_file(path).facts
+    if header.get("format") != FIELD_FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
+        return {}
+    first, sides = header["first_cell"], [header["voxel"] * (count - 1) for count in header["shape"]]
+    place = {
+        "shape": header["shape"],
+        "extent_m": [round(side, 6) for side in sides],
+        "first_cell": [round(start, 6) for start in first],
+        "last_cell": [round(start + side, 6) for start, side in zip(first, sides, strict=True)],
+    }
+    return {**place, **{key: header[key] for key in _FIELD_FACTS if header.get(key) is not None}}
 
 
 def _describe_capture(path: Path) -> Summary:

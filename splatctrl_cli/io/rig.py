@@ -73,17 +73,20 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
     """What a reconstruction from this log would lack, in words; empty where nothing."""
     found = camera_topics(log, survey, options)
     if not found:
-        lacks = [_no_camera(log, survey).message.removeprefix(f"{log.path}: ")]
+        lacks = [str(_no_camera(log, survey)).removeprefix(f"{log.path}: ")]
         if not survey.of_type(CAMERA_INFO):
-            lacks.append("no CameraInfo topic")
-        return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static)"]
+            lacks.append("no CameraInfo topic; record the colour camera's camera_info")
+        return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static); record it, or give --camera-pose"]
     lacks = []
     for topics in found:
         lacks.extend(_Builder(log, survey, options, topics).problems())
         stamps = [survey.topics[name].stamps_ns for name in (topics.color, topics.depth)]
         gap = nearest_gap_ns(*stamps) * 1e-9
         if gap > options.pairing_tolerance_s:
-            lacks.append(f"camera {topics.name}: colour and depth are never closer than {gap * 1e3:.4g} ms")
+            lacks.append(
+                f"camera {topics.name}: colour and depth are never closer than {gap * 1e3:.4g} ms; give "
+                f"--pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right"
+            )
     return lacks
 
 
@@ -162,7 +165,7 @@ class _Builder:
             try:
                 step()
             except InputError as error:
-                found.append(error.message.removeprefix(f"{self._path}: "))
+                found.append(str(error).removeprefix(f"{self._path}: "))
         return list(dict.fromkeys(found))
 
     @property

@@ -180,3 +180,13 @@ def test_the_sample_log_becomes_a_capture_of_all_its_cameras(
     assert sorted(frames) == ["cam0", "cam1", "cam2", "cam3"]
     assert min(frames.values()) > 20
     assert json.loads(printed)["loss"]["damaged"] == 0
+
+
+def test_info_keeps_names_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = {"command": "x", "inputs": {"robot_spheres.yaml": "12ab"}, "config": {"max_splats": 5}, "stamp_ns": None}
+    (tmp_path / "run.json").write_text(json.dumps(given))
+    code, printed, _ = run(capsys, "info", tmp_path / "run.json")
+    assert code == 0
+    assert "\n    robot_spheres.yaml: 12ab\n" in printed
+    assert "\n    max_splats: 5\n" in printed
+    assert "\n  stamp_ns: -\n" in printed

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.io.capture import write_capture
 from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.source import SourceOptions, open_source
+from splatctrl_cli.io.splats import write_ply
+from splatctrl_cli.records import SplatSet
 from tests.io.make_log import LogRecipe, make_log
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
@@ -57,8 +60,14 @@ def test_topics_come_with_count_rate_size_and_encoding(tmp_path: Path) -> None:
     ],
 )
 def test_what_a_log_lacks_is_said_and_is_no_error(tmp_path: Path, recipe: LogRecipe, said: str) -> None:
-    missing = describe(make_log(tmp_path / "log.mcap", recipe)).missing
+    log = make_log(tmp_path / "log.mcap", recipe)
+    missing = describe(log).missing
     assert any(said in item for item in missing), missing
+    if recipe.num_frames:
+        assert all("; " in item for item in missing), "each with its remedy"
+        with pytest.raises(InputError) as refused:
+            list(open_source(log).records())
+        assert refused.value.remedy in "\n".join(missing), "the one that ingest gives"
 
 
 def test_everything_a_log_lacks_is_said_at_once(tmp_path: Path) -> None:
@@ -113,6 +122,45 @@ def test_a_grid_is_described_without_unpickling(tmp_path: Path) -> None:
     assert summary.facts["header"] == {"frame": "world", "units": "m"}
     assert summary.facts["origin"] == [0.0, 1.0, 2.0]
     assert ["sdf", "3x4x5", "float32"] in list(summary.grids[0].rows)
+
+
+def test_a_field_folder_is_described_by_what_its_grid_covers(tmp_path: Path) -> None:
+    splats = SplatSet(
+        centers=np.zeros((1, 3), np.float32),
+        radii=np.full(1, 0.01, np.float32),
+        colors=np.zeros((1, 3), np.float32),
+        opacities=np.ones(1, np.float32),
+        labels=np.zeros(1, np.uint8),
+        density=np.zeros(1, np.float32),
+    )
+    write_ply(tmp_path / "splats.ply", splats, {})
+    baked = ["--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", "0.1", "-q", "-o", str(tmp_path / "field")]
+    assert main(["sdf-bake", str(tmp_path / "splats.ply"), *baked]) == 0
+    summary = describe(tmp_path / "field")
+    assert summary.kind == "field folder"
+    facts = {key: value for key, value in summary.facts.items() if key not in {"files", "bytes"}}
+    assert facts == {
+        "shape": [3, 3, 5],
+        "extent_m": [0.2, 0.2, 0.4],
+        "first_cell": [-0.1, -0.1, -0.1],
+        "last_cell": [0.1, 0.1, 0.3],
+        "voxel": 0.1,
+        "kernel": "matern",
+        "length_scale": 0.02,
+        "sign": "positive outside",
+        "frame": "world",
+        "labels": ["human", "object"],
+        "splats_used": {"object": 1, "robot": 0, "human": 0},
+        "observed": "no occupancy grid: all never seen",
+    }
+
+
+def test_a_folder_with_anothers_field_json_is_a_run_folder(tmp_path: Path) -> None:
+    (tmp_path / "field.json").write_text('{"shape": 3}')
+    (tmp_path / "run.json").write_text('{"command": "replay", "config": {"scene": {"noise": 1}}, "seed": 0}')
+    summary = describe(tmp_path)
+    assert summary.kind == "run folder"
+    assert summary.facts["run"] == {"command": "replay", "seed": 0}, "its settings are left to info run.json"
 
 
 def test_pickled_arrays_are_named_not_run(tmp_path: Path) -> None:
@@ -192,7 +240,7 @@ def test_the_sensor_message_logs_are_described_and_other_encodings_listed(real_d
     ros = describe(folder / "rosbag2_2025_09_10-13_03_56_0.mcap")
     assert ros.facts["messages"] == 194
     assert any("no depth topic" in item for item in ros.missing)
-    assert "no tf (/tf, /tf_static)" in ros.missing
+    assert "no tf (/tf, /tf_static); record it, or give --camera-pose" in ros.missing
     web = describe(folder / "simple-protobuf.mcap")
     assert {row[2] for row in web.grids[0].rows} == {"json", "protobuf"}
     assert web.damaged == 0
