@@ -66,15 +66,16 @@ def source_options(args: argparse.Namespace) -> "SourceOptions":
 
 
 class _Listed:
-    """Lets argparse take a list that names something, as it is. Raises UsageError for one that names nothing."""
+    """A list for argparse, without spaces around its names. Raises UsageError for one that names nothing."""
 
     def __init__(self, option: str) -> None:
         self.option = option
 
     def __call__(self, text: str) -> str:
-        if not _names(text):
+        names = _names(text)
+        if not names:
             raise UsageError(f"{self.option} {text!r}: expected names, got none", remedy="leave the option out")
-        return text
+        return ",".join(names)
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:

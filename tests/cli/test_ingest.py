@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.cli.main import main
+from splatctrl_cli.cli.main import build_parser, main
 from splatctrl_cli.io.source import open_source
 from tests.io.make_log import LogRecipe, make_log
 from tests.io.test_image_folder import described
@@ -57,6 +57,7 @@ def test_a_list_that_names_nothing_is_refused(
 def test_spaces_around_names_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
     assert run(capsys, "ingest", log, "--cameras", "cam1, cam0", "-o", tmp_path / "x.capture")[0] == 0
+    assert build_parser().parse_args(["ingest", "log", "--cameras", " cam1, cam0,"]).cameras == "cam1,cam0"
 
 
 def test_a_capture_without_a_camera_to_train_with_is_refused(
