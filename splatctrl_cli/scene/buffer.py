@@ -23,6 +23,10 @@ class Seeds:
     def __len__(self) -> int:
         return len(self.radii)
 
+    def select(self, keep: Bool) -> "Seeds":
+        """The seeds where `keep` (K,) is true, in order."""
+        return Seeds(centers=self.centers[keep], radii=self.radii[keep], colors=self.colors[keep])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:

@@ -37,7 +37,7 @@ from splatctrl_cli.scene.seeding import (
 )
 from splatctrl_cli.scene.window import View, Window, make_view
 
-NUM_BLOCKS = 10  # of refining; splats are removed after each, seeded after each of the first half
+NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +126,7 @@ class SceneFitter:
             count = num_iterations * (block + 1) // NUM_BLOCKS - done
             self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
             removed.update(self._remove(nowhere, self._floating([view.frame for view in views])))
-            if block < NUM_BLOCKS // 2:
+            if block < NUM_BLOCKS - 2:
                 filled += self._seed(views)
             progress(done + count)
         filled += self._fill_gaps(views)
@@ -198,9 +198,9 @@ class SceneFitter:
         sources = []
         for view in views:
             mask = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
-            if mask.any():
-                sources.append(candidates(view.frame, world_points(view.frame), mask))
-        if not sources:
+            found = candidates(view.frame, world_points(view.frame), mask)
+            sources.append(found.select(self._is_grounded(found.points, views)))
+        if not any(len(source) for source in sources):
             return Filled(added=0, relocated=0, unmet=0)
         if self.density is None:
             self.density = density_for(sources, int(self.config.fill * self.config.max_splats), self.config)
@@ -218,7 +218,15 @@ class SceneFitter:
             self.splats(),
             self.config,
         )
+        seeds = seeds.select(self._is_grounded(seeds.centers, views))
         return self.buffer.fill(seeds, self.config.initial_opacity)
+
+    def _is_grounded(self, points: Float32, views: Sequence[View]) -> Bool:
+        """Points (K,) that no view sees through: what one sensor measured and another looks past was noise."""
+        is_grounded = np.ones(len(points), bool)
+        for view in views:
+            is_grounded &= ~seen_through(points, view.frame, self.occupancy.config.see_through)
+        return is_grounded
 
     def _optimise(self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings) -> None:
         for view in self.window.schedule(num_iterations, rng):

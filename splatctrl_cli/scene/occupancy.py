@@ -81,10 +81,14 @@ class OccupancyMap:
         return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
 
     def occupied_centers(self) -> Float32:
-        """Centres (K, 3) [m] of occupied voxels that the robot was never in; those it left stay full for a while."""
-        threshold = float(np.log(self.config.occupied_above / (1.0 - self.config.occupied_above)))
-        is_occupied = (self.log_odds > threshold) & (self.entity & SWEPT == 0)
-        return (self.origin + self.config.voxel * np.argwhere(is_occupied)).astype(np.float32)
+        """Centres (K, 3) [m] of voxels that were hit more than once and that the robot was never in.
+
+        One hit may be noise; voxels that the robot left stay full for a while.
+        """
+        config = self.config
+        threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
+        is_occupied = (self.log_odds > max(threshold, 1.5 * config.log_odds_hit)) & (self.entity & SWEPT == 0)
+        return (self.origin + config.voxel * np.argwhere(is_occupied)).astype(np.float32)
 
     def grid(self) -> OccupancyGrid:
         """A copy of the grid as it is now."""

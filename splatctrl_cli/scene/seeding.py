@@ -55,6 +55,13 @@ class Candidates:
     colors: Float32
     pixels: Float32
 
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, keep: Bool) -> "Candidates":
+        """Those where `keep` (K,) is true, in order."""
+        return Candidates(points=self.points[keep], colors=self.colors[keep], pixels=self.pixels[keep])
+
 
 def candidates(frame: RgbdFrame, points_world: Float64, mask: Bool) -> Candidates:
     """What the pixels of a mask (H, W) offer."""
