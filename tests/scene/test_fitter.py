@@ -136,3 +136,14 @@ def test_refining_a_scene_that_stands_still_improves_it_and_is_audited() -> None
     assert row.psnr > before.psnr
     assert row.alive == len(target.splats())
     assert row.alive == before.alive + row.added + row.relocated - sum(row.removed.values())
+
+
+def test_what_one_camera_measures_and_another_sees_through_is_not_mapped() -> None:
+    noisy, clean = frame(x=0.1), frame(x=-0.1, camera="cam1")
+    noisy.depth[25:35, 25:35] = 0.6
+    target = fitter()
+    target.step([noisy, clean])
+    assert on_top(target.splats()) == 0
+    alone = fitter()
+    alone.step([noisy])
+    assert on_top(alone.splats()) > 5
