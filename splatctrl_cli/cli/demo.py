@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, add_threads
 from splatctrl_cli.errors import GateFailed, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="DIR",
         help="what 'splatctrl simulate' wrote (default: sample_data)",
     )
-    parser.add_argument("--threads", type=int, default=0, help="threads (default: one per core)")
+    add_threads(parser)
     add_output(parser, default="demo_output", what="folder for everything the demo makes")
 
 

@@ -12,6 +12,7 @@ from splatctrl_cli.cli.common import (
     add_config,
     add_gates,
     add_output,
+    check_gate_names,
     check_gates,
     configured,
     table,
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
     from splatctrl_cli.scene.time_steps import TimeStep
 
 DAMAGED = 3
+GATED = (
+    *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet"),
+    *("loss", "psnr"),
+)  # what --require can name
 
 
 def register(subparsers: Subparsers) -> None:
@@ -55,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.device == "cuda":
         raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
+    check_gate_names(args.require, GATED)
     console, stopwatch, config = Console(args), Stopwatch(), _config(args)
     source = _open(args)
     robot = _robot(args, source)
@@ -92,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     lines.append("removed: " + (", ".join(f"{n} {reason}" for reason, n in removed.items() if n) or "none"))
     lines += [f"note: {note}" for note in source.loss.notes]
     console.result({"scene": str(out), "metrics": metrics, "removed": removed}, [*lines, f"wrote {out}"])
-    check_gates(args.require, {k: float(v) for k, v in metrics.items() if isinstance(v, int | float)})
+    check_gates(args.require, {name: float(str(metrics[name])) for name in GATED})
     return DAMAGED if source.loss.damaged else 0
 
 
@@ -149,8 +155,11 @@ class _Reconstruction:
         self.config = config
         self.source = source
         self.robot = robot
-        trained = [c for c in source.cameras if c != "holdout"]
-        self.cameras = [c for c in trained if args.cameras is None or c in args.cameras.split(",")]
+        self.cameras = [camera for camera in source.cameras if camera != "holdout"]
+        if not self.cameras:
+            raise UsageError(
+                f"{source.name}: no camera is left to train on", remedy="camera 'holdout' is kept for score"
+            )
         self.writer = SceneWriter(folder, {"format": FORMAT, "frame": "world", "units": "m", "source": source.name})
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []

@@ -58,6 +58,7 @@ def test_gates_decide_the_exit_code(recording: Path, tmp_path: Path, capsys: pyt
         (["LOG", "--cameras", "cam9"], 4, "cam0"),
         (["LOG", "--box=50,50,50,51,51,51"], 4, "no pixel"),
         (["--dtu", "DTU", "--holdout", "a"], 2, "'a'"),
+        (["LOG", "--require", "pnsr>=3"], 2, "did you mean psnr"),
         ([], 2, "SOURCE"),
     ],
 )
