@@ -91,15 +91,19 @@ def run(args: argparse.Namespace) -> int:
         [
             [
                 metrics["time_steps"], last.alive, last.robot, metrics["added"], metrics["relocated"],
-                metrics["unmet"], f"{metrics['psnr']:.2f}", f"{stopwatch.seconds['fit']:.1f}",
+                metrics["unmet"], "-" if last.psnr is None else f"{last.psnr:.2f}", f"{stopwatch.seconds['fit']:.1f}",
             ]
         ],
     )  # fmt: skip
     lines.append("removed: " + (", ".join(f"{n} {reason}" for reason, n in removed.items() if n) or "none"))
     lines += [f"note: {note}" for note in source.loss.notes]
     console.result({"scene": str(out), "metrics": metrics, "removed": removed}, [*lines, f"wrote {out}"])
-    check_gates(args.require, {name: float(str(metrics[name])) for name in GATED})
+    check_gates(args.require, {name: _number(metrics[name]) for name in GATED})
     return DAMAGED if source.loss.damaged else 0
+
+
+def _number(value: object) -> float | None:
+    return None if value is None else float(str(value))
 
 
 def _config(args: argparse.Namespace) -> "Config":
@@ -171,9 +175,18 @@ class _Reconstruction:
 
         scene = self.config.scene
         steps = tqdm(self._steps(), disable=True if console.is_quiet else None, unit=" steps")
+        early: TimeStep | None = None
         for index, step in enumerate(steps):
+            if self.fitter is None and not step.has_depth and self._needs_depth():
+                console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
+                early = early or step
+                continue
             if self.fitter is None:
                 self.fitter = self._new_fitter(step)
+            elif not self.source.has_clock and self.fitter.num_steps == 1:
+                console.log(
+                    "warning: more views than fit in one time step; the last ones are refined on, the rest seed"
+                )
             row = self.fitter.step(step.frames, self._posture(step))
             self.stamps.extend(frame.stamp_ns for frame in step.frames)
             self.rows.append(row)
@@ -181,9 +194,14 @@ class _Reconstruction:
             if index % 10 == 0 and not steps.disable:
                 steps.set_postfix(splats=row.alive, dB=row.psnr)
             if steps.disable and index % 10 == 0:
-                console.log(f"time step {index}: {row.alive} splats, {row.psnr:.1f} dB on its own views")
+                quality = (
+                    "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB on its own views"
+                )
+                console.log(f"time step {index}: {row.alive} splats, {quality}")
             if index % scene.snapshot_every == 0 and self.source.has_clock:
                 self.writer.snapshot(step.stamp_ns, self.fitter.splats())
+        if self.fitter is None and early is not None:
+            self._workspace(early)  # says that there is no depth
         if self.fitter is None:
             raise InputError(
                 f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
@@ -219,6 +237,10 @@ class _Reconstruction:
             seed=self.args.seed,
             threads=self.args.threads,
         )
+
+    def _needs_depth(self) -> bool:
+        """Whether only depth can say where the workspace is."""
+        return self.args.box is None and self.robot is None
 
     def _workspace(self, first: "TimeStep") -> "Box":
         from splatctrl_cli.records import Box

@@ -37,6 +37,8 @@ from splatctrl_cli.scene.seeding import (
 )
 from splatctrl_cli.scene.window import View, Window, make_view
 
+DENSITY_NAMES = ("edge", "tolerance", "num_candidates")
+MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
 
@@ -44,7 +46,8 @@ NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after 
 class AuditRow:
     """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames.
 
-    dead: slots that wait to be reused. unmet: seeds that found no free slot.
+    dead: slots that wait to be reused. unmet: seeds that found no free slot. loss and psnr are
+    None where no view shows anything of the workspace.
     """
 
     stamp_ns: int
@@ -56,8 +59,8 @@ class AuditRow:
     unmet: int
     removed: dict[str, int]
     robot: int
-    loss: float
-    psnr: float
+    loss: float | None
+    psnr: float | None
 
 
 class SceneFitter:
@@ -100,9 +103,10 @@ class SceneFitter:
         self._carry(robot)
         is_trail = self._label(robot)
         removed = self._remove(is_trail, self._floating(frames))
+        is_first = self.density is None
         filled = self._seed(views)
+        is_first = is_first and self.density is not None
         self.window.advance(views)
-        is_first = self.num_steps == 0
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         self._optimise(num_iterations, rng, self._settings())
         self._prune(robot, frames, removed)
@@ -125,7 +129,7 @@ class SceneFitter:
             done = num_iterations * block // NUM_BLOCKS
             count = num_iterations * (block + 1) // NUM_BLOCKS - done
             self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
-            removed.update(self._remove(nowhere, self._floating([view.frame for view in views])))
+            removed.update(self._remove(nowhere, self._floating([view.frame for view in views]), counts_time=False))
             if block < NUM_BLOCKS - 2:
                 filled += self._seed(views)
             progress(done + count)
@@ -172,15 +176,17 @@ class SceneFitter:
         return is_floating & self.buffer.is_alive
 
     def _prune(self, robot: RobotPosture | None, frames: Sequence[RgbdFrame], removed: dict[str, int]) -> None:
-        """Remove what the optimiser moved off the robot or into the air; adds to the counts in `removed`."""
+        """Remove what the optimiser moved off the robot, into the air or out; adds to the counts in `removed`."""
         drifted = self._label(robot)
         self.buffer.kill(drifted)
         floating = self._floating(frames)
         self.buffer.kill(floating)
-        removed["trail"] += int(drifted.sum())
-        removed["free"] += int(floating.sum())
+        outside = self.buffer.is_alive & ~self.workspace.contains(self.buffer.centers)
+        self.buffer.kill(outside)
+        for reason, mask in (("trail", drifted), ("free", floating), ("workspace", outside)):
+            removed[reason] += int(mask.sum())
 
-    def _remove(self, is_trail: Bool, is_floating: Bool) -> dict[str, int]:
+    def _remove(self, is_trail: Bool, is_floating: Bool, *, counts_time: bool = True) -> dict[str, int]:
         reasons = removals(
             self.buffer,
             self.occupancy,
@@ -188,13 +194,14 @@ class SceneFitter:
             self.config.min_opacity,
             is_trail=is_trail,
             is_floating=is_floating,
+            counts_time=counts_time,
         )
         for mask in reasons.values():
             self.buffer.kill(mask)
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
     def _seed(self, views: Sequence[View]) -> Filled:
-        """Fill dead slots at the pixels of M_add; the first time chooses the density that uses `fill` of them."""
+        """Fill dead slots at the pixels of M_add, as densely as uses `fill` of the budget on the first full view."""
         sources = []
         for view in views:
             mask = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
@@ -202,8 +209,10 @@ class SceneFitter:
             sources.append(found.select(self._is_grounded(found.points, views)))
         if not any(len(source) for source in sources):
             return Filled(added=0, relocated=0, unmet=0)
-        if self.density is None:
-            self.density = density_for(sources, int(self.config.fill * self.config.max_splats), self.config)
+        num_candidates = sum(len(source) for source in sources)
+        if self.density is None or num_candidates > MUCH_MORE * self.density.num_candidates:
+            count = max(int(self.config.fill * self.config.max_splats), 1)
+            self.density = density_for(sources, count, self.config)
         live = self.buffer.centers[self.buffer.is_alive]
         seeds = seeds_at(sources, live, self.density, self.config)
         reserve = int(self.config.gap_reserve * self.config.max_splats)
@@ -211,9 +220,10 @@ class SceneFitter:
 
     def _fill_gaps(self, views: Sequence[View]) -> Filled:
         """Put splats where a measured surface is far from every sphere."""
+        occupied = self.occupancy.occupied_centers()
         seeds = gap_seeds(
             [(view.frame, view.mappable) for view in views],
-            self.occupancy.occupied_centers(),
+            occupied[self.workspace.contains(occupied)],
             self.occupancy.config.voxel,
             self.splats(),
             self.config,
@@ -279,7 +289,8 @@ class SceneFitter:
 
     def _audit(self, views: Sequence[View], filled: Filled, removed: dict[str, int]) -> AuditRow:
         c, buffer = self.config, self.buffer
-        terms = [self._evaluate(view, self._planes(view)) for view in views]
+        counted = [view for view in views if view.target.counted.any()]
+        terms = [self._evaluate(view, self._planes(view)) for view in counted]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
         image = [
             c.lambda_color * ((1 - c.lambda_dssim) * t.l1 + c.lambda_dssim * t.dssim)
@@ -287,7 +298,7 @@ class SceneFitter:
             + c.lambda_opacity * t.transmittance
             for t in terms
         ]
-        squared = float(np.mean([t.squared for t in terms]))
+        squared = float(np.mean([t.squared for t in terms])) if terms else None
         return AuditRow(
             stamp_ns=max(view.frame.stamp_ns for view in views),
             cameras=tuple(view.frame.camera for view in views),
@@ -298,8 +309,8 @@ class SceneFitter:
             unmet=filled.unmet,
             removed=removed,
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
-            loss=round(float(np.mean(image)) + c.lambda_reg * opacity, 6),
-            psnr=round(-10.0 * float(np.log10(max(squared, 1e-12))), 4),
+            loss=round(float(np.mean(image)) + c.lambda_reg * opacity, 6) if image else None,
+            psnr=None if squared is None else round(-10.0 * float(np.log10(max(squared, 1e-12))), 4),
         )
 
     def state(self) -> dict[str, NDArray[np.generic]]:
@@ -311,7 +322,7 @@ class SceneFitter:
             "counters": np.array([self.num_steps, self.num_iterations], np.int64),
         }
         if self.density is not None:
-            arrays["density"] = np.array([self.density.edge, self.density.tolerance])
+            arrays["density"] = np.array([getattr(self.density, name) for name in DENSITY_NAMES])
         if self._posture is not None:
             arrays |= {f"posture/{name}": getattr(self._posture, name) for name in POSTURE_NAMES}
         for kind, views in (("newest", self.window.newest), ("keyframe", self.window.keyframes)):
@@ -327,8 +338,8 @@ class SceneFitter:
             getattr(self.occupancy, name)[...] = arrays[name]
         self.num_steps, self.num_iterations = (int(n) for n in arrays["counters"])
         if "density" in arrays:
-            edge, tolerance = (float(x) for x in arrays["density"])
-            self.density = SeedDensity(edge=edge, tolerance=tolerance)
+            edge, tolerance, num_candidates = (float(x) for x in arrays["density"])
+            self.density = SeedDensity(edge=edge, tolerance=tolerance, num_candidates=int(num_candidates))
         if "posture/radii" in arrays:
             self._posture = RobotPosture(**{n: np.asarray(arrays[f"posture/{n}"], float) for n in POSTURE_NAMES})
         self.window = Window(self.config)

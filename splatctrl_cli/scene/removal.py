@@ -51,13 +51,15 @@ def removals(
     *,
     is_trail: Bool,
     is_floating: Bool,
+    counts_time: bool = True,
 ) -> dict[str, Bool]:
     """Masks (M,) of live splats to remove, by reason; each splat under its first reason in `REASONS`.
 
     broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free, or
     a camera sees through it.
     uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot, is no longer.
-    Updates the buffer's count of uncertain time steps. Splats whose surroundings were never seen stay, unless the
+    Updates the buffer's count of uncertain time steps,
+    where this is one. Splats whose surroundings were never seen stay, unless the
     rule is "literal".
     """
     config = occupancy.config
@@ -65,7 +67,8 @@ def removals(
     is_broken: Bool = ~np.all(np.isfinite(buffer.parameters), axis=1)
     value, is_observed = occupancy.occupancy_around(np.where(is_broken[:, None], np.float32(0), centers))
     is_free, is_uncertain = _verdict(value, is_observed, config)
-    buffer.num_uncertain[:] = np.where(is_uncertain, buffer.num_uncertain + 1, 0)
+    if counts_time:
+        buffer.num_uncertain[:] = np.where(is_uncertain, buffer.num_uncertain + 1, 0)
     has_lost_patience = is_uncertain & (
         (buffer.num_uncertain > config.uncertain_patience) | (config.rule == "literal")
     )

@@ -76,23 +76,28 @@ def candidates(frame: RgbdFrame, points_world: Float64, mask: Bool) -> Candidate
 
 @dataclass(frozen=True, kw_only=True)
 class SeedDensity:
-    """How densely to seed: edge [m] of the coarsest cubes, and the detail from which a cube is split."""
+    """How densely to seed: edge [m] of the coarsest cubes, the detail from which a cube is split, and the number of
+    candidate pixels on which both were chosen.
+    """
 
     edge: float
     tolerance: float
+    num_candidates: int = 0
 
 
 def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig) -> SeedDensity:
     """The density that spends at most `count` seeds on the candidates.
 
     Cubes start at the edge at which splats of the largest radius still cover a surface; where that is too many
-    already, at the smallest larger edge (to 5 %) that is not.
+    already, at the smallest larger edge (to 5 %) that is not, but no larger than the cloud.
     """
     points, colors, _ = _joined(sources)
+    extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
     edge = config.max_radius / config.radius_per_edge
-    while len(cube_levels(points, colors, edge, 1)[0].detail) > count:
+    while edge < extent and len(cube_levels(points, colors, edge, 1)[0].detail) > count:
         edge *= 1.05
-    return SeedDensity(edge=edge, tolerance=tolerance_for(cube_levels(points, colors, edge, NUM_LEVELS), count))
+    tolerance = tolerance_for(cube_levels(points, colors, edge, NUM_LEVELS), count)
+    return SeedDensity(edge=edge, tolerance=tolerance, num_candidates=len(points))
 
 
 def seeds_at(

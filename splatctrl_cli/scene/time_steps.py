@@ -9,7 +9,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Box, Float64, JointState, Record, RgbdFrame
 from splatctrl_cli.scene.seeding import world_points
 
-LARGEST_STEP = 32  # frames of a scene without a clock that are taken in together
+LARGEST_STEP = 128  # frames of a scene without a clock that are taken in together; 640x480: 9 MiB each
 LARGEST_GAP_NS = 200_000_000  # a joint state older than this says nothing about a frame
 
 
@@ -28,11 +28,16 @@ class TimeStep:
         """Of the newest frame."""
         return max(frame.stamp_ns for frame in self.frames)
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether any pixel of any frame has a depth."""
+        return any(bool((frame.depth > 0).any()) for frame in self.frames)
+
 
 def time_steps(
     records: Iterator[Record], cameras: Collection[str], *, has_clock: bool, tolerance_ns: int = 20_000_000
 ) -> Iterator[TimeStep]:
-    """Group the frames of `cameras`: with a clock by stamp, else up to 32 views at a time."""
+    """Group the frames of `cameras`: with a clock by stamp, else up to 128 views at a time."""
     frames: list[RgbdFrame] = []
     newest: JointState | None = None
     at_frames: JointState | None = None
@@ -78,7 +83,7 @@ def depth_box(frames: Sequence[RgbdFrame], max_range: float) -> Box:
         names = ", ".join(sorted({frame.camera for frame in frames}))
         raise InputError(
             f"camera {names}: no valid depth within {max_range} m in the first frames",
-            remedy="check the depth topic and scale, or raise occupancy.max_range",
+            remedy="check the depth topic and scale, raise occupancy.max_range, or give a --box",
         )
     lower, upper = np.percentile(joined, [0.5, 99.5], axis=0)
     margin = 0.02 * (upper - lower) + 0.02

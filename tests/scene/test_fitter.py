@@ -147,3 +147,77 @@ def test_what_one_camera_measures_and_another_sees_through_is_not_mapped() -> No
     alone = fitter()
     alone.step([noisy])
     assert on_top(alone.splats()) > 5
+
+
+def test_a_robot_that_moves_keeps_its_splats_and_one_that_jumps_leaves_none() -> None:
+    moved, stayed = fitter(), fitter()
+    for target, x in ((moved, 0.03), (stayed, 0.0)):
+        target.step([frame(0, block=0.2)], posture(0.0))
+        before = target.splats().centers[target.splats().labels == Label.ROBOT, 0].mean()
+        target.config = replace(CONFIG, iterations_per_step=0)
+        target._carry(posture(x))
+        after = target.splats().centers[target.splats().labels == Label.ROBOT, 0].mean()
+        assert abs(after - before - x) < 1e-4
+    jumped = fitter()
+    jumped.step([frame(0, block=0.2)], posture(0.0))
+    away = RobotPosture(centers=np.array([[5.0, 0.0, 0.2]]), radii=np.array([0.12]), T_world_link=np.eye(4)[None])
+    row = jumped.step([frame(1, block=0.2)], away)  # the link did not move: its splats are a trail
+    assert row.removed["trail"] > 0
+    assert row.robot == 0
+
+
+def test_a_blank_or_sparse_start_costs_no_quality() -> None:
+    straight, late, sparse = fitter(), fitter(), fitter()
+    blank, speck = frame(0), frame(0)
+    blank.depth[:] = 0.0
+    speck.depth[:] = 0.0
+    speck.depth[28:33, 38:43] = 1.0
+    rows = []
+    for target, first in ((straight, None), (late, blank), (sparse, speck)):
+        if first is not None:
+            target.step([first])
+        rows.append([target.step([frame(k)]) for k in (1, 2)][-1])
+    want = rows[0].psnr
+    assert want is not None
+    for row in rows[1:]:
+        assert row.psnr is not None and row.psnr > want - 2.0
+
+
+def test_a_view_of_nothing_has_no_score() -> None:
+    target = SceneFitter(CONFIG, OCCUPANCY, replace(WORKSPACE, lower=WORKSPACE.lower + 9, upper=WORKSPACE.upper + 9))
+    row = target.step([frame()])
+    assert row.psnr is None
+    assert row.loss is None
+
+
+@pytest.mark.parametrize("budget", [1, 2, 7])
+def test_a_tiny_budget_is_filled_not_exceeded(budget: int) -> None:
+    target = SceneFitter(replace(CONFIG, max_splats=budget, first_iterations=2), OCCUPANCY, WORKSPACE)
+    assert 0 <= target.step([frame()]).alive <= budget
+
+
+def test_no_splat_ends_outside_the_workspace() -> None:
+    low = replace(WORKSPACE, upper=np.array([0.45, 0.35, 0.175]))
+    target = SceneFitter(CONFIG, OCCUPANCY, low)
+    run(target, [0.17] * 4)
+    assert low.contains(target.splats().centers).all()
+
+
+def test_rates_fall_as_they_are_told() -> None:
+    target = fitter()
+    full, low = target._settings(), target._settings(0.1, 0.5)
+    assert low.lr_color == pytest.approx(0.1 * full.lr_color)
+    assert low.noise == pytest.approx(0.1 * full.noise)
+    assert low.lr_center == pytest.approx(0.5 * full.lr_center)
+    assert low.lr_log_radius == pytest.approx(0.5 * full.lr_log_radius)
+    assert full.regulariser == CONFIG.lambda_reg  # nothing alive yet: one share
+
+
+def test_a_splat_that_drifts_into_the_air_is_gone_after_the_next_step() -> None:
+    target = fitter()
+    target.step([frame(0)])
+    lifted = np.flatnonzero(target.buffer.is_alive)[:20]
+    target.buffer.centers[lifted, 2] = 0.019  # within one voxel of the floor: only the image can tell
+    row = target.step([frame(1)])
+    assert row.removed["free"] >= 10
+    assert target.splats().centers[:, 2].max() < 0.019

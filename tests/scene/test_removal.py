@@ -93,3 +93,20 @@ def test_what_no_camera_looks_at_does_not_float() -> None:
 def test_inside_spheres_counts_the_margin() -> None:
     points = np.float32([[0.0, 0.0, 0.0], [0.11, 0.0, 0.0], [0.13, 0.0, 0.0]])
     assert inside_spheres(points, np.zeros((1, 3)), np.array([0.1]), 0.02).tolist() == [True, True, False]
+
+
+def test_a_trail_goes_from_the_surface_it_lies_on() -> None:
+    trail = np.array([True, False, False, False, False, False])
+    assert removed(buffer(), is_trail=trail) == {"workspace": [2], "free": [1], "trail": [0]}
+
+
+def test_what_is_no_time_step_does_not_try_the_patience() -> None:
+    grid = OccupancyMap(WORKSPACE, OccupancyConfig(uncertain_patience=2), 1)
+    grid.integrate(frame())
+    grid.log_odds[grid.num_updates > 0] = 0.0
+    none = np.zeros(6, bool)
+    slots = buffer()
+    for _ in range(5):
+        reasons = removals(slots, grid, WORKSPACE, 0.1, is_trail=none, is_floating=none, counts_time=False)
+        assert not reasons["uncertain"].any()
+    assert not slots.num_uncertain.any()
