@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 TRAINING, SCORING = "cam0,cam1,cam2", "cam3"
 CLOSED_LOOP_START = "1.6"  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
+INPUTS = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
 
 
@@ -38,15 +39,11 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.output import output_path
+    from splatctrl_cli.io.output import Stopwatch, output_path, sha256, write_run
 
-    console, start = Console(args), time.perf_counter()
+    console, stopwatch, start = Console(args), Stopwatch(), time.perf_counter()
     out = args.out or Path("demo_output")
-    missing = [
-        name
-        for name in ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
-        if not (args.data / name).is_file()
-    ]
+    missing = [name for name in INPUTS if not (args.data / name).is_file()]
     if missing:
         raise InputError(
             f"{args.data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
@@ -54,9 +51,19 @@ def run(args: argparse.Namespace) -> int:
     if out.resolve() == args.data.resolve():
         raise UsageError(f"{out}: is the input folder", remedy="give another --out")
     with output_path(out, force=args.force, is_folder=True) as folder:
-        for command in _commands(args.data, folder, args.threads):
-            _run(command, console, folder, out)
-        pictures = _pictures(args.data, folder, args.threads)
+        with stopwatch.stage("commands"):
+            for command in _commands(args.data, folder, args.threads):
+                _run(command, console, folder, out)
+        with stopwatch.stage("pictures"):
+            pictures = _pictures(args.data, folder, args.threads)
+        write_run(
+            folder,
+            command="demo",
+            config={"threads": args.threads},
+            inputs={name: sha256(args.data / name) for name in INPUTS},
+            metrics={},
+            stopwatch=stopwatch,
+        )
     seconds = time.perf_counter() - start
     lines = [f"{description}: {out / name}" for name, description in pictures.items()]
     console.result(

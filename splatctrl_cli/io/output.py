@@ -16,6 +16,7 @@ from typing import Any
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError, WriteError
 
+MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG})
 
 
@@ -33,9 +34,11 @@ def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
     """Yield ``NAME.partial`` (an empty folder, or a file name to write to); rename it to `path` on success.
 
     A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``.
-    Raises UsageError when `path` exists without `force`, or its parent cannot be written; WriteError where
-    `is_write_failure` (a full disk); every other error as it is.
+    Raises UsageError when `path` has no name of its own, exists without `force`, is not of the kind to write, or
+    is a folder that no command wrote, and when its parent cannot be written; WriteError where `is_write_failure`
+    (a full disk); every other error as it is.
     """
+    _check_replaceable(path, is_folder=is_folder)
     if path.exists() and not force:
         raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
     partial = path.with_name(path.name + ".partial")
@@ -61,9 +64,25 @@ def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
         raise
 
 
+def _check_replaceable(path: Path, *, is_folder: bool) -> None:
+    """Raise UsageError where --force could remove what no command wrote: a folder is ours if empty or marked."""
+    if path.name in ("", ".."):
+        raise UsageError(f"{path}: has no name of its own to write under", remedy="give another --out")
+    if is_folder and path.is_file():
+        raise UsageError(f"{path}: is a file, expected a folder to write", remedy="give another --out")
+    if not is_folder and path.is_dir():
+        raise UsageError(f"{path}: is a folder, expected a file to write", remedy="give another --out")
+    try:
+        is_foreign = path.is_dir() and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}", remedy="give another --out") from None
+    if is_foreign:
+        raise UsageError(f"{path}: was not written by splatctrl (no run.json)", remedy="give another --out")
+
+
 def _replace(partial: Path, path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
-        old = path.with_name(path.name + ".old")
+        old = path.with_name(path.name + ".partial.old")  # no name that a person gives to a copy
         _remove(old)
         path.rename(old)
         partial.rename(path)

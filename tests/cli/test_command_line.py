@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from splatctrl_cli.cli import demo
 from splatctrl_cli.cli.main import COMMANDS, main
 from tests.io.make_log import LogRecipe, make_log
 
@@ -183,10 +184,37 @@ WRITERS = [command for command in COMMANDS if command != "info"]
 @pytest.mark.parametrize("command", WRITERS)
 def test_an_output_that_exists_is_kept_without_force(work: Work, tmp_path: Path, command: str) -> None:
     out = tmp_path / "out"
-    out.write_text("precious")
+    file = out if command == "export" else out / "run.json"
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("precious")
     done = splatctrl(*work.arguments(command, out), "-q")
     assert_refused(done, 2, "out: already exists; give --force")
-    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("out", "precious")]
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
+    assert file.read_text() == "precious"
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: str) -> None:
+    precious = tmp_path / "out" / "precious"
+    precious.parent.mkdir()
+    precious.write_text("mine")
+    said = "is a folder, expected a file" if command == "export" else "was not written by splatctrl (no run.json)"
+    assert_refused(splatctrl(*work.arguments(command, precious.parent), "-q", "--force"), 2, said, "another --out")
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [precious]
+
+
+def test_force_replaces_what_the_demo_wrote(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(demo, "_run", lambda command, console, folder, out: None)
+    monkeypatch.setattr(demo, "_pictures", lambda data, out, threads: {})
+    out = tmp_path / "out"
+    assert main(["demo", "-o", str(out), "-q"]) == 0
+    run = json.loads((out / "run.json").read_text())
+    assert run["command"] == "demo"
+    assert set(run["inputs"]) == {"log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml"}
+    assert main(["demo", "-o", str(out), "-q", "--force"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("command", WRITERS)

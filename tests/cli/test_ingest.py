@@ -33,6 +33,7 @@ def test_an_existing_capture_is_kept_without_force(tmp_path: Path, capsys: pytes
     log, out = make_log(tmp_path / "log.mcap"), tmp_path / "x.capture"
     out.mkdir()
     (out / "precious").touch()
+    (out / "capture.json").touch()
     code, _, error = run(capsys, "ingest", log, "-o", out)
     assert code == 2
     assert "already exists; give --force" in error

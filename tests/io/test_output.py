@@ -26,11 +26,73 @@ def test_an_existing_output_is_refused_untouched_without_force(tmp_path: Path) -
 def test_force_replaces_a_folder_whole(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").write_text("x")
+    (tmp_path / "out" / "run.json").write_text("{}")
     with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
         (partial / "new").write_text("y")
         assert (tmp_path / "out" / "old").exists()
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("name", ["run.json", "capture.json", None])
+def test_force_replaces_a_folder_that_a_command_wrote_or_that_is_empty(tmp_path: Path, name: str | None) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out.old").mkdir()
+    if name:
+        (tmp_path / "out" / name).write_text("{}")
+    with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
+        (partial / "new").write_text("y")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.old"]
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_folder_that_no_command_wrote_is_refused_untouched(tmp_path: Path, force: bool) -> None:
+    precious = tmp_path / "out" / "scan1" / "run.json"
+    precious.parent.mkdir(parents=True)
+    precious.write_text("mine")
+    with (
+        pytest.raises(UsageError, match=r"not written by splatctrl \(no run.json\); give another --out"),
+        output_path(tmp_path / "out", force=force, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    assert [p for p in tmp_path.rglob("*") if p.is_file()] == [precious]
+
+
+def test_a_file_where_a_folder_is_to_be_written_is_refused_untouched(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    with (
+        pytest.raises(UsageError, match="out: is a file, expected a folder to write; give another --out"),
+        output_path(tmp_path / "out", force=True, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_folder_where_a_file_is_to_be_written_is_refused_untouched(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.json").write_text("{}")
+    with (
+        pytest.raises(UsageError, match="out: is a folder, expected a file to write; give another --out"),
+        output_path(tmp_path / "out", force=True, is_folder=False),
+    ):
+        pytest.fail("must not get here")
+    assert (tmp_path / "out" / "run.json").is_file()
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("name", ["", ".", "..", "/", "sub/.."])
+def test_an_output_without_a_name_of_its_own_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, force: bool
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with (
+        pytest.raises(UsageError, match="has no name of its own"),
+        output_path(Path(name), force=force, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    assert [p.name for p in tmp_path.rglob("*")] == ["here"]
 
 
 def test_refused_input_leaves_nothing(tmp_path: Path) -> None:
