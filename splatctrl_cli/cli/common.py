@@ -16,6 +16,7 @@ from splatctrl_cli.errors import GateFailed, UsageError
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
 
+MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
 Subparsers = Any  # argparse keeps its subparser type private
 
 
@@ -69,12 +70,13 @@ def add_gates(parser: argparse.ArgumentParser) -> None:
 
 
 def configured(args: argparse.Namespace) -> "Config":
-    """The configuration that --config and --set give. Raises UsageError for it, or a seed or threads below 0."""
+    """The configuration that --config and --set give. Raises UsageError for it, or a seed or threads out of range."""
     from splatctrl_cli.config import load_config
 
-    for option in ("seed", "threads"):
-        if getattr(args, option) < 0:
-            raise UsageError(f"--{option}: expected 0 or more, got {getattr(args, option)}")
+    if args.threads < 0:
+        raise UsageError(f"--threads: expected 0 or more, got {args.threads}")
+    if not 0 <= args.seed <= MAX_SEED:
+        raise UsageError(f"--seed: expected 0 to {MAX_SEED}, got {args.seed}")
     return load_config(args.config, args.set)
 
 

@@ -159,7 +159,8 @@ def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_p
     assert_refused(splatctrl(*arguments, "--config", tmp_path), 4, "cannot be read: Is a directory; check the path")
     assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, got 'many'")
     assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=-5"), 2, "expected above 0, got -5")
-    assert_refused(splatctrl(*arguments, "--seed=-1"), 2, "--seed: expected 0 or more, got -1")
+    assert_refused(splatctrl(*arguments, "--seed=-1"), 2, "--seed: expected 0 to 2147483647, got -1")
+    assert_refused(splatctrl(*arguments, "--seed", 2**32), 2, "--seed: expected 0 to 2147483647, got 4294967296")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 
 
