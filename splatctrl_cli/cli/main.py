@@ -8,10 +8,11 @@ import importlib
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.cli.parser import Parser
-from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.errors import SplatCtrlError, UsageError
 
 COMMANDS = ("simulate", "ingest", "info", "reconstruct", "export", "sdf-bake", "score", "replay", "demo")
 
@@ -43,6 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = build_parser().parse_args(argv)
         verbose = args.verbose
+        _keep_inputs(args)
         code: int = args.run(args)
         sys.stdout.flush()
         return code
@@ -67,6 +69,20 @@ def _fail_to_read_or_write(error: OSError, verbose: int) -> int:
         return _fail(error, f"{error.filename or 'output'}: writing failed: {reason}; make room", 6, verbose)
     line = f"{error.filename or 'input'}: cannot be read: {reason}; check the path and its permissions"
     return _fail(error, line, 4, verbose)
+
+
+def _keep_inputs(args: argparse.Namespace) -> None:
+    """Refuse an output that is an input, or a folder that holds one: --force would replace it."""
+    out = getattr(args, "out", None)
+    if out is None:
+        return
+    target = out.resolve()
+    for name, given in vars(args).items():
+        if name == "out" or not isinstance(given, Path):
+            continue
+        source = given.resolve()
+        if source == target or target in source.parents:
+            raise UsageError(f"{out}: would replace the input {given}", remedy="give another --out")
 
 
 def _fail(error: BaseException, line: str, code: int, verbose: int) -> int:

@@ -84,3 +84,14 @@ def test_views_that_trained_a_scene_are_not_scored_as_held_out(
     capsys.readouterr()
     assert main(["score", scene, "--dtu", dtu, "--holdout", "2", "-q"]) == 2
     assert "trained the scene" in capsys.readouterr().err
+
+
+def test_an_output_that_is_or_holds_the_input_is_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = recording / "log.mcap"
+    before = log.read_bytes()
+    for out in (log, recording):
+        assert main(["reconstruct", str(log), "-o", str(out), "--force", "-q"]) == 2
+        assert "would replace the input" in capsys.readouterr().err
+    assert log.read_bytes() == before
