@@ -148,6 +148,38 @@ class SplatSet:
 
 
 @dataclass(frozen=True, kw_only=True)
+class GaussianSet:
+    """Anisotropic 3D Gaussians with view-dependent colour, as 3D Gaussian splatting fits them.
+
+    centers (N, 3) float32 [m], world; scales (N, 3) float32 [m], sigmas along the Gaussian's own axes; quats_wxyz
+    (N, 4) float32, unit, from those axes to world; opacities (N,) float32 in (0, 1); harmonics (N, K, 3) float32,
+    real spherical harmonics of red, green and blue up to degree 0 to 3 (K = 1, 4, 9, 16; colour is 0.5 + their sum);
+    labels (N,) uint8 (`Label`).
+    """
+
+    centers: Float32
+    scales: Float32
+    quats_wxyz: Float32
+    opacities: Float32
+    harmonics: Float32
+    labels: UInt8
+
+    def __len__(self) -> int:
+        return len(self.opacities)
+
+    def select(self, keep: Bool) -> "GaussianSet":
+        """The Gaussians where `keep` (N,) is true, in order."""
+        return GaussianSet(
+            centers=self.centers[keep],
+            scales=self.scales[keep],
+            quats_wxyz=self.quats_wxyz[keep],
+            opacities=self.opacities[keep],
+            harmonics=self.harmonics[keep],
+            labels=self.labels[keep],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Box:
     """Axis-aligned box, lower (3,) and upper (3,) float64 [m], world."""
 
