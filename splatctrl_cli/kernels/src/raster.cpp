@@ -126,6 +126,16 @@ void store_row(float* plane, const Camera& camera, int x0, int y, const Float8 i
 
 void Rasteriser::prepare(const Camera& camera, int num_splats, const float* centers, const float* radii,
                          const float* opacities, const float* colors, int num_threads) {
+  const Projection project = [&](int first, int last, Footprint* footprints, std::uint8_t* visible) {
+    for (int i = first; i < last; ++i) {
+      visible[i] = project_isotropic(camera, centers + 3 * i, radii[i], opacities[i], &footprints[i]);
+    }
+  };
+  prepare(camera, num_splats, project, colors, num_threads);
+}
+
+void Rasteriser::prepare(const Camera& camera, int num_splats, const Projection& project, const float* colors,
+                         int num_threads) {
   camera_ = camera;
   num_splats_ = num_splats;
   colors_ = colors;
@@ -135,9 +145,7 @@ void Rasteriser::prepare(const Camera& camera, int num_splats, const float* cent
   visible_.assign(num_splats, 0);
   constexpr int kChunk = 1024;
   parallel_for((num_splats + kChunk - 1) / kChunk, num_threads, [&](int chunk) {
-    for (int i = chunk * kChunk; i < std::min(num_splats, (chunk + 1) * kChunk); ++i) {
-      visible_[i] = project_isotropic(camera, centers + 3 * i, radii[i], opacities[i], &footprints_[i]);
-    }
+    project(chunk * kChunk, std::min(num_splats, (chunk + 1) * kChunk), footprints_.data(), visible_.data());
   });
   sort_by_depth();
   fill_tiles();

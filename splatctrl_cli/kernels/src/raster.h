@@ -5,6 +5,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <vector>
 
 #include "projection.h"
@@ -20,6 +21,10 @@ struct SplatGradient {
   float color[3];
 };
 
+// Fills footprints[i], and visible[i] with 1 where it can be seen, for first <= i < last. Called for chunks of splats,
+// on several threads.
+using Projection = std::function<void(int first, int last, Footprint* footprints, std::uint8_t* visible)>;
+
 // Buffers that live as long as the rasteriser: nothing is allocated once they have grown.
 class Rasteriser {
  public:
@@ -27,6 +32,10 @@ class Rasteriser {
   // next call: forward() and backward() read them.
   void prepare(const Camera& camera, int num_splats, const float* centers, const float* radii,
                const float* opacities, const float* colors, int num_threads);
+
+  // The same for footprints that come from elsewhere; `project` may fill colors as well.
+  void prepare(const Camera& camera, int num_splats, const Projection& project, const float* colors,
+               int num_threads);
 
   // planes (5, H, W): red, green, blue, depth, opacity.
   void forward(float* planes, int num_threads);
