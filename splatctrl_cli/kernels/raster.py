@@ -84,7 +84,8 @@ class LossTerms:
 class LossWeights:
     """Weights of eq. 4; `normalised` compares depth divided by accumulated opacity.
 
-    opacity weighs the mean transmittance where there is depth: a term of ours, 0 in the paper.
+    opacity weighs the mean transmittance where there is depth: a term of ours, 0 in the paper. background: the colour
+    that is seen through what the splats leave transparent; colour + (1 - opacity) background is compared.
     """
 
     dssim: float
@@ -92,6 +93,7 @@ class LossWeights:
     depth: float
     opacity: float
     normalised: bool
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,15 +115,12 @@ class ImageLoss:
         self._native: Any = native.ImageLoss()
 
     def evaluate(self, planes: Float32, view: TargetView, weights: LossWeights, out: Float32) -> LossTerms:
-        """Loss of planes (5, H, W) against a view; writes its derivative to out (5, H, W).
-
-        The colours of pixels that are not counted are overwritten in `planes`.
-        """
+        """Loss of planes (5, H, W) against a view; writes its derivative to out (5, H, W)."""
         height, width = view.depth.shape
         w = weights
         l1, dssim, error, transmittance, squared = self._native.evaluate(
-            planes, view.color, view.depth, view.counted, width, height, w.dssim, w.color, w.depth, w.opacity,
-            w.normalised, out, self.num_threads,
+            planes, view.color, view.depth, view.counted, width, height,
+            np.array([w.dssim, w.color, w.depth, w.opacity, *w.background]), w.normalised, out, self.num_threads,
         )  # fmt: skip
         return LossTerms(l1=l1, dssim=dssim, depth=error, transmittance=transmittance, squared=squared)
 

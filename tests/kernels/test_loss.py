@@ -1,5 +1,7 @@
 """The fused image loss against eq. 4 in float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -22,13 +24,17 @@ def images(height: int = 29, width: int = 43, seed: int = 0) -> tuple[Float32, T
 
 def evaluated(planes: Float32, view: TargetView, weights: LossWeights, threads: int = 1) -> tuple[LossTerms, Float32]:
     gradient = np.full_like(planes, np.nan)
-    return ImageLoss(threads).evaluate(planes.copy(), view, weights, gradient), gradient
+    return ImageLoss(threads).evaluate(planes, view, weights, gradient), gradient
 
 
+BACKGROUND = (0.9, 0.2, 0.5)
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), BACKGROUND])
 @pytest.mark.parametrize("normalised", [False, True])
-def test_value_and_gradient_equal_the_reference(normalised: bool) -> None:
+def test_value_and_gradient_equal_the_reference(normalised: bool, background: tuple[float, float, float]) -> None:
     planes, view = images()
-    weights = LossWeights(dssim=0.2, color=1.0, depth=0.7, opacity=0.1, normalised=normalised)
+    weights = LossWeights(dssim=0.2, color=1.0, depth=0.7, opacity=0.1, normalised=normalised, background=background)
     terms, gradient = evaluated(planes, view, weights)
     leaf = torch.tensor(planes.astype(np.float64), requires_grad=True)
     expected = reference.loss(
@@ -41,6 +47,7 @@ def test_value_and_gradient_equal_the_reference(normalised: bool) -> None:
         depth_weight=0.7,
         opacity_weight=0.1,
         normalised=normalised,
+        background=background,
     )
     expected.backward()  # type: ignore[no-untyped-call]
     value = 0.8 * terms.l1 + 0.2 * terms.dssim + 0.7 * terms.depth + 0.1 * terms.transmittance
@@ -67,6 +74,35 @@ def test_pixels_that_do_not_count_change_neither_value_nor_gradient() -> None:
     assert a[0] == b[0]
     assert np.array_equal(a[1], b[1])
     assert not a[1][:3, view.counted == 0].any()
+
+
+def test_the_background_is_seen_through_what_is_transparent() -> None:
+    planes, view = images()
+    composed = planes.copy()
+    composed[:3] += (1 - planes[4]) * np.float32(BACKGROUND)[:, None, None]
+    terms, gradient = evaluated(planes, view, replace(WEIGHTS, background=BACKGROUND))
+    painted_terms, painted = evaluated(composed, view, WEIGHTS)
+    assert (terms.l1, terms.dssim, terms.squared) == pytest.approx(
+        (painted_terms.l1, painted_terms.dssim, painted_terms.squared), rel=1e-6
+    )
+    assert np.abs(gradient[:4] - painted[:4]).max() < 1e-5 * np.abs(painted[:4]).max()
+    share = np.tensordot(np.float32(BACKGROUND), painted[:3], axes=1)
+    assert np.abs(gradient[4] - (painted[4] - share)).max() < 1e-5 * np.abs(share).max()
+    assert np.abs(share[(view.depth == 0) & (view.counted > 0)]).min() > 0
+
+
+def test_the_gradient_is_the_slope_of_the_value() -> None:
+    """Central differences up the slope of each plane; smooth but for the few pixels whose error changes sign."""
+    planes, view = images()
+    planes[4] = 0.3 + 0.7 * planes[4]  # a normalised depth jumps where the opacity passes 0.1
+    weights = replace(WEIGHTS, background=BACKGROUND, normalised=True)
+    gradient = evaluated(planes, view, weights)[1]
+    for plane in range(5):
+        step = np.zeros_like(planes)
+        step[plane] = np.float32(1e-3) * np.sign(gradient[plane])
+        terms = [evaluated(planes + sign * step, view, weights)[0] for sign in (1, -1)]
+        high, low = (0.8 * t.l1 + 0.2 * t.dssim + 0.7 * t.depth + 0.1 * t.transmittance for t in terms)
+        assert high - low == pytest.approx(2 * float((gradient * step).sum(dtype=np.float64)), rel=1e-2)
 
 
 def test_a_frame_without_depth_has_no_depth_loss() -> None:

@@ -35,9 +35,14 @@ def loss(
     depth_weight: float,
     opacity_weight: float,
     normalised: bool,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> torch.Tensor:
-    """lambda_color ((1 - l) L1 + l D-SSIM) + lambda_depth L1(depth); means over counted and over valid pixels."""
-    x = torch.where(counted[None], planes[:3], color)
+    """lambda_color ((1 - l) L1 + l D-SSIM) + lambda_depth L1(depth); means over counted and over valid pixels.
+
+    The background shows through what the planes leave transparent.
+    """
+    behind = torch.tensor(background, dtype=torch.float64)[:, None, None]
+    x = torch.where(counted[None], planes[:3] + (1 - planes[4]) * behind, color)
     num_values = 3 * counted.sum()
     l1 = (x - color).abs().sum() / num_values
     d_ssim = (1 - ssim_map(x, color)).sum() / num_values

@@ -113,25 +113,26 @@ void bind_loss(nb::module_& m) {
       .def(nb::init<>())
       .def(
           "evaluate",
-          [](ImageLoss& self, const Floats& planes, const ConstFloats& color, const ConstFloats& depth,
-             const Array<const std::uint8_t>& counted, int width, int height, float dssim, float color_weight, float depth_weight, float opacity_weight,
-             bool normalised,
-             const Floats& plane_gradients, int num_threads) {
+          [](ImageLoss& self, const ConstFloats& planes, const ConstFloats& color, const ConstFloats& depth,
+             const Array<const std::uint8_t>& counted, int width, int height, const Array<const double>& weights,
+             bool normalised, const Floats& plane_gradients, int num_threads) {
             const auto size = static_cast<std::size_t>(width) * height;
             expect(planes.size() == 5 * size && color.size() == 3 * size && depth.size() == size &&
                        counted.size() == size && plane_gradients.size() == 5 * size,
                    "expected planes (5, H, W), color (3, H, W), depth and counted (H, W), plane_gradients (5, H, W)");
+            expect(weights.size() == 7, "weights: expected 7 numbers");
+            const auto w = [&weights](int k) { return static_cast<float>(weights.data()[k]); };
+            const LossWeights values{w(0), w(1), w(2), w(3), normalised, {w(4), w(5), w(6)}};
             LossTerms terms;
             {
               const nb::gil_scoped_release release;
               terms = self.evaluate(planes.data(), color.data(), depth.data(), counted.data(), width, height,
-                                    {dssim, color_weight, depth_weight, opacity_weight, normalised}, plane_gradients.data(),
-                                    num_threads);
+                                    values, plane_gradients.data(), num_threads);
             }
             return nb::make_tuple(terms.l1, terms.dssim, terms.depth, terms.transmittance, terms.squared);
           },
           nb::arg("planes").noconvert(), nb::arg("color").noconvert(), nb::arg("depth").noconvert(),
-          nb::arg("counted").noconvert(), nb::arg("width"), nb::arg("height"), nb::arg("dssim"), nb::arg("color_weight"), nb::arg("depth_weight"), nb::arg("opacity_weight"),
+          nb::arg("counted").noconvert(), nb::arg("width"), nb::arg("height"), nb::arg("weights").noconvert(),
           nb::arg("normalised"), nb::arg("plane_gradients").noconvert(), nb::arg("num_threads"));
 }
 

@@ -68,6 +68,19 @@ struct Image {
   float* row(float* plane, int y) const { return plane + static_cast<std::size_t>(y) * width; }
 };
 
+// One row of the colours that are compared: the background added, the target's own where a pixel does not count.
+void seen_row(const Image& image, const float* planes, const float* color, const std::uint8_t* counted, int row,
+              const float* background, float* seen) {
+  const std::size_t size = static_cast<std::size_t>(image.width) * image.height;
+  const float* opacity = image.row(planes + 4 * size, row);
+  for (int c = 0; c < 3; ++c) {
+    const float* x = image.row(planes + c * size, row);
+    const float* y = image.row(color + c * size, row);
+    float* out = image.row(seen + c * size, row);
+    for (int u = 0; u < image.width; ++u) out[u] = counted[u] ? x[u] + (1.0f - opacity[u]) * background[c] : y[u];
+  }
+}
+
 // One row of SSIM and of its derivatives with respect to the three moments that hold x.
 double ssim_row(const Image& image, const float* x_plane, const float* y_plane, int row, std::vector<PaddedRow>& sums,
                 float* d_mean, float* d_second, float* d_cross) {
@@ -158,17 +171,28 @@ void depth_row(const Image& image, const float* planes, const float* depth, int 
   }
 }
 
+// The background's share in the opacity's derivative, from the finished derivatives of one row's colours.
+void background_row(const Image& image, int row, const float* background, float* plane_gradients) {
+  const std::size_t size = static_cast<std::size_t>(image.width) * image.height;
+  float* g_opacity = image.row(plane_gradients + 4 * size, row);
+  for (int c = 0; c < 3; ++c) {
+    const float* g_color = image.row(plane_gradients + c * size, row);
+    for (int x = 0; x < image.width; ++x) g_opacity[x] -= background[c] * g_color[x];
+  }
+}
+
 long count_valid(const float* depth, std::size_t size) {
   return std::count_if(depth, depth + size, [](float d) { return d > 0.0f; });
 }
 
 }  // namespace
 
-LossTerms ImageLoss::evaluate(float* planes, const float* color, const float* depth, const std::uint8_t* counted,
+LossTerms ImageLoss::evaluate(const float* planes, const float* color, const float* depth, const std::uint8_t* counted,
                               int width, int height, const LossWeights& weights, float* plane_gradients,
                               int num_threads) {
   const Image image{width, height};
   const std::size_t size = static_cast<std::size_t>(width) * height;
+  seen_.resize(3 * size);
   maps_.resize(9 * size);
   rows_.assign(5 * static_cast<std::size_t>(height), 0.0);
   const long num_valid = count_valid(depth, size);
@@ -186,12 +210,8 @@ LossTerms ImageLoss::evaluate(float* planes, const float* color, const float* de
   };
   parallel_for(num_chunks, num_threads, [&](int chunk) {
     each_row(chunk, [&](int row) {
-      for (int c = 0; c < 3; ++c) {
-        float* x = image.row(planes + c * size, row);
-        const float* y = image.row(color + c * size, row);
-        const std::uint8_t* keep = counted + static_cast<std::size_t>(row) * width;
-        for (int u = 0; u < width; ++u) x[u] = keep[u] ? x[u] : y[u];
-      }
+      seen_row(image, planes, color, counted + static_cast<std::size_t>(row) * width, row, weights.background,
+               seen_.data());
     });
   });
   parallel_for(num_chunks, num_threads, [&](int chunk) {
@@ -199,7 +219,7 @@ LossTerms ImageLoss::evaluate(float* planes, const float* color, const float* de
     each_row(chunk, [&](int row) {
       for (int c = 0; c < 3; ++c) {
         float* maps = maps_.data() + 3 * c * size;
-        rows_[5 * row] += ssim_row(image, planes + c * size, color + c * size, row, sums, image.row(maps, row),
+        rows_[5 * row] += ssim_row(image, seen_.data() + c * size, color + c * size, row, sums, image.row(maps, row),
                                    image.row(maps + size, row), image.row(maps + 2 * size, row));
       }
     });
@@ -210,11 +230,12 @@ LossTerms ImageLoss::evaluate(float* planes, const float* color, const float* de
       for (int c = 0; c < 3; ++c) {
         const float* maps = maps_.data() + 3 * c * size;
         const float* three[3] = {maps, maps + size, maps + 2 * size};
-        color_row(image, planes + c * size, color + c * size, counted + static_cast<std::size_t>(row) * width, three, row, weight_l1, weight_ssim, sums,
-                  image.row(plane_gradients + c * size, row), &rows_[5 * row + 1], &rows_[5 * row + 2]);
+        color_row(image, seen_.data() + c * size, color + c * size, counted + static_cast<std::size_t>(row) * width,
+                  three, row, weight_l1, weight_ssim, sums, image.row(plane_gradients + c * size, row), &rows_[5 * row + 1], &rows_[5 * row + 2]);
       }
       depth_row(image, planes, depth, row, weight_depth, weight_opacity, weights.normalised, plane_gradients,
                 &rows_[5 * row + 3], &rows_[5 * row + 4]);
+      background_row(image, row, weights.background, plane_gradients);
     });
   });
   LossTerms terms;

@@ -12,6 +12,7 @@ struct LossWeights {
   float depth;       // lambda_depth
   float opacity;     // lambda_opacity: of the mean transmittance where there is depth (not in the paper)
   bool normalised;   // compare depth divided by accumulated opacity instead of eq. 3 as printed
+  float background[3];  // seen through what the splats leave transparent: C + (1 - opacity) background is compared
 };
 
 struct LossTerms {
@@ -26,12 +27,13 @@ struct LossTerms {
 class ImageLoss {
  public:
   // planes (5, H, W) as the rasteriser writes them; color (3, H, W) in [0, 1]; depth (H, W) [m], 0 = none; counted
-  // (H, W), 0 = this pixel is none of the map's business: its colour is copied into planes and its gradient is zero.
+  // (H, W), 0 = this pixel is none of the map's business: it is given its target's colour, and no colour gradient.
   // Writes plane_gradients (5, H, W). Means are over counted pixels.
-  LossTerms evaluate(float* planes, const float* color, const float* depth, const std::uint8_t* counted, int width,
+  LossTerms evaluate(const float* planes, const float* color, const float* depth, const std::uint8_t* counted, int width,
                      int height, const LossWeights& weights, float* plane_gradients, int num_threads);
 
  private:
+  std::vector<float> seen_;  // (3, H, W) colours that are compared
   std::vector<float> maps_;  // (3 channels, 3 maps, H, W): dSSIM/d(mean, second moment, cross moment)
   std::vector<double> rows_; // (H, 5) partial sums
 };
