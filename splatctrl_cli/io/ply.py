@@ -1,5 +1,6 @@
 """One element of a PLY file as a table of numbers, read strictly: every byte the header promises, and none more."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Float64
 
 SCALARS = {
@@ -15,6 +16,7 @@ SCALARS = {
     **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+NAMES_OF_SCALARS = {"f4": "float", "u1": "uchar"}
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
@@ -31,6 +33,15 @@ class PlyFile:
 
     def __contains__(self, name: str) -> bool:
         return name in (self.rows.dtype.names or ())
+
+    def pairs(self) -> dict[str, str]:
+        """The ``key: value`` comments; one without a colon is a key with an empty value."""
+        pairs = {}
+        for line in self.comments:
+            key, _, value = line.partition(":")
+            if key.strip():
+                pairs[key.strip()] = value.strip()
+        return pairs
 
     def column(self, name: str) -> Float64:
         """(N,) float64 values of one property; raises InputError where one is not finite, naming its index."""
@@ -75,6 +86,11 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
     if wanted is None:
         raise InputError(f"{path}: expected an element {element}, got {[found.name for found in header.elements]}")
     names = [name for name, _ in wanted.properties]
+    if "packed_position" in names:
+        raise InputError(
+            f"{path}: a compressed PLY of SuperSplat (packed_position, ...), expected one value per property",
+            remedy="export it there as an uncompressed PLY",
+        )
     missing = [name for name in required if name not in names]
     if missing:
         raise InputError(
@@ -83,6 +99,24 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
         )
     read = _read_ascii if header.format == "ascii" else _read_binary
     return PlyFile(path=path, rows=read(path, content, header)[element], comments=tuple(header.comments))
+
+
+def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> None:
+    """Write the structured array `rows` (float32 and uint8 fields) as element vertex. Same input, same bytes.
+
+    The comments follow the properties: a reader that takes the third line for the count of vertices finds it there.
+    Characters outside ASCII in comments are written as backslash escapes, because readers of the format stop at them.
+    Raises UsageError for a comment of several lines, or a key with a colon.
+    """
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {NAMES_OF_SCALARS[kind.str[1:]]} {name}" for name, (kind, *_) in fields.items()]
+    for key, value in comments.items():
+        if not key or ":" in key or any(mark in key + value for mark in "\r\n"):
+            raise UsageError(f"PLY comment {key!r}: expected one line and a key without a colon, got {value!r}")
+        lines.append(f"comment {key}: {value}".rstrip() if value else f"comment {key}")
+    header = "\n".join([*lines, "end_header", ""]).encode("ascii", "backslashreplace")
+    path.write_bytes(header + rows.tobytes())
 
 
 def _read_binary(path: Path, content: bytes, header: _Header) -> dict[str, NDArray[Any]]:

@@ -255,7 +255,7 @@ def test_a_nan_is_named_with_its_index(tmp_path: Path, index: int, name: str) ->
 
 @pytest.mark.parametrize("scale", [-200, 200, 1e6])
 def test_a_scale_that_is_no_radius_is_refused(tmp_path: Path, scale: float) -> None:
-    with pytest.raises(InputError, match=r"splat 0: scale_0 gives a radius of"):
+    with pytest.raises(InputError, match=r"splat 0: scale_0: expected a radius that float32 holds"):
         read_ply(ascii_ply(tmp_path / "a.ply", MINIMAL, [[0, 0, 0, 0, 0, 0, 0, scale, scale, scale]]))
 
 
