@@ -17,6 +17,7 @@ NB_MODULE(SPLATCTRL_MODULE, m) {
   nanobind::set_leak_warnings(false);  // an interrupted run keeps objects in its traceback; that is no leak
   m.def("runs_x86_64_v3", &runs_x86_64_v3, "True where this processor has AVX2, FMA and BMI2.");
   splatctrl::bind_raster(m);
+  splatctrl::bind_gaussians(m);
   splatctrl::bind_field(m);
   splatctrl::bind_occupancy(m);
 }

@@ -1,6 +1,4 @@
 // Rasteriser, image loss, optimiser: see kernels/raster.py for shapes.
-#include <stdexcept>
-
 #include <algorithm>
 
 #include "bind.h"
@@ -15,26 +13,6 @@ using Floats = Array<float>;
 using ConstFloats = Array<const float>;
 
 static_assert(sizeof(SplatGradient) == 10 * sizeof(float), "gradients cross as rows of ten floats");
-
-void expect(bool holds, const char* what) {
-  if (!holds) throw std::invalid_argument(what);
-}
-
-// camera: fx, fy, cx, cy, width, height, world-to-camera rotation (9, row-major), translation (3).
-Camera camera_from(const Array<const double>& values) {
-  expect(values.size() == 18, "camera: expected 18 numbers");
-  const double* p = values.data();
-  Camera camera;
-  camera.fx = static_cast<float>(p[0]);
-  camera.fy = static_cast<float>(p[1]);
-  camera.cx = static_cast<float>(p[2]);
-  camera.cy = static_cast<float>(p[3]);
-  camera.width = static_cast<int>(p[4]);
-  camera.height = static_cast<int>(p[5]);
-  for (int k = 0; k < 9; ++k) camera.rotation[k] = static_cast<float>(p[6 + k]);
-  for (int k = 0; k < 3; ++k) camera.translation[k] = static_cast<float>(p[15 + k]);
-  return camera;
-}
 
 std::size_t num_pixels(const Camera& camera) { return static_cast<std::size_t>(camera.width) * camera.height; }
 

@@ -99,6 +99,20 @@ struct FootprintGradient {
   float u, v, a, b, c, depth, opacity;
 };
 
+// Derivatives with respect to a 2-D covariance [[A, B], [B, C]], from those of its inverse.
+struct CovarianceGradient {
+  float A, B, C;
+};
+
+SPLATCTRL_HOST_DEVICE inline CovarianceGradient covariance_backward(float A, float B, float C,
+                                                                    const FootprintGradient& g) {
+  const float det = A * C - B * B;
+  const float k = 1.0f / (det * det);
+  return {k * (-C * C * g.a + B * C * g.b - B * B * g.c),
+          k * (2.0f * B * C * g.a - (A * C + B * B) * g.b + 2.0f * A * B * g.c),
+          k * (-B * B * g.a + A * B * g.b - A * A * g.c)};
+}
+
 // From the footprint's derivatives to those of the centre (world) and the radius.
 SPLATCTRL_HOST_DEVICE inline void project_isotropic_backward(const Camera& camera, const float* center, float radius,
                                                              const FootprintGradient& g, float* g_center,
@@ -109,11 +123,7 @@ SPLATCTRL_HOST_DEVICE inline void project_isotropic_backward(const Camera& camer
   const float A = q * fx * fx * (1.0f + s.tx * s.tx) + kDilation;
   const float B = q * fx * fy * s.tx * s.ty;
   const float C = q * fy * fy * (1.0f + s.ty * s.ty) + kDilation;
-  const float det = A * C - B * B;
-  const float k = 1.0f / (det * det);
-  const float g_A = k * (-C * C * g.a + B * C * g.b - B * B * g.c);
-  const float g_B = k * (2.0f * B * C * g.a - (A * C + B * B) * g.b + 2.0f * A * B * g.c);
-  const float g_C = k * (-B * B * g.a + A * B * g.b - A * A * g.c);
+  const auto [g_A, g_B, g_C] = covariance_backward(A, B, C, g);
   const float g_q = g_A * fx * fx * (1.0f + s.tx * s.tx) + g_B * fx * fy * s.tx * s.ty +
                     g_C * fy * fy * (1.0f + s.ty * s.ty);
   const float g_tx = s.clamped_x ? 0.0f : q * fx * (2.0f * fx * s.tx * g_A + fy * s.ty * g_B);
