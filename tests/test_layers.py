@@ -17,6 +17,7 @@ HOMES = {
     "daqp": {"control"},
     "rosbags": {"io"},
     "mcap": {"io"},
+    "pxr": {"io"},
 }
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.ply import PlyFile, read_table, write_table
-from splatctrl_cli.io.splat_values import check_finite, logit, refuse, sigma_of_log, sigmoid
+from splatctrl_cli.io.ply import PlyFile, check_properties, read_table, write_table
+from splatctrl_cli.io.splat_values import check_finite, logit, refuse, sigma_of_log, sigmoid, unit_quaternions
 from splatctrl_cli.records import Float32, GaussianSet, Label, UInt8
 
 REST = tuple(f"f_rest_{index}" for index in range(45))
@@ -23,7 +23,6 @@ NAMES = (
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz", *REST})
-UNIT_TOLERANCE = 5e-7  # of a length; float32 can do no better
 REST_PER_DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest_* -> degree of the harmonics
 HEADER_COMMENTS = {
     "frame": "world",
@@ -66,17 +65,24 @@ def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     Raises InputError for a file that is not whole, lacks a property or holds a value that is no Gaussian's.
     """
     ply = read_table(path, "vertex", REQUIRED)
+    return gaussians_of(ply), ply.pairs()
+
+
+def gaussians_of(ply: PlyFile) -> GaussianSet:
+    """The Gaussians that a table of a PLY file holds. Raises InputError as `read_gaussian_ply` does."""
+    path = ply.path
+    check_properties(path, ply.names, REQUIRED)
     scales = [sigma_of_log(str(path), f"scale_{axis}", ply.column(f"scale_{axis}")) for axis in range(3)]
     gaussians = GaussianSet(
         centers=np.column_stack([ply.column(name) for name in "xyz"]).astype(np.float32),
         scales=np.column_stack(scales),
-        quats_wxyz=_unit_quaternions(ply),
+        quats_wxyz=unit_quaternions(str(path), np.column_stack([ply.column(f"rot_{index}") for index in range(4)])),
         opacities=sigmoid(ply.column("opacity")),
         harmonics=without_zero_degrees(_harmonics(ply)),
         labels=labels_of(ply),
     )
     check_gaussians(str(path), gaussians)
-    return gaussians, ply.pairs()
+    return gaussians
 
 
 def labels_of(ply: PlyFile) -> UInt8:
@@ -111,17 +117,9 @@ def check_gaussians(where: str, gaussians: GaussianSet) -> None:
     refuse(where, "rotation", g.quats_wxyz, np.abs(lengths - 1) > 1e-3, "a unit quaternion w x y z")
 
 
-def _unit_quaternions(ply: PlyFile) -> Float32:
-    quats = np.column_stack([ply.column(f"rot_{index}") for index in range(4)])
-    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
-    refuse(str(ply.path), "rot", quats, np.asarray(lengths[:, 0] < 1e-12), "a quaternion w x y z that is not zero")
-    is_unit = np.abs(lengths - 1) <= UNIT_TOLERANCE  # kept to the bit
-    return np.where(is_unit, quats, quats / lengths).astype(np.float32)
-
-
 def _harmonics(ply: PlyFile) -> Float32:
     """(N, K, 3) coefficients; f_rest has all of a channel's in a row."""
-    num_rest = sum(name.startswith("f_rest_") for name in ply.rows.dtype.names or ())
+    num_rest = sum(name.startswith("f_rest_") for name in ply.names)
     names = [f"f_rest_{index}" for index in range(num_rest)]
     if num_rest not in REST_PER_DEGREE or not all(name in ply for name in names):
         expected = ", ".join(map(str, REST_PER_DEGREE))

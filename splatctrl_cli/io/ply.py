@@ -1,6 +1,6 @@
 """One element of a PLY file as a table of numbers, read strictly: every byte the header promises, and none more."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,12 @@ class PlyFile:
         return len(self.rows)
 
     def __contains__(self, name: str) -> bool:
-        return name in (self.rows.dtype.names or ())
+        return name in self.names
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The properties, in the file's order."""
+        return self.rows.dtype.names or ()
 
     def pairs(self) -> dict[str, str]:
         """The ``key: value`` comments; one without a colon is a key with an empty value."""
@@ -75,7 +80,7 @@ class _Header:
 def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
     """Element `element` of a PLY file (ASCII or binary, either byte order) that has all of the `required` properties.
 
-    Raises InputError for a file that is missing, no PLY, cut short or too long, or lacks a property.
+    Raises InputError for a file that is missing, no PLY, cut short or too long, compressed, or lacks a property.
     """
     try:
         content = path.read_bytes()
@@ -91,14 +96,19 @@ def read_table(path: Path, element: str, required: tuple[str, ...]) -> PlyFile:
             f"{path}: a compressed PLY of SuperSplat (packed_position, ...), expected one value per property",
             remedy="export it there as an uncompressed PLY",
         )
+    check_properties(path, names, required)
+    read = _read_ascii if header.format == "ascii" else _read_binary
+    return PlyFile(path=path, rows=read(path, content, header)[element], comments=tuple(header.comments))
+
+
+def check_properties(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
+    """Raise InputError that names which of the `required` properties are not among `names`."""
     missing = [name for name in required if name not in names]
     if missing:
         raise InputError(
             f"{path}: no 3D-GS splat file: missing properties {' '.join(missing)} (it has {' '.join(names)})",
             remedy="a point cloud or mesh has to be reconstructed first",
         )
-    read = _read_ascii if header.format == "ascii" else _read_binary
-    return PlyFile(path=path, rows=read(path, content, header)[element], comments=tuple(header.comments))
 
 
 def write_table(path: Path, rows: NDArray[Any], comments: Mapping[str, str]) -> None:

@@ -10,6 +10,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Bool, Float32, Float64
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+UNIT_TOLERANCE = 5e-7  # of a quaternion's length; float32 can do no better
 LOGIT_OF_ONE = 20.0  # finite, and its sigmoid is exactly 1 in float32
 LOGIT_OF_ZERO = -110.0  # finite, and its sigmoid is exactly 0 in float32
 
@@ -33,6 +34,14 @@ def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
     limits = np.finfo(np.float32)
     refuse(where, name, values, (values > limits.max) | (values < limits.tiny), "a radius that float32 holds [m]")
     return values.astype(np.float32)
+
+
+def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
+    """(N, 4) quaternions scaled to length one, to the bit where they have it; InputError for one of no length."""
+    wide = quats.astype(np.float64)
+    lengths = np.linalg.norm(wide, axis=1, keepdims=True)
+    refuse(where, "rotation", quats, np.asarray(~(lengths[:, 0] > 1e-12)), "a quaternion that is not zero")
+    return np.where(np.abs(lengths - 1.0) <= UNIT_TOLERANCE, wide, wide / lengths).astype(np.float32)
 
 
 def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: str) -> None:

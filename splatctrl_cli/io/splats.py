@@ -13,11 +13,10 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.gaussian_ply import labels_of
+from splatctrl_cli.io.isotropic import MAX_SCALE_SPREAD
 from splatctrl_cli.io.ply import PlyFile, read_table, write_table
 from splatctrl_cli.io.splat_values import SH_C0, check_finite, logit, refuse, sigma_of_log, sigmoid
 from splatctrl_cli.records import SplatSet
-
-MAX_SCALE_SPREAD = 1e-5  # largest difference of log scales that still reads as isotropic
 
 NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -62,7 +61,17 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
     Raises InputError for a file that is not whole, lacks a property, is anisotropic or holds no valid splat.
     """
     ply = read_table(path, "vertex", REQUIRED)
-    _check_isotropic(path, ply)
+    return splats_of(ply), ply.pairs()
+
+
+def splats_of(ply: PlyFile) -> SplatSet:
+    """The splats that a table of a PLY file holds. Raises InputError as `read_ply` does."""
+    path = ply.path
+    if num := num_stretched(ply):
+        raise InputError(
+            f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
+            remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set",
+        )
     splats = SplatSet(
         centers=np.column_stack([ply.column(name) for name in "xyz"]).astype(np.float32),
         radii=sigma_of_log(str(path), "scale_0", ply.column("scale_0")),
@@ -72,19 +81,14 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
         density=(ply.column("density") if "density" in ply else np.zeros(len(ply))).astype(np.float32),
     )
     check_splats(str(path), splats)
-    return splats, ply.pairs()
+    return splats
 
 
-def _check_isotropic(path: Path, ply: PlyFile) -> None:
+def num_stretched(ply: PlyFile) -> int:
+    """How many rows of a table have scales that differ."""
     scales = np.column_stack([ply.column(f"scale_{axis}") for axis in range(3)])
     spread = scales.max(axis=1, initial=-np.inf) - scales.min(axis=1, initial=np.inf)
-    num_anisotropic = int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
-    if num_anisotropic:
-        raise InputError(
-            f"{path}: expected isotropic splats (three equal scale_*), got {num_anisotropic} of {len(ply)} "
-            "whose scales differ",
-            remedy="distances are defined on spheres: export an isotropic set",
-        )
+    return int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
 
 
 def check_splats(where: str, splats: SplatSet) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.gaussian_ply import NAMES, read_gaussian_ply, write_gaussian_ply
@@ -138,7 +139,7 @@ PLAIN = [name for name in NAMES if name[0] != "n" and not name.startswith("f_res
         (1, "nan", "splat 1: y: expected a finite number, got nan"),
         (12, "inf", "splat 1: rot_2: expected a finite number, got inf"),
         (8, 200, r"splat 1: scale_1: expected a radius that float32 holds \[m\]"),
-        (10, 0, "splat 1: rot: expected a quaternion w x y z that is not zero"),
+        (10, 0, "splat 1: rotation: expected a quaternion that is not zero"),
     ],
 )
 def test_a_row_that_is_no_gaussian_is_named_by_its_index(
@@ -164,3 +165,25 @@ def test_a_compressed_ply_is_refused_by_name(tmp_path: Path) -> None:
     for read in (read_ply, read_gaussian_ply):
         with pytest.raises(InputError, match=r"compressed PLY of SuperSplat .*; export it there as an uncompr"):
             read(tmp_path / "a.ply")
+
+
+def test_other_readers_find_the_same_values(tmp_path: Path) -> None:
+    gaussians = gaussian_set(30)
+    write_gaussian_ply(tmp_path / "a.ply", gaussians, {})
+    rows = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
+    assert np.array_equal(np.column_stack([rows[name] for name in "xyz"]), gaussians.centers)
+    assert np.array_equal(np.column_stack([rows[f"rot_{i}"] for i in range(4)]), gaussians.quats_wxyz)
+    rest = np.column_stack([rows[f"f_rest_{i}"] for i in range(45)]).reshape(30, 3, 15)
+    assert np.array_equal(np.moveaxis(rest, 1, 2), gaussians.harmonics[:, 1:])
+
+
+def test_open3d_finds_the_same_values(tmp_path: Path) -> None:
+    open3d = pytest.importorskip("open3d", reason="open3d is not installed: its reader was not compared")
+    gaussians = gaussian_set(30)
+    write_gaussian_ply(tmp_path / "a.ply", gaussians, {})
+    points = open3d.t.io.read_point_cloud(str(tmp_path / "a.ply")).point
+    assert np.array_equal(points["positions"].numpy(), gaussians.centers)
+    assert np.array_equal(points["rot"].numpy(), gaussians.quats_wxyz)
+    assert np.array_equal(points["f_dc"].numpy(), gaussians.harmonics[:, 0])
+    assert np.array_equal(points["f_rest"].numpy(), gaussians.harmonics[:, 1:])
+    np.testing.assert_allclose(points["scale"].numpy(), gaussians.scales, rtol=1e-6)

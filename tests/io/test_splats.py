@@ -293,10 +293,16 @@ def test_another_reader_finds_the_same_points_and_properties(tmp_path: Path) -> 
     assert np.array_equal(vertices["density"], splats.density)
 
 
-def test_open3d_reads_the_same_points(tmp_path: Path) -> None:
+def test_open3d_finds_the_same_centres_colours_sigmas_and_opacities(tmp_path: Path) -> None:
     open3d = pytest.importorskip("open3d", reason="open3d is not installed: its reader was not compared")
     splats = splat_set(30)
     write_ply(tmp_path / "a.ply", splats, {})
-    cloud = open3d.t.io.read_point_cloud(str(tmp_path / "a.ply"))
-    assert np.array_equal(cloud.point.positions.numpy(), splats.centers)
-    assert np.array_equal(cloud.point["label"].numpy().ravel(), splats.labels)
+    points = open3d.t.io.read_point_cloud(str(tmp_path / "a.ply")).point
+    assert np.array_equal(points["positions"].numpy(), splats.centers)
+    assert np.array_equal(points["label"].numpy().ravel(), splats.labels)
+    assert np.array_equal(points["density"].numpy().ravel(), splats.density)
+    assert np.array_equal(points["rot"].numpy(), np.tile([1, 0, 0, 0], (30, 1)))
+    np.testing.assert_allclose(0.5 + 0.28209479 * points["f_dc"].numpy(), splats.colors, atol=1e-6)
+    np.testing.assert_allclose(points["scale"].numpy(), np.repeat(splats.radii[:, None], 3, axis=1), rtol=1e-6)
+    logits = points["opacity"].numpy().ravel()
+    np.testing.assert_allclose(1 / (1 + np.exp(-logits)), splats.opacities, atol=1e-6)
