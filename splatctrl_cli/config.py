@@ -53,6 +53,37 @@ class SceneConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class GaussianConfig:
+    """The baseline, `reconstruct --method 3dgs`: 3D Gaussian splatting (Kerbl et al. 2023), with its numbers. Shares
+    are of `iterations`, of which it had 30,000.
+    """
+
+    iterations: int = 3000
+    max_gaussians: int = 500_000  # 3DGS has no limit
+    max_degree: int = 3  # of the spherical harmonics, 0 to 3
+    degree_every: float = 1 / 30  # share of the iterations after which the degree rises by one
+    initial_opacity: float = 0.1
+    lr_center: float = 1.6e-4  # times the extent of the scene [m]
+    lr_center_final: float = 1.6e-6  # at the end; falls exponentially
+    lr_log_scale: float = 5e-3
+    lr_quat: float = 1e-3
+    lr_color: float = 2.5e-3  # of the constant harmonic
+    lr_harmonics: float = 1.25e-4  # of the others, a twentieth
+    lr_logit_opacity: float = 5e-2
+    densify_from: int = 500  # iterations before the first round of adding and removing
+    densify_until: float = 0.5  # share of the iterations after which their number is fixed
+    densify_every: int = 100  # iterations
+    densify_gradient: float = 2e-4  # mean screen gradient, in half images, from which a Gaussian is cloned or split
+    dense_share: float = 0.01  # of the scene's extent: a Gaussian up to this size is cloned, a larger one split
+    split_shrink: float = 1.6  # the sigmas of a split Gaussian's parts are divided by this
+    min_opacity: float = 0.005  # a fainter one is removed
+    max_screen_radius: float = 20.0  # [px] a larger one is removed once opacities have been reset
+    max_size_share: float = 0.1  # of the scene's extent: the same for sigmas
+    reset_every: float = 0.1  # share of the iterations after which opacities are reset, while the number grows
+    reset_opacity: float = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
 class OccupancyConfig:
     """III-C: occupancy grid, free-space filter, robot labels."""
 
@@ -118,6 +149,7 @@ class Config:
     """The whole configuration, one table per section in TOML."""
 
     scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    gaussians: GaussianConfig = dataclasses.field(default_factory=GaussianConfig)
     occupancy: OccupancyConfig = dataclasses.field(default_factory=OccupancyConfig)
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     control: ControlConfig = dataclasses.field(default_factory=ControlConfig)
@@ -155,8 +187,14 @@ _POSITIVE = (
     *("scene.max_splats", "scene.snapshot_every", "scene.min_radius", "scene.max_radius", "scene.radius_per_edge"),
     *("scene.fill", "scene.final_rate", "occupancy.voxel", "occupancy.max_range", "occupancy.ray_stride"),
     *("occupancy.log_odds_hit", "occupancy.log_odds_limit", "field.voxel", "field.length_scale"),
+    *("gaussians.max_gaussians", "gaussians.lr_center", "gaussians.lr_center_final", "gaussians.densify_every"),
+    *("gaussians.split_shrink", "gaussians.max_screen_radius", "gaussians.max_size_share"),
 )
 _AT_LEAST_ZERO = (
+    *("gaussians.iterations", "gaussians.max_degree", "gaussians.degree_every", "gaussians.lr_log_scale"),
+    *("gaussians.lr_quat", "gaussians.lr_color", "gaussians.lr_harmonics", "gaussians.lr_logit_opacity"),
+    *("gaussians.densify_from", "gaussians.densify_until", "gaussians.densify_gradient", "gaussians.dense_share"),
+    *("gaussians.reset_every",),
     *("scene.lambda_dssim", "scene.lambda_color", "scene.lambda_depth", "scene.lambda_reg", "scene.lambda_opacity"),
     *("scene.lambda_mde", "scene.min_depth_error", "scene.max_gap", "scene.gap_reserve", "scene.hole_opacity"),
     *("scene.iterations_per_step", "scene.first_iterations", "scene.refine_iterations", "scene.refine_geometry"),
@@ -166,6 +204,7 @@ _AT_LEAST_ZERO = (
 )
 _SHARES = (
     *("scene.initial_opacity", "scene.min_opacity"),
+    *("gaussians.initial_opacity", "gaussians.min_opacity", "gaussians.reset_opacity"),
     *("occupancy.free_below", "occupancy.occupied_above"),
 )
 _AT_MOST_ONE = ("scene.lambda_dssim", "scene.hole_opacity", "scene.gap_reserve", "scene.fill", "scene.final_rate")
@@ -192,6 +231,7 @@ def _check_ranges(config: Config) -> None:
         _check(values[name] <= 1, name, "at most 1", values[name])
     for low, high in _ORDERED:
         _check(values[low] <= values[high], low, f"at most {high} = {values[high]:g}", values[low])
+    _check(config.gaussians.max_degree <= 3, "gaussians.max_degree", "at most 3", config.gaussians.max_degree)
     _check_occupancy(config.occupancy)
 
 

@@ -1,0 +1,73 @@
+"""Anisotropic Gaussians as rows of parameters and as sets, and how they look from a camera."""
+
+import numpy as np
+
+from splatctrl_cli.kernels import num_threads
+from splatctrl_cli.kernels.gaussians import (
+    CENTER,
+    HARMONICS,
+    LOG_SCALE,
+    LOGIT,
+    NUM_PARAMETERS,
+    QUAT,
+    RED_0,
+    GaussianRasteriser,
+)
+from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label
+from splatctrl_cli.scene.buffer import Seeds
+from splatctrl_cli.scene.render import Rendering, camera_array
+
+LARGEST_LOGIT = 16.0  # opacity 1 to float32
+SH_0 = 0.28209479177387814  # the constant harmonic, 1 / (2 sqrt(pi))
+PER_CHANNEL = 16  # harmonics
+
+
+def seeded(seeds: Seeds, opacity: float) -> Float32:
+    """Parameters (N, 59) of isotropic seeds as Gaussians of one colour."""
+    rows = np.zeros((len(seeds), NUM_PARAMETERS), np.float32)
+    rows[:, CENTER] = seeds.centers
+    rows[:, LOG_SCALE] = np.log(seeds.radii)[:, None]
+    rows[:, QUAT.start] = 1.0
+    rows[:, LOGIT] = np.log(opacity / (1.0 - opacity))
+    rows[:, RED_0::PER_CHANNEL] = (seeds.colors - 0.5) / SH_0
+    return rows
+
+
+def gaussians_of(parameters: Float32, degree: int) -> GaussianSet:
+    """The set that parameters (N, 59) describe, with harmonics up to `degree`; all are objects."""
+    quats = parameters[:, QUAT].astype(np.float64)
+    harmonics = parameters[:, HARMONICS].reshape(-1, 3, PER_CHANNEL)[:, :, : (degree + 1) ** 2]
+    return GaussianSet(
+        centers=parameters[:, CENTER].copy(),
+        scales=np.exp(parameters[:, LOG_SCALE]),
+        quats_wxyz=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        opacities=(1.0 / (1.0 + np.exp(-parameters[:, LOGIT].astype(np.float64)))).astype(np.float32),
+        harmonics=np.ascontiguousarray(np.moveaxis(harmonics, 1, 2)),
+        labels=np.full(len(parameters), Label.OBJECT, np.uint8),
+    )
+
+
+def parameters_of(gaussians: GaussianSet) -> Float32:
+    """Parameters (N, 59) of a set; opacities of 0 and 1 become the nearest that a logit can say."""
+    rows = np.zeros((len(gaussians), NUM_PARAMETERS), np.float32)
+    rows[:, CENTER] = gaussians.centers
+    rows[:, LOG_SCALE] = np.log(gaussians.scales)
+    rows[:, QUAT] = gaussians.quats_wxyz
+    opacity = gaussians.opacities.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        logit = np.log(opacity) - np.log1p(-opacity)
+    rows[:, LOGIT] = np.clip(logit, -LARGEST_LOGIT, LARGEST_LOGIT)
+    coefficients = np.moveaxis(gaussians.harmonics, 2, 1)
+    rows[:, HARMONICS].reshape(-1, 3, PER_CHANNEL)[:, :, : coefficients.shape[2]] = coefficients
+    return rows
+
+
+def render_gaussians(
+    gaussians: GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, *, threads: int = 0
+) -> Rendering:
+    """Render `gaussians` from a pinhole camera at T_world_camera (4, 4); black where nothing is."""
+    raster = GaussianRasteriser(num_threads(threads))
+    raster.prepare(camera_array(intrinsics, T_world_camera), parameters_of(gaussians))
+    planes = raster.forward()
+    color = np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2))
+    return Rendering(color=color, depth=planes[3].copy(), opacity=planes[4].copy())

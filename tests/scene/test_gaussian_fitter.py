@@ -1,0 +1,147 @@
+"""3D Gaussian splatting of a textured floor."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import Config, GaussianConfig, SceneConfig
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Box, GaussianSet, RgbdFrame
+from splatctrl_cli.scene.gaussian_fitter import (
+    GaussianAuditRow,
+    GaussianFitter,
+    center_rate,
+    first_seeds,
+    scene_extent,
+)
+from splatctrl_cli.scene.gaussians import gaussians_of, parameters_of, render_gaussians
+from splatctrl_cli.scene.window import make_view
+from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame, looking_down
+
+FAST = GaussianConfig(iterations=300, densify_from=60, densify_every=30, reset_every=0.2)
+CONFIG = Config(scene=SceneConfig(max_splats=200), gaussians=FAST)
+
+
+def frames() -> list[RgbdFrame]:
+    return [frame(x=0.1), frame(x=-0.1), frame(y=0.05)]
+
+
+def checked() -> list[RgbdFrame]:
+    """A pattern finer than the seeds can show."""
+    v, u = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
+    squares = ((u // 3 + v // 3) % 2 * 200 + 20).astype(np.uint8)
+    return [replace(frame(), color=np.repeat(squares[:, :, None], 3, axis=2))]
+
+
+def fitted(config: Config = CONFIG, threads: int = 1, seed: int = 0) -> tuple[GaussianFitter, list[GaussianAuditRow]]:
+    rows: list[GaussianAuditRow] = []
+    fitter = GaussianFitter(config, WORKSPACE, frames(), seed=seed, threads=threads)
+    fitter.fit(rows.append)
+    return fitter, rows
+
+
+def test_a_floor_is_reconstructed_in_colour_and_depth_from_a_view_not_trained_on() -> None:
+    fitter, rows = fitted(replace(CONFIG, gaussians=replace(FAST, reset_every=0.0)))
+    view = render_gaussians(fitter.gaussians(), INTRINSICS, looking_down(0.03, -0.02))
+    inside = (slice(8, 52), slice(10, 68))
+    error = (view.color - frame(x=0.03, y=-0.02).color / 255.0)[inside]
+    assert -10 * np.log10(np.mean(error**2)) > 30
+    assert np.median(np.abs(view.normalised_depth()[inside] - HEIGHT)) < 0.01 * HEIGHT
+    assert rows[-1].psnr is not None
+    assert rows[-1].psnr > 30
+
+
+def test_growing_shows_detail_that_the_seeds_cannot() -> None:
+    psnr = {}
+    for until in (0.0, 1.0):
+        rules = replace(FAST, iterations=200, densify_until=until, reset_every=0.0, lr_color=0.05)
+        fitter = GaussianFitter(replace(CONFIG, gaussians=rules), WORKSPACE, checked(), threads=1)
+        start, psnr[until] = len(fitter.arrays), fitter.fit().psnr or 0.0
+        assert (len(fitter.arrays) > 2 * start) == (until > 0)
+    assert psnr[1.0] > psnr[0.0] + 2.0
+
+
+def test_the_audit_adds_up_and_follows_the_schedule() -> None:
+    start = len(GaussianFitter(CONFIG, WORKSPACE, frames(), threads=1).arrays)
+    fitter, rows = fitted()
+    assert start <= 200
+    count = start
+    for row in rows:
+        count += row.cloned + row.split - sum(row.pruned.values())
+        assert row.gaussians == count
+        assert set(asdict(row)["pruned"]) == {"broken", "opacity", "screen", "size"}
+    assert count == len(fitter.gaussians())
+    assert [row.iteration for row in rows] == [60, 90, 120, 300]
+    assert [row.opacity_reset for row in rows] == [True, False, True, False]
+    assert [row.degree for row in rows] == [3, 3, 3, 3]
+
+
+def test_the_degree_rises_with_the_iterations() -> None:
+    config = replace(CONFIG, gaussians=replace(FAST, iterations=50, degree_every=0.3))
+    fitter = GaussianFitter(config, WORKSPACE, frames(), threads=1)
+    fitter.fit()
+    assert fitter.degree == 3
+    assert fitter.gaussians().harmonics.shape[1] == 16
+    assert GaussianFitter(config, WORKSPACE, frames(), threads=1).gaussians().harmonics.shape[1] == 1
+
+
+def test_the_number_of_gaussians_never_exceeds_its_limit() -> None:
+    config = replace(CONFIG, gaussians=replace(FAST, max_gaussians=220, iterations=150, densify_until=1.0))
+    fitter = GaussianFitter(config, WORKSPACE, checked(), threads=1)
+    rows: list[GaussianAuditRow] = []
+    fitter.fit(rows.append)
+    assert all(row.gaussians <= 220 for row in rows)
+    assert any(row.unmet for row in rows)
+
+
+def test_same_seed_gives_the_same_bytes_at_any_thread_count() -> None:
+    config = replace(CONFIG, gaussians=replace(FAST, iterations=150))
+    results = [fitted(config, threads) for threads in (1, 2, 4)]
+    bytes_ = [fitter.arrays.parameters.tobytes() for fitter, _ in results]
+    assert bytes_[0] == bytes_[1] == bytes_[2]
+    assert results[0][1] == results[1][1] == results[2][1]
+    assert fitted(config, seed=1)[0].arrays.parameters.tobytes() != bytes_[0]
+
+
+def test_seeds_are_those_that_an_empty_map_asks_for() -> None:
+    views = [make_view(f, f.depth > 0) for f in frames()]
+    seeds = first_seeds(views, CONFIG)
+    assert 50 < len(seeds) <= 200
+    assert np.abs(seeds.centers[:, 2]).max() < 1e-3
+
+
+def test_a_scene_without_depth_is_refused() -> None:
+    away = Box(lower=np.array([5.0, 5.0, 5.0]), upper=np.array([6.0, 6.0, 6.0]))
+    with pytest.raises(InputError, match="no pixel of any view has a depth inside the workspace"):
+        GaussianFitter(CONFIG, away, frames())
+
+
+def test_the_extent_is_that_of_the_cameras_or_of_what_they_see() -> None:
+    apart = [frame(x=1.0), frame(x=-1.0)]
+    assert scene_extent(apart) == pytest.approx(1.1)
+    assert scene_extent([frame()]) == pytest.approx(0.5 * HEIGHT)
+
+
+def test_the_rate_of_centres_falls_exponentially_to_its_end() -> None:
+    rates = [center_rate(FAST, k) for k in (0, 150, 300)]
+    assert rates == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6])
+
+
+def test_parameters_and_sets_say_the_same() -> None:
+    rng = np.random.default_rng(0)
+    quats = rng.normal(size=(9, 4))
+    gaussians = GaussianSet(
+        centers=rng.normal(size=(9, 3)).astype(np.float32),
+        scales=rng.uniform(0.01, 0.1, (9, 3)).astype(np.float32),
+        quats_wxyz=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        opacities=np.linspace(0, 1, 9, dtype=np.float32),
+        harmonics=rng.normal(size=(9, 4, 3)).astype(np.float32),
+        labels=np.zeros(9, np.uint8),
+    )
+    back = gaussians_of(parameters_of(gaussians), 1)
+    assert np.array_equal(back.centers, gaussians.centers)
+    assert np.array_equal(back.harmonics, gaussians.harmonics)
+    assert back.scales == pytest.approx(gaussians.scales, rel=1e-6)
+    assert back.quats_wxyz == pytest.approx(gaussians.quats_wxyz, abs=1e-6)
+    assert back.opacities == pytest.approx(gaussians.opacities, abs=2e-7)
