@@ -95,8 +95,7 @@ class OccupancyConfig:
     log_odds_miss: float = -0.4
     log_odds_limit: float = 2.0  # three cameras turn a full voxel free in two time steps
     min_range: float = 0.2  # [m]; nearer depth is what carries the camera, or noise
-    max_range: float = 3.0  # [m]
-    ray_stride: int = 2  # every second pixel and row carves free space
+    max_range: float = 3.0  # [m]; farther depth is no hit, it frees what is nearer
     see_through: float = 0.015  # [m] by which a splat must stand before every depth around its pixel to be floating
     uncertain_patience: int = 10  # time steps a splat may stand in uncertain voxels
     robot_margin: float = 0.015  # [m] beyond the robot's spheres that still counts as robot
@@ -185,7 +184,7 @@ def load_config(path: Path | None, assignments: typing.Sequence[str]) -> Config:
 
 _POSITIVE = (
     *("scene.max_splats", "scene.snapshot_every", "scene.min_radius", "scene.max_radius", "scene.radius_per_edge"),
-    *("scene.fill", "scene.final_rate", "occupancy.voxel", "occupancy.max_range", "occupancy.ray_stride"),
+    *("scene.fill", "scene.final_rate", "occupancy.voxel", "occupancy.max_range"),
     *("occupancy.log_odds_hit", "occupancy.log_odds_limit", "field.voxel", "field.length_scale"),
     *("gaussians.max_gaussians", "gaussians.lr_center", "gaussians.lr_center_final", "gaussians.densify_every"),
     *("gaussians.split_shrink", "gaussians.max_screen_radius", "gaussians.max_size_share"),

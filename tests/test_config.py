@@ -50,7 +50,6 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         ("scene.snapshot_every=0", "scene.snapshot_every: expected above 0, got 0"),
         ("scene.initial_opacity=2", "scene.initial_opacity: expected between 0 and 1, got 2"),
         ("scene.min_radius=0.5", "scene.min_radius: expected at most scene.max_radius = 0.02, got 0.5"),
-        ("occupancy.ray_stride=0", "occupancy.ray_stride: expected above 0, got 0"),
         ("scene.fill=1.5", "scene.fill: expected at most 1, got 1.5"),
         ("scene.noise=-1", "scene.noise: expected 0 or more, got -1"),
         ("scene.window=-1", "scene.window: expected 0 or more, got -1"),

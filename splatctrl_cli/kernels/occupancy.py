@@ -1,4 +1,6 @@
-"""The voxel kernels of the compiled module: depth integration and entity marks, in place on the grid's arrays."""
+"""The voxel kernels of the compiled module: depth integration and entity bits, in place on the grid's arrays."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,6 +9,21 @@ from splatctrl_cli.kernels import native
 
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthImage:
+    """A depth image as the kernels take it.
+
+    intrinsics (6,) float64: fx, fy, cx, cy, width, height; T_world_camera (4, 4) float64; depth (H, W) float32 [m];
+    depth nearer than min_range is none, depth beyond max_range is no hit.
+    """
+
+    intrinsics: Float64
+    T_world_camera: Float64
+    depth: NDArray[np.float32]
+    min_range: float
+    max_range: float
 
 
 def pack_grid(origin: Float64, voxel: float, shape: tuple[int, ...]) -> Float64:
@@ -18,28 +35,43 @@ def integrate_depth(
     grid: Float64,
     log_odds: NDArray[np.float32],
     num_updates: NDArray[np.uint16],
-    marks: UInt8,
-    intrinsics: Float64,
-    T_world_camera: Float64,
-    depth: NDArray[np.float32],
+    hits: UInt8,
+    image: DepthImage,
     *,
     hit: float,
     miss: float,
     limit: float,
-    max_range: float,
-    stride: int,
     num_threads: int,
 ) -> None:
-    """Add one depth image (H, W) [m] to log_odds and num_updates (X, Y, Z); marks (2, X, Y, Z) is zeroed scratch.
+    """Add one depth image to log_odds and num_updates (X, Y, Z); hits (X, Y, Z) is scratch, zero before and after.
 
-    intrinsics (6,): fx, fy, cx, cy, width, height.
+    A voxel that holds a pixel's point is a hit. Else it is a miss where its centre falls on a pixel whose depth lies
+    beyond the centre; a pixel without depth takes that of the nearest one with it, up to where the two rays are
+    half a voxel apart. Depth beyond max_range frees what is nearer.
     """
     native.integrate_depth(
-        grid, log_odds, num_updates, marks, intrinsics, T_world_camera, depth, hit, miss, limit, max_range, stride,
-        num_threads,
+        grid, log_odds, num_updates, hits, image.intrinsics, image.T_world_camera, image.depth, image.min_range,
+        image.max_range, hit, miss, limit, num_threads,
     )  # fmt: skip
 
 
-def mark_spheres(grid: Float64, entity: UInt8, centers: Float64, radii: Float64, bit: int, num_threads: int) -> None:
-    """OR `bit` into the voxels of entity (X, Y, Z) that meet a sphere; centers (S, 3) [m], radii (S,) [m]."""
-    native.mark_spheres(grid, entity, centers, radii, bit, num_threads)
+def label_hits(
+    grid: Float64,
+    entity: UInt8,
+    image: DepthImage,
+    chosen: UInt8,
+    *,
+    set_bits: int = 0,
+    clear_bits: int = 0,
+    num_threads: int,
+) -> None:
+    """Set or clear bits of entity (X, Y, Z) in voxels that hold the point of a pixel with chosen (H, W) not 0."""
+    native.label_hits(
+        grid, entity, image.intrinsics, image.T_world_camera, image.depth, chosen, image.min_range, image.max_range,
+        set_bits, clear_bits, num_threads,
+    )  # fmt: skip
+
+
+def mark_spheres(grid: Float64, entity: UInt8, centers: Float64, radii: Float64, bits: int, num_threads: int) -> None:
+    """OR bits into the voxels of entity (X, Y, Z) that meet a sphere; centers (S, 3) [m], radii (S,) [m]."""
+    native.mark_spheres(grid, entity, centers, radii, bits, num_threads)

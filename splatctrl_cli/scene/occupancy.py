@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.kernels.occupancy import integrate_depth, mark_spheres, pack_grid
+from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, mark_spheres, pack_grid
 from splatctrl_cli.records import SWEPT, Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
 
 MAX_VOXELS = 400_000_000
@@ -29,26 +29,31 @@ class OccupancyMap:
         self.log_odds: Float32 = np.zeros(shape, np.float32)
         self.num_updates: NDArray[np.uint16] = np.zeros(shape, np.uint16)
         self.entity: NDArray[np.uint8] = np.zeros(shape, np.uint8)
-        self._marks: NDArray[np.uint8] = np.zeros((2, *shape), np.uint8)
+        self._hits: NDArray[np.uint8] = np.zeros(shape, np.uint8)
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
     def integrate(self, frame: RgbdFrame) -> None:
-        """Add one depth image: rays free what they pass, ends are hits."""
-        k = frame.intrinsics
+        """Add one depth image: what its rays pass is free, where they end are hits."""
         integrate_depth(
             self._packed,
             self.log_odds,
             self.num_updates,
-            self._marks,
-            np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64),
-            np.ascontiguousarray(frame.T_world_camera, np.float64),
-            np.where(frame.depth >= self.config.min_range, frame.depth, np.float32(0.0)).astype(np.float32),
+            self._hits,
+            self._image(frame),
             hit=self.config.log_odds_hit,
             miss=self.config.log_odds_miss,
             limit=self.config.log_odds_limit,
-            max_range=self.config.max_range,
-            stride=self.config.ray_stride,
             num_threads=self.num_threads,
+        )
+
+    def _image(self, frame: RgbdFrame) -> DepthImage:
+        k = frame.intrinsics
+        return DepthImage(
+            intrinsics=np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64),
+            T_world_camera=np.ascontiguousarray(frame.T_world_camera, np.float64),
+            depth=np.ascontiguousarray(frame.depth, np.float32),
+            min_range=self.config.min_range,
+            max_range=self.config.max_range,
         )
 
     def mark_robot(self, centers: Float64, radii: Float64) -> None:

@@ -2,14 +2,37 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import SWEPT, Box, Label
+from splatctrl_cli.geometry import back_project, invert_transform, look_at, transform_points
+from splatctrl_cli.records import SWEPT, Box, Intrinsics, Label, RgbdFrame
 from splatctrl_cli.scene.occupancy import OccupancyMap
+from tests.reference.occupancy import ray_walk
 from tests.scene.wall import WORKSPACE, frame
 
 CONFIG = OccupancyConfig(voxel=0.05)
+AROUND = Box(lower=np.array([-0.63, -0.61, -0.17]), upper=np.array([0.98, 0.94, 1.02]))  # the tilted camera is in it
+
+
+def tilted(*, rod: bool = False, holes: float = 0.0) -> RgbdFrame:
+    """What a tilted camera sees of the floor z = 0 and of a rod, thinner than a voxel, that may stand before it."""
+    k = Intrinsics(fx=48.0, fy=48.0, cx=23.0, cy=18.0, width=48, height=36)
+    T = look_at((0.7, 0.5, 0.8), (0.0, 0.0, 0.1))
+    rays = back_project(k, np.ones((k.height, k.width))) @ T[:3, :3].T
+    depth = (-T[2, 3] / np.minimum(rays[..., 2], -1e-6)).astype(np.float32)
+    if rod:
+        depth[6:30, 20] = 0.6
+    is_hole = (depth > 2.5) | (np.random.default_rng(0).random(depth.shape) < holes)
+    depth[is_hole] = 0.0
+    color = np.zeros((*depth.shape, 3), np.uint8)
+    return RgbdFrame(stamp_ns=0, camera="cam0", color=color, depth=depth, intrinsics=k, T_world_camera=T)
+
+
+def centers(grid: OccupancyMap) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """(X, Y, Z, 3) [m], world."""
+    return grid.origin + grid.config.voxel * np.stack(np.indices(grid.log_odds.shape), -1)
 
 
 def seen(*, block: float = 0.0, times: int = 3, threads: int = 1) -> OccupancyMap:
@@ -47,16 +70,80 @@ def test_a_block_that_leaves_becomes_free_again() -> None:
     assert grid.occupancy_around(top)[0][0] < 0.3
 
 
+@pytest.mark.parametrize(("rod", "holes", "share"), [(False, 0.0, 1.0), (True, 0.0, 0.95), (True, 0.3, 0.9)])
+def test_what_rays_pass_is_free_and_what_holds_a_point_is_hit(rod: bool, holes: float, share: float) -> None:
+    # Left out are voxels that rays pass only beside their centre: at the rim of the view, of holes, of a shadow.
+    grid = OccupancyMap(AROUND, OccupancyConfig(voxel=0.08), 2)
+    view = tilted(rod=rod, holes=holes)
+    grid.integrate(view)
+    passed, hit = ray_walk(view, grid.origin, 0.08, grid.log_odds.shape)
+    is_free = grid.log_odds < 0
+    assert ((grid.log_odds > 0) == hit).all()
+    assert not (is_free & ~passed).any()
+    within = binary_erosion(passed | hit, np.ones((3, 3, 3))) & passed
+    assert within.sum() > 300
+    assert is_free[within].mean() >= share
+    assert ((grid.num_updates > 0) == (is_free | hit)).all()
+
+
+def test_what_stands_behind_a_thin_thing_is_not_free() -> None:
+    grid = OccupancyMap(AROUND, CONFIG, 1)
+    view = tilted()
+    view.depth[:, 16:24] = 0.6
+    grid.integrate(view)
+    points = transform_points(invert_transform(view.T_world_camera), centers(grid))
+    u = points[..., 0] / points[..., 2] * view.intrinsics.fx + view.intrinsics.cx
+    is_behind = (points[..., 2] > 0.6) & (u > 16) & (u < 23)
+    assert is_behind.sum() > 1000
+    assert not (grid.log_odds[is_behind] < 0).any()
+
+
+def test_pixels_without_depth_free_nothing_of_their_own() -> None:
+    grid = OccupancyMap(AROUND, CONFIG, 1)
+    view = tilted()
+    view.depth[:, 16:] = 0.0
+    grid.integrate(view)
+    points = transform_points(invert_transform(view.T_world_camera), centers(grid))
+    u = points[..., 0] / points[..., 2] * view.intrinsics.fx + view.intrinsics.cx
+    is_blind = (points[..., 2] > 0.05) & (u > 16 + view.intrinsics.fx * CONFIG.voxel / points[..., 2])
+    assert is_blind.sum() > 1000
+    assert not grid.num_updates[is_blind].any()
+
+
 def test_thread_count_does_not_change_a_bit() -> None:
-    one, two = seen(block=0.1, threads=1), seen(block=0.1, threads=2)
-    assert one.log_odds.tobytes() == two.log_odds.tobytes()
-    assert one.num_updates.tobytes() == two.num_updates.tobytes()
+    grids = []
+    for threads in (1, 2, 5):
+        grid = OccupancyMap(AROUND, OccupancyConfig(voxel=0.02), threads)
+        for view in (tilted(), tilted(holes=0.5), frame(block=0.1)):
+            grid.integrate(view)
+        grids.append((grid.log_odds.tobytes(), grid.num_updates.tobytes()))
+    assert grids[0] == grids[1] == grids[2]
 
 
-def test_depth_beyond_the_range_says_nothing() -> None:
+def test_depth_beyond_the_range_hits_nothing_and_frees_what_is_within() -> None:
     grid = OccupancyMap(WORKSPACE, OccupancyConfig(voxel=0.05, max_range=0.9), 1)
     grid.integrate(frame())
+    x, y, z = np.moveaxis(centers(grid), -1, 0)
+    depth = 1.0 - z
+    is_in_view = (np.abs(x) < 0.4 * depth) & (np.abs(y) < 0.3 * depth)
+    assert not (grid.log_odds > 0).any()
+    assert (grid.log_odds[is_in_view & (depth < 0.9)] < 0).all()
+    assert not grid.num_updates[depth > 0.9].any()
+
+
+def test_depth_nearer_than_the_range_says_nothing() -> None:
+    grid = OccupancyMap(WORKSPACE, OccupancyConfig(voxel=0.05, min_range=1.1), 1)
+    grid.integrate(frame())
     assert not grid.num_updates.any()
+
+
+def test_counts_and_log_odds_stop_at_their_limits() -> None:
+    grid = seen(times=1)
+    grid.num_updates[grid.num_updates > 0] = 65535
+    for _ in range(20):
+        grid.integrate(frame())
+    assert set(np.unique(grid.num_updates)) == {0, 65535}
+    assert set(np.unique(grid.log_odds)) == {-2.0, 0.0, 2.0}
 
 
 def test_robot_bits_are_where_a_sphere_is_and_swept_bits_where_one_was() -> None:

@@ -2,6 +2,7 @@
 #include <stdexcept>
 
 #include "bind.h"
+#include "entity.h"
 #include "occupancy.h"
 
 namespace splatctrl {
@@ -20,49 +21,67 @@ VoxelGrid grid_from(const Array<const double>& values, std::size_t num_voxels) {
   return grid;
 }
 
+// intrinsics: fx, fy, cx, cy, width, height.
+DepthImage image_from(const Array<const double>& intrinsics, const Array<const double>& T_world_camera,
+                      const Array<const float>& depth, float min_range, float max_range) {
+  const double* k = intrinsics.data();
+  if (intrinsics.size() != 6 || T_world_camera.size() != 16 || depth.size() != static_cast<std::size_t>(k[4] * k[5])) {
+    throw std::invalid_argument("expected intrinsics (6,), T_world_camera (4, 4), depth (H, W)");
+  }
+  return {k[0],      k[1], k[2], k[3], static_cast<int>(k[4]), static_cast<int>(k[5]), T_world_camera.data(),
+          depth.data(), min_range, max_range};
+}
+
 }  // namespace
 
 void bind_occupancy(nb::module_& m) {
   m.def(
       "integrate_depth",
       [](const Array<const double>& grid, const Array<float>& log_odds, const Array<std::uint16_t>& num_updates,
-         const Array<std::uint8_t>& marks, const Array<const double>& intrinsics,
-         const Array<const double>& T_world_camera, const Array<const float>& depth, float hit, float miss,
-         float limit, float max_range, int stride, int num_threads) {
+         const Array<std::uint8_t>& hits, const Array<const double>& intrinsics,
+         const Array<const double>& T_world_camera, const Array<const float>& depth, float min_range,
+         float max_range, float hit, float miss, float limit, int num_threads) {
         const VoxelGrid g = grid_from(grid, log_odds.size());
-        Camera camera{};
-        const double* k = intrinsics.data();
-        camera.fx = static_cast<float>(k[0]);
-        camera.fy = static_cast<float>(k[1]);
-        camera.cx = static_cast<float>(k[2]);
-        camera.cy = static_cast<float>(k[3]);
-        camera.width = static_cast<int>(k[4]);
-        camera.height = static_cast<int>(k[5]);
-        if (num_updates.size() != log_odds.size() || marks.size() != 2 * log_odds.size() || intrinsics.size() != 6 ||
-            T_world_camera.size() != 16 ||
-            depth.size() != static_cast<std::size_t>(camera.width) * camera.height || stride < 1) {
-          throw std::invalid_argument("expected voxel arrays of one shape, intrinsics (6,), T (4, 4), depth (H, W)");
+        const DepthImage image = image_from(intrinsics, T_world_camera, depth, min_range, max_range);
+        if (num_updates.size() != log_odds.size() || hits.size() != log_odds.size()) {
+          throw std::invalid_argument("expected voxel arrays of one shape");
         }
         const nb::gil_scoped_release release;
-        integrate_depth(g, log_odds.data(), num_updates.data(), marks.data(), camera, T_world_camera.data(),
-                        depth.data(), {hit, miss, limit, max_range, stride}, num_threads);
+        integrate_depth(g, {log_odds.data(), num_updates.data(), hits.data()}, image, {hit, miss, limit},
+                        num_threads);
       },
       nb::arg("grid").noconvert(), nb::arg("log_odds").noconvert(), nb::arg("num_updates").noconvert(),
-      nb::arg("marks").noconvert(), nb::arg("intrinsics").noconvert(), nb::arg("T_world_camera").noconvert(),
-      nb::arg("depth").noconvert(), nb::arg("hit"), nb::arg("miss"), nb::arg("limit"), nb::arg("max_range"),
-      nb::arg("stride"), nb::arg("num_threads"));
+      nb::arg("hits").noconvert(), nb::arg("intrinsics").noconvert(), nb::arg("T_world_camera").noconvert(),
+      nb::arg("depth").noconvert(), nb::arg("min_range"), nb::arg("max_range"), nb::arg("hit"), nb::arg("miss"),
+      nb::arg("limit"), nb::arg("num_threads"));
+  m.def(
+      "label_hits",
+      [](const Array<const double>& grid, const Array<std::uint8_t>& entity, const Array<const double>& intrinsics,
+         const Array<const double>& T_world_camera, const Array<const float>& depth,
+         const Array<const std::uint8_t>& chosen, float min_range, float max_range, std::uint8_t set,
+         std::uint8_t clear, int num_threads) {
+        const VoxelGrid g = grid_from(grid, entity.size());
+        const DepthImage image = image_from(intrinsics, T_world_camera, depth, min_range, max_range);
+        if (chosen.size() != depth.size()) throw std::invalid_argument("chosen: expected (H, W), as depth");
+        if (set && clear) throw std::invalid_argument("set, clear: expected one of them to be 0");
+        const nb::gil_scoped_release release;
+        label_hits(g, entity.data(), image, chosen.data(), set, clear, num_threads);
+      },
+      nb::arg("grid").noconvert(), nb::arg("entity").noconvert(), nb::arg("intrinsics").noconvert(),
+      nb::arg("T_world_camera").noconvert(), nb::arg("depth").noconvert(), nb::arg("chosen").noconvert(),
+      nb::arg("min_range"), nb::arg("max_range"), nb::arg("set"), nb::arg("clear"), nb::arg("num_threads"));
   m.def(
       "mark_spheres",
       [](const Array<const double>& grid, const Array<std::uint8_t>& entity, const Array<const double>& centers,
-         const Array<const double>& radii, std::uint8_t bit, int num_threads) {
+         const Array<const double>& radii, std::uint8_t bits, int num_threads) {
         const VoxelGrid g = grid_from(grid, entity.size());
         if (centers.size() != 3 * radii.size()) throw std::invalid_argument("centers: expected (S, 3)");
         const nb::gil_scoped_release release;
-        mark_spheres(g, entity.data(), centers.data(), radii.data(), static_cast<int>(radii.size()), bit,
+        mark_spheres(g, entity.data(), centers.data(), radii.data(), static_cast<int>(radii.size()), bits,
                      num_threads);
       },
       nb::arg("grid").noconvert(), nb::arg("entity").noconvert(), nb::arg("centers").noconvert(),
-      nb::arg("radii").noconvert(), nb::arg("bit"), nb::arg("num_threads"));
+      nb::arg("radii").noconvert(), nb::arg("bits"), nb::arg("num_threads"));
 }
 
 }  // namespace splatctrl
