@@ -1,95 +1,153 @@
-"""``splatctrl export``: a scene's splats as a 3D-GS PLY, read back and rendered to check that it is the same."""
+"""``splatctrl export``: splats in the formats that viewers open, read back and rendered before they count."""
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError
+from splatctrl_cli.cli.export_check import check, compare, difference_table
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.records import Float32, Float64, Intrinsics, SplatSet
+    from splatctrl_cli.io.splat_formats import SplatFormat
+    from splatctrl_cli.records import GaussianSet, SplatSet
 
-MAX_PIXEL_DIFFERENCE = 0.01 / 255  # of a colour or opacity; depths by that share of the scene's size
-NUM_VIEWS = 4  # around the scene
-IMAGE_SIZE = (320, 240)
+LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
+SUFFIXES = ".ply, .splat, .spz, .glb, .usda, .usdc"
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
     parser = add_command(
-        subparsers, "export", run, summary="write a scene's splats as a 3D-GS PLY that stock viewers open"
+        subparsers, "export", run, summary="write splats as PLY, .splat, .spz, glTF or USD, and check what reads back"
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="a scene folder, or a splats.ply")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help=f"a scene folder, or a splat file: {SUFFIXES}")
     parser.add_argument(
         "--labels",
         metavar="NAME,...",
         help="only splats of these labels: object, robot, human (default: all)",
     )
-    add_output(parser, default="SCENE.ply, beside SCENE", what="the PLY file to write")
+    parser.add_argument(
+        "--layout",
+        choices=["short", "full"],
+        help="of a PLY: short has label and density and no harmonics, full has the reference's 62 properties "
+        "(default: short for isotropic splats; for others full, and a label where one is not object)",
+    )
+    parser.add_argument(
+        "--isotropic",
+        action="store_true",
+        help="make anisotropic Gaussians round: same volume, opacity and mean colour",
+    )
+    add_output(
+        parser, default="SCENE.ply, beside SCENE", what=f"the file to write; its suffix says the format: {SUFFIXES}"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.io.output import output_path, sha256
-    from splatctrl_cli.io.splats import read_ply, write_ply
+    from splatctrl_cli.io.splat_formats import read_splats
 
     source = _splat_file(args.scene)
     out = args.out or _beside(args.scene)
+    kind = _format(out, args.layout)
     if out.resolve() == source.resolve():
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
-    splats, comments = read_ply(source)
-    chosen = _select(splats, args.labels, source)
-    if not len(chosen):
+    splats, comments = read_splats(source)
+    selected = _select(splats, args.labels)
+    if not len(selected):
         raise NotEvaluableError(f"{source}: no splat to write among {len(splats)}", remedy="give other --labels")
+    chosen = _round(selected) if args.isotropic else selected
+    _check_layout(args.layout, chosen, source)
+    kept = {key: value for key, value in comments.items() if key not in LAYOUT_COMMENTS}
     with output_path(out, force=args.force, is_folder=False) as partial:
-        write_ply(partial, chosen, {**comments, "exported_from": f"{source.name} sha256 {sha256(source)}"})
-        difference, covered = _compare(chosen, read_ply(partial)[0])
-        if not difference <= MAX_PIXEL_DIFFERENCE:
-            raise WriteError(
-                f"{out}: does not render as its source: largest pixel difference {difference:.3g}, expected at most "
-                f"{MAX_PIXEL_DIFFERENCE:.3g}"
-            )
+        back = _write(partial, kind, chosen, {**kept, "exported_from": f"{source.name} sha256 {sha256(source)}"})
         result = {
             "file": str(out),
+            "format": kind.name,
             "bytes": partial.stat().st_size,
             "sha256": sha256(partial),
             "num_splats": len(chosen),
             "num_left_out": len(splats) - len(chosen),
-            "num_views_compared": NUM_VIEWS,
-            "largest_pixel_difference": difference,
-            "covered_share": covered,
+            **check(out, kind, chosen, back),
+            "isotropic_psnr": None if chosen is selected else compare(selected, chosen).psnr,
         }
-    Console(args).result(result, _lines(result))
+    Console(args).result(result, _lines(result, was_rounded=chosen is not selected))
     return 0
 
 
-def _lines(result: dict[str, Any]) -> list[str]:
+def _lines(result: dict[str, Any], *, was_rounded: bool) -> list[str]:
     left_out = f", {result['num_left_out']} left out by label" if result["num_left_out"] else ""
-    return [
-        f"{result['file']}: {result['num_splats']} splats{left_out}, {result['bytes']} bytes",
-        f"read back and rendered from {result['num_views_compared']} views ({100 * result['covered_share']:.0f} % of "
-        f"their pixels covered): largest pixel difference {result['largest_pixel_difference']:.2g}",
+    lines = [
+        f"{result['file']}: {result['num_splats']} splats{left_out}, {result['bytes']} bytes, {result['format']}"
     ]
+    if was_rounded:
+        lines.append(f"made isotropic: {_decibels(result['isotropic_psnr'])} against the source")
+    if result["not_kept"]:
+        lines.append(f"not kept: {', '.join(result['not_kept'])}")
+    if result["num_outside"]:
+        lines.append(
+            f"{result['num_outside']} splats have a size or colour beyond the format's range: put at its edge"
+        )
+    lines += difference_table(result["differences"], result["allowed"])
+    lines.append(
+        f"read back and rendered from {result['num_views_compared']} views ({100 * result['covered_share']:.0f} % of "
+        f"their pixels covered): {_decibels(result['psnr'])}, largest pixel difference "
+        f"{result['largest_pixel_difference']:.2g}"
+    )
+    return lines
+
+
+def _decibels(psnr: float | None) -> str:
+    return "the same" if psnr is None else f"PSNR {psnr:.1f} dB"
 
 
 def _beside(scene: Path) -> Path:
     place = scene if scene.name.strip(".") else scene.resolve()  # . and .. have no name of their own
-    return place.with_name(f"{place.name.removesuffix('.ply')}.ply")
+    suffix = "" if scene.is_dir() else scene.suffix
+    return place.with_name(f"{place.name.removesuffix(suffix)}.ply")
 
 
 def _splat_file(scene: Path) -> Path:
     if not scene.exists():
-        raise InputError(f"{scene}: no such scene", remedy="give a folder that reconstruct wrote, or a splats.ply")
+        raise InputError(f"{scene}: no such scene", remedy="give a folder that reconstruct wrote, or a splat file")
     file = scene / "splats.ply" if scene.is_dir() else scene
     if not file.is_file():
         raise InputError(
-            f"{scene}: has no splats.ply", remedy="give a folder that reconstruct wrote, or a splats.ply"
+            f"{scene}: has no splats.ply", remedy="give a folder that reconstruct wrote, or a splat file"
         )
     return file
 
 
-def _select(splats: "SplatSet", names: str | None, source: Path) -> "SplatSet":
+def _format(out: Path, layout: str | None) -> "SplatFormat":
+    from splatctrl_cli.io.splat_formats import REFERENCE_PLY, format_of
+
+    kind = format_of(out)
+    if layout is not None and out.suffix.lower() != ".ply":
+        raise UsageError(f"--layout {layout}: {out} is no PLY", remedy="leave it out")
+    return REFERENCE_PLY if layout == "full" else kind
+
+
+def _check_layout(layout: str | None, chosen: "SplatSet | GaussianSet", source: Path) -> None:
+    from splatctrl_cli.records import GaussianSet
+
+    if layout == "short" and isinstance(chosen, GaussianSet):
+        raise UsageError(
+            f"--layout short: expected isotropic splats, {source} has {len(chosen)} Gaussians that are not all so",
+            remedy="give --isotropic, or --layout full",
+        )
+
+
+def _round(splats: "SplatSet | GaussianSet") -> "SplatSet | GaussianSet":
+    """The nearest isotropic set; splats that are isotropic as they are."""
+    from splatctrl_cli.io.isotropic import nearest_splats
+    from splatctrl_cli.records import GaussianSet
+
+    return nearest_splats(splats) if isinstance(splats, GaussianSet) else splats
+
+
+def _select(splats: "SplatSet | GaussianSet", names: str | None) -> "SplatSet | GaussianSet":
     import numpy as np
 
     from splatctrl_cli.records import Label
@@ -104,36 +162,20 @@ def _select(splats: "SplatSet", names: str | None, source: Path) -> "SplatSet":
     return splats.select(np.isin(splats.labels, [known[name] for name in chosen]))
 
 
-def _compare(a: "SplatSet", b: "SplatSet") -> tuple[float, float]:
-    """Largest difference of a colour, opacity, or depth over the scene's size, in views around it; share covered.
+def _write(
+    partial: Path, kind: "SplatFormat", splats: "SplatSet | GaussianSet", comments: Mapping[str, str]
+) -> "SplatSet | GaussianSet":
+    """Write the splats and return what reads back; isotropic ones in a PLY keep their density."""
+    from splatctrl_cli.io.isotropic import as_gaussians, as_splats
+    from splatctrl_cli.io.splat_formats import FORMATS
+    from splatctrl_cli.io.splats import read_ply, write_ply
+    from splatctrl_cli.records import GaussianSet
 
-    A pixel is covered where anything shows.
-    """
-    import numpy as np
-
-    from splatctrl_cli.scene.render import render
-
-    intrinsics, poses, size = _views(a.centers)
-    largest, covered = 0.0, 0.0
-    for T_world_camera in poses:
-        one, two = (render(splats, intrinsics, T_world_camera) for splats in (a, b))
-        pairs = ((one.color, two.color), (one.opacity, two.opacity), (one.depth / size, two.depth / size))
-        largest = max(largest, *(float(np.abs(x.astype(np.float64) - y).max()) for x, y in pairs))
-        covered += float(np.mean(one.opacity > 0)) / len(poses)
-    return largest, covered
-
-
-def _views(centers: "Float32") -> tuple["Intrinsics", "list[Float64]", float]:
-    """Cameras evenly around the box that holds most of the splats, from above, and that box's diagonal [m]."""
-    import numpy as np
-
-    from splatctrl_cli.geometry import look_at
-    from splatctrl_cli.records import Intrinsics
-
-    lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
-    middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
-    width, height = IMAGE_SIZE
-    intrinsics = Intrinsics(fx=width, fy=width, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height)
-    angles = 2 * np.pi * (np.arange(NUM_VIEWS) + 0.5) / NUM_VIEWS
-    directions = np.column_stack([np.cos(angles), np.sin(angles), np.full(NUM_VIEWS, 0.7)])
-    return intrinsics, [look_at(middle + size * direction, middle) for direction in directions], size
+    if isinstance(splats, GaussianSet):
+        kind.write(partial, splats, comments)
+        return kind.read(partial)[0]
+    if kind is FORMATS[".ply"]:
+        write_ply(partial, splats, comments)
+        return read_ply(partial)[0]
+    kind.write(partial, as_gaussians(splats), comments)
+    return as_splats(kind.read(partial)[0], str(partial))

@@ -15,6 +15,7 @@ from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.describe_splats import describe_splats
 from splatctrl_cli.io.summary import Grid, Summary
 
 _HEAD = 1 << 16  # bytes in which a text header must end
@@ -32,7 +33,8 @@ def describe_file(path: Path) -> Summary:
             return describe(path, head)
     raise InputError(
         f"{path}: unknown kind of file",
-        remedy="known: .mcap .bag .db3 .toml .ply .npz .npy .vti .urdf .json .jsonl .csv .yaml .png .jpg",
+        remedy="known: .mcap .bag .db3 .toml .ply .splat .spz .glb .usda .usdc .npz .npy .vti .urdf .json .jsonl "
+        ".csv .yaml .png .jpg",
     )
 
 
@@ -226,6 +228,7 @@ _KINDS: tuple[tuple[Callable[[Path, bytes], bool], Callable[[Path, bytes], Summa
     (lambda _, head: head.startswith(b"\x93NUMPY"), _npy),
     (lambda _, head: head.startswith((b"\x89PNG", b"\xff\xd8\xff")), _image),
     (lambda path, head: path.suffix == ".vti" or b'type="ImageData"' in head[:512], _vti),
+    (_suffix(".splat", ".spz", ".glb", ".usda", ".usdc"), describe_splats),
     (_suffix(".urdf", ".xacro"), _urdf),
     (_suffix(".json"), _json),
     (_suffix(".jsonl", ".csv"), _rows),

@@ -15,9 +15,11 @@ from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.io.capture import write_capture
 from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.source import SourceOptions, open_source
+from splatctrl_cli.io.splat_formats import FORMATS
 from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.records import SplatSet
 from tests.io.make_log import LogRecipe, make_log
+from tests.io.test_gaussian_ply import gaussian_set
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
@@ -153,6 +155,17 @@ def test_a_field_folder_is_described_by_what_its_grid_covers(tmp_path: Path) -> 
         "splats_used": {"object": 1, "robot": 0, "human": 0},
         "observed": "no occupancy grid: all never seen",
     }
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz", ".glb"])
+def test_a_splat_file_of_a_binary_format_is_described_by_its_content(tmp_path: Path, suffix: str) -> None:
+    gaussians = gaussian_set(30, degree=0)
+    FORMATS[suffix].write(tmp_path / f"a{suffix}", gaussians, {})
+    summary = describe(tmp_path / f"a{suffix}")
+    assert summary.kind == "splats"
+    assert (summary.facts["splats"], summary.facts["shape"]) == (30, "anisotropic")
+    assert summary.facts["degree_of_harmonics"] == 0
+    np.testing.assert_allclose(np.array(summary.facts["lower_m"]), gaussians.centers.min(axis=0), atol=1e-3)
 
 
 def test_a_folder_with_anothers_field_json_is_a_run_folder(tmp_path: Path) -> None:
