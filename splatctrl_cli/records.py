@@ -50,7 +50,8 @@ class RgbdFrame:
     """One colour image with its registered depth and pose.
 
     color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = none;
-    T_world_camera (4, 4) float64 maps optical camera coordinates (z forward) to world.
+    T_world_camera (4, 4) float64 maps optical camera coordinates (z forward) to world; human (H, W) uint8, not 0
+    where the pixel shows a person, None where nobody looked for one.
     """
 
     stamp_ns: int
@@ -59,6 +60,7 @@ class RgbdFrame:
     depth: Float32
     intrinsics: Intrinsics
     T_world_camera: Float64
+    human: UInt8 | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

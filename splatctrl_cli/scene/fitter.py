@@ -21,9 +21,10 @@ from splatctrl_cli.kernels.raster import (
 )
 from splatctrl_cli.records import Bool, Box, Float32, Intrinsics, Label, OccupancyGrid, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
+from splatctrl_cli.scene.labels import relabel
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture, carried
-from splatctrl_cli.scene.removal import removals, robot_labels, seen_through
+from splatctrl_cli.scene.removal import removals, seen_through
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
@@ -59,6 +60,7 @@ class AuditRow:
     unmet: int
     removed: dict[str, int]
     robot: int
+    human: int
     loss: float | None
     psnr: float | None
 
@@ -100,8 +102,9 @@ class SceneFitter:
         views = [self._view(frame) for frame in frames]
         for frame in frames:
             self.occupancy.integrate(frame)
+        self.occupancy.mark_humans(frames)
         self._carry(robot)
-        is_trail = self._label(robot)
+        is_trail = relabel(self.buffer, self.occupancy, robot)
         removed = self._remove(is_trail, self._floating(frames))
         is_first = self.density is None
         filled = self._seed(views)
@@ -111,7 +114,7 @@ class SceneFitter:
         self._optimise(num_iterations, rng, self._settings())
         self._prune(robot, frames, removed)
         filled += self._fill_gaps(views)
-        self._label(robot)
+        relabel(self.buffer, self.occupancy, robot)
         self.num_steps += 1
         return self._audit(views, filled, removed)
 
@@ -148,17 +151,6 @@ class SceneFitter:
         min_range = self.occupancy.config.min_range
         return make_view(frame, inside_workspace(frame, world_points(frame), self.workspace, min_range))
 
-    def _label(self, robot: RobotPosture | None) -> Bool:
-        """Label the robot's splats; returns those (M,) that were robot and no longer are: its trail."""
-        was_robot: Bool = self.buffer.labels == Label.ROBOT
-        if robot is None:
-            return np.zeros(len(was_robot), bool)
-        is_robot = robot_labels(self.buffer, self.occupancy, robot.centers, robot.radii)
-        is_trail: Bool = was_robot & ~is_robot
-        self.buffer.labels[is_robot] = Label.ROBOT
-        self.buffer.labels[is_trail] = Label.OBJECT
-        return is_trail
-
     def _carry(self, robot: RobotPosture | None) -> None:
         """Move the robot's splats with the link of the sphere they are nearest to."""
         before, self._posture = self._posture, robot
@@ -177,7 +169,7 @@ class SceneFitter:
 
     def _prune(self, robot: RobotPosture | None, frames: Sequence[RgbdFrame], removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into the air or out; adds to the counts in `removed`."""
-        drifted = self._label(robot)
+        drifted = relabel(self.buffer, self.occupancy, robot)
         self.buffer.kill(drifted)
         floating = self._floating(frames)
         self.buffer.kill(floating)
@@ -309,6 +301,7 @@ class SceneFitter:
             unmet=filled.unmet,
             removed=removed,
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
+            human=int((buffer.labels[buffer.is_alive] == Label.HUMAN).sum()),
             loss=round(float(np.mean(image)) + c.lambda_reg * opacity, 6) if image else None,
             psnr=None if squared is None else round(-10.0 * float(np.log10(max(squared, 1e-12))), 4),
         )

@@ -1,11 +1,13 @@
 """The occupancy grid of III-C: what the depth images have seen free, occupied, or never."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, mark_spheres, pack_grid
+from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
 from splatctrl_cli.records import SWEPT, Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
 
 MAX_VOXELS = 400_000_000
@@ -61,12 +63,45 @@ class OccupancyMap:
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
         mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
 
+    def mark_humans(self, frames: Sequence[RgbdFrame]) -> None:
+        """Set the human bit in the voxels that human pixels of `frames`, one time step's, hit.
+
+        A voxel loses it when the masked images of a time step hit it with other pixels alone, or when it is rather
+        free than full. What no masked image hits keeps it: who stands behind something is still there.
+        """
+        masked = [(frame, frame.human) for frame in frames if frame.human is not None]
+        for frame, human in masked:
+            self._label_hits(frame, human == 0, clear_bits=Label.HUMAN)
+        for frame, human in masked:
+            self._label_hits(frame, human != 0, set_bits=Label.HUMAN)
+        if masked:
+            self.entity[self.log_odds < 0] &= np.uint8(~Label.HUMAN & 0xFF)
+
+    def _label_hits(self, frame: RgbdFrame, chosen: Bool, *, set_bits: int = 0, clear_bits: int = 0) -> None:
+        label_hits(
+            self._packed,
+            self.entity,
+            self._image(frame),
+            np.ascontiguousarray(chosen).view(np.uint8),
+            set_bits=set_bits,
+            clear_bits=clear_bits,
+            num_threads=self.num_threads,
+        )
+
     def entity_at(self, points_world: Float32) -> NDArray[np.uint8]:
         """Entity bits (N,) of the voxels that hold points (N, 3); 0 outside the grid."""
-        cell = np.floor((points_world - self.origin) / self.config.voxel + 0.5).astype(np.int64)
+        cell = np.floor((points_world - self.origin) / self.config.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.entity.shape), axis=1)
-        i, j, k = np.clip(cell, 0, np.array(self.entity.shape) - 1).T
+        i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
         return np.where(is_inside, self.entity[i, j, k], np.uint8(0))
+
+    def entity_around(self, points_world: Float32) -> NDArray[np.uint8]:
+        """Entity bits (N,) of the eight voxels nearest to each point (N, 3), together."""
+        bits = np.zeros(len(points_world), np.uint8)
+        for corner in np.ndindex(2, 2, 2):
+            offset = self.config.voxel * (np.array(corner, np.float32) - np.float32(0.5))
+            bits |= self.entity_at(points_world + offset)
+        return bits
 
     def occupancy_around(self, points_world: Float32) -> tuple[Float32, Bool]:
         """The largest occupancy (N,) of the eight voxels nearest to each point, and whether any was ever seen.

@@ -5,19 +5,11 @@ from scipy.ndimage import minimum_filter
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import invert_transform, project, transform_points
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
+from splatctrl_cli.records import Bool, Box, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 
 REASONS = ("broken", "workspace", "opacity", "free", "uncertain", "trail")
-
-
-def inside_spheres(points: Float32, centers: Float64, radii: Float64, margin: float) -> Bool:
-    """Points (N, 3) within `margin` [m] of a sphere of (S, 3), (S,) [m]."""
-    inside = np.zeros(len(points), bool)
-    for center, radius in zip(centers, radii, strict=True):
-        inside |= np.sum((points - center) ** 2, axis=1) <= (radius + margin) ** 2
-    return inside
 
 
 def seen_through(centers: Float32, frame: RgbdFrame, tolerance: float) -> Bool:
@@ -57,7 +49,7 @@ def removals(
 
     broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free, or
     a camera sees through it.
-    uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot, is no longer.
+    uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot or human, is no longer.
     Updates the buffer's count of uncertain time steps,
     where this is one. Splats whose surroundings were never seen stay, unless the
     rule is "literal".
@@ -95,12 +87,3 @@ def _verdict(value: Float32, is_observed: Bool, config: OccupancyConfig) -> tupl
         is_observed & (value < config.free_below),
         is_observed & (value >= config.free_below) & (value < config.occupied_above),
     )
-
-
-def robot_labels(buffer: SplatBuffer, occupancy: OccupancyMap, centers: Float64, radii: Float64) -> Bool:
-    """Splats (M,) of the robot: those in voxels that its spheres meet, then within a margin of a sphere itself."""
-    margin = occupancy.config.robot_margin
-    occupancy.mark_robot(centers, radii + margin)
-    is_robot = buffer.is_alive & (occupancy.entity_at(buffer.centers) & Label.ROBOT > 0)
-    is_robot[is_robot] = inside_spheres(buffer.centers[is_robot], centers, radii, margin)
-    return is_robot

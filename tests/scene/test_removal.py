@@ -7,7 +7,7 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.records import Bool
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.removal import inside_spheres, removals, seen_through
+from splatctrl_cli.scene.removal import removals, seen_through
 from tests.scene.wall import WORKSPACE, frame
 
 FLOOR, AIR, OUTSIDE, BELOW = [0.2, 0.2, 0.0], [0.2, 0.2, 0.3], [3.0, 0.0, 0.0], [0.0, 0.0, 0.1]
@@ -88,11 +88,6 @@ def test_what_no_camera_looks_at_does_not_float() -> None:
     points = np.float32([[0.1, 0.1, 0.3], [9.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
     assert not seen_through(points, blind, 0.015).any()
     assert not seen_through(points[1:], frame(), 0.015).any()
-
-
-def test_inside_spheres_counts_the_margin() -> None:
-    points = np.float32([[0.0, 0.0, 0.0], [0.11, 0.0, 0.0], [0.13, 0.0, 0.0]])
-    assert inside_spheres(points, np.zeros((1, 3)), np.array([0.1]), 0.02).tolist() == [True, True, False]
 
 
 def test_a_trail_goes_from_the_surface_it_lies_on() -> None:
