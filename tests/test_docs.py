@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])
 CODE = re.compile(r"`([^`\n]+)`")
 PLACE = re.compile(r"([\w/]+\.(?:py|h|cpp))(?:: (.+))?")
-SETTING = re.compile(r"((?:scene|occupancy|field|control)\.\w+)(?: = (.+))?")
+SETTING = re.compile(r"((?:scene|gaussians|occupancy|field|control)\.\w+)(?: = (.+))?")
 
 
 def generated() -> dict[str, str]:

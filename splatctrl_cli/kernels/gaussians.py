@@ -30,12 +30,14 @@ class GaussianRasteriser:
         self.native: Any = native.Rasteriser()
         self.degree = 0
         self._colors: Float32 = np.empty((0, 3), np.float32)
+        self._gradients: Float32 = np.empty((0, 10), np.float32)
         self._shape = (0, 0)
 
     def prepare(self, camera: Float64, parameters: Float32, degree: int = 3) -> None:
         """Project, colour (harmonics up to `degree`), sort and bin the Gaussians for a `pack_camera` camera."""
         if len(self._colors) != len(parameters):
             self._colors = np.empty((len(parameters), 3), np.float32)  # the kernel keeps a pointer to it
+            self._gradients = np.empty((len(parameters), 10), np.float32)
         self._shape = (int(camera[5]), int(camera[4]))
         self.degree = degree
         native.prepare_gaussians(self.native, camera, parameters, degree, self._colors, self.num_threads)
@@ -47,10 +49,12 @@ class GaussianRasteriser:
         return planes
 
     def backward(self, planes: Float32, plane_gradients: Float32) -> Float32:
-        """Gradients (N, 10) of the footprints: u, v, conic a, b, c, depth, opacity, red, green, blue."""
-        gradients = np.empty((len(self._colors), 10), np.float32)
-        self.native.backward(planes, plane_gradients, gradients, self.num_threads)
-        return gradients
+        """Gradients (N, 10) of the footprints: u, v, conic a, b, c, depth, opacity, red, green, blue.
+
+        The next call writes to the same array.
+        """
+        self.native.backward(planes, plane_gradients, self._gradients, self.num_threads)
+        return self._gradients
 
     def parameter_gradients(self, parameters: Float32, gradients: Float32) -> Float32:
         """Gradients (N, 59) of the prepared parameters from those of their footprints (N, 10)."""
