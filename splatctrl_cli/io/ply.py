@@ -53,7 +53,10 @@ class PlyFile:
         values = self.rows[name].astype(np.float64)
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
-            raise InputError(f"{self.path}: splat {bad[0]}: {name}: expected a finite number, got {values[bad[0]]}")
+            raise InputError(
+                f"{self.path}: splat {bad[0]}: {name}: expected a finite number, got {values[bad[0]]} "
+                f"({len(bad)} of {len(self)} are not finite)"
+            )
         return values
 
 

@@ -5,6 +5,7 @@ says that z is up and that a unit is a metre. Needs the library usd-core, which 
 """
 
 import errno
+import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,8 +53,11 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
     layer.customLayerData = {"frame": "world", **comments}
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         named = Path(folder) / f"{NAME}{suffix}"
-        if not layer.Export(str(named)):
-            raise OSError(errno.EIO, "the USD library could not write it", str(path))
+        try:
+            layer.Export(str(named))
+        except Exception as error:  # of the library's own type; it repeats itself for every block
+            code = errno.ENOSPC if os.strerror(errno.ENOSPC) in str(error) else errno.EIO
+            raise OSError(code, os.strerror(code), str(path)) from None
         named.replace(path)
 
 

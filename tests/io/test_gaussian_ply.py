@@ -136,7 +136,7 @@ PLAIN = [name for name in NAMES if name[0] != "n" and not name.startswith("f_res
 @pytest.mark.parametrize(
     ("index", "value", "message"),
     [
-        (1, "nan", "splat 1: y: expected a finite number, got nan"),
+        (1, "nan", r"splat 1: y: expected a finite number, got nan \(1 of 2 are not finite\)"),
         (12, "inf", "splat 1: rot_2: expected a finite number, got inf"),
         (8, 200, r"splat 1: scale_1: expected a radius that float32 holds \[m\]"),
         (10, 0, "splat 1: rotation: expected a quaternion that is not zero"),

@@ -1,5 +1,6 @@
 """OpenUSD particle fields: what the library says of the file, and what is refused."""
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -54,3 +55,16 @@ def test_a_field_without_scales_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text(text)
     with pytest.raises(InputError, match="its ParticleField3DGaussianSplat has no scales"):
         read_usd(tmp_path / "a.usda", suffix=".usda")
+
+
+def test_a_disk_that_is_full_is_an_error_of_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pxr import Sdf, Tf
+
+    def export(_layer: object, _path: str) -> None:
+        raise Tf.ErrorException("Error occurred writing file: No space left on device")
+
+    monkeypatch.setattr(Sdf.Layer, "Export", export)
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        write_usd(tmp_path / "a.usdc", gaussian_set(2), {}, suffix=".usdc")
+    assert caught.value.errno == errno.ENOSPC
+    assert not list(tmp_path.iterdir())
