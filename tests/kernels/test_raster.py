@@ -126,3 +126,11 @@ def test_wrong_dtype_is_refused() -> None:
     centers, radii, opacities, colors = splats()
     with pytest.raises(TypeError):
         Rasteriser(1).prepare(camera(), centers.astype(np.float64), radii, opacities, colors)  # type: ignore[arg-type]
+
+
+def test_backward_before_forward_is_refused() -> None:
+    raster = Rasteriser(1)
+    raster.prepare(camera(), *splats())
+    planes = np.zeros((5, 37, 45), np.float32)
+    with pytest.raises(RuntimeError, match="expected forward"):
+        raster.backward(planes, planes)

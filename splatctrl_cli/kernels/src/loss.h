@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 namespace splatctrl {
@@ -23,19 +24,25 @@ struct LossTerms {
   double squared = 0.0;  // mean squared colour error, for PSNR
 };
 
+struct LossScratch;
+
 // SSIM with an 11 x 11 Gaussian window of sigma 1.5, zero beyond the border, C1 = 0.01^2, C2 = 0.03^2.
 class ImageLoss {
  public:
+  ImageLoss();
+  ImageLoss(const ImageLoss&) = delete;
+  ImageLoss& operator=(const ImageLoss&) = delete;
+  ~ImageLoss();
+
   // planes (5, H, W) as the rasteriser writes them; color (3, H, W) in [0, 1]; depth (H, W) [m], 0 = none; counted
   // (H, W), 0 = this pixel is none of the map's business: it is given its target's colour, and no colour gradient.
   // Writes plane_gradients (5, H, W). Means are over counted pixels.
-  LossTerms evaluate(const float* planes, const float* color, const float* depth, const std::uint8_t* counted, int width,
-                     int height, const LossWeights& weights, float* plane_gradients, int num_threads);
+  LossTerms evaluate(const float* planes, const float* color, const float* depth, const std::uint8_t* counted,
+                     int width, int height, const LossWeights& weights, float* plane_gradients, int num_threads);
 
  private:
-  std::vector<float> seen_;  // (3, H, W) colours that are compared
-  std::vector<float> maps_;  // (3 channels, 3 maps, H, W): dSSIM/d(mean, second moment, cross moment)
-  std::vector<double> rows_; // (H, 5) partial sums
+  std::vector<std::unique_ptr<LossScratch>> scratch_;  // one per thread
+  std::vector<LossTerms> bands_;                       // partial sums
 };
 
 }  // namespace splatctrl

@@ -1,8 +1,13 @@
 // Eight floats at a time, in the compiler's own vector types: AVX2 on x86-64-v3, pairs of SSE or NEON elsewhere.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #include <cstring>
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
 
 namespace splatctrl {
 
@@ -19,11 +24,41 @@ inline Float8 load8(const float* p) {
 
 inline void store8(float* p, Float8 v) { std::memcpy(p, &v, sizeof v); }
 
+#if defined(__AVX__)
+inline Float8 min8(Float8 a, Float8 b) { return (Float8)_mm256_min_ps((__m256)a, (__m256)b); }
+inline Float8 max8(Float8 a, Float8 b) { return (Float8)_mm256_max_ps((__m256)a, (__m256)b); }
+#else
 inline Float8 min8(Float8 a, Float8 b) { return a < b ? a : b; }
 inline Float8 max8(Float8 a, Float8 b) { return a > b ? a : b; }
+#endif
 
-// Sum of the lanes, in one fixed order.
-inline float sum8(Float8 v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); }
+// v where the mask is set, 0 elsewhere.
+inline Float8 keep8(Int8 mask, Float8 v) { return (Float8)(mask & (Int8)v); }
+
+inline Float8 sqrt8(Float8 v) {
+#if defined(__AVX__)
+  return (Float8)_mm256_sqrt_ps((__m256)v);
+#else
+  Float8 root;
+  for (int lane = 0; lane < 8; ++lane) root[lane] = std::sqrt(v[lane]);
+  return root;
+#endif
+}
+
+// The lanes' sign bits, lane 0 lowest.
+inline unsigned signs8(Int8 v) {
+#if defined(__AVX__)
+  return static_cast<unsigned>(_mm256_movemask_ps((__m256)v));
+#elif defined(__SSE2__)
+  __m128 half[2];
+  std::memcpy(half, &v, sizeof half);
+  return static_cast<unsigned>(_mm_movemask_ps(half[0]) | _mm_movemask_ps(half[1]) << 4);
+#else
+  unsigned bits = 0;
+  for (int lane = 0; lane < 8; ++lane) bits |= (static_cast<std::uint32_t>(v[lane]) >> 31) << lane;
+  return bits;
+#endif
+}
 
 inline bool any8(Int8 mask) {
   std::int64_t part[4];
@@ -31,24 +66,38 @@ inline bool any8(Int8 mask) {
   return (part[0] | part[1] | part[2] | part[3]) != 0;
 }
 
-// exp(x) for x in [-87, 88], relative error below 2e-7; x below -87 gives exp(-87). Range reduction by ln 2 in two
-// parts, then the degree-6 Taylor polynomial on |r| <= ln(2) / 2.
-inline Float8 exp8(Float8 x) {
-  const Float8 magic = splat8(12582912.0f);  // 1.5 * 2^23: adding it rounds to the nearest integer
-  x = max8(x, splat8(-87.0f));
-  const Float8 n = (x * 1.44269504088896341f + magic) - magic;
-  const Float8 r = (x - n * 0.693359375f) + n * 2.12194440e-4f;
-  Float8 p = splat8(1.3888888889e-3f);
-  p = p * r + 8.3333333333e-3f;
-  p = p * r + 4.1666666667e-2f;
-  p = p * r + 1.6666666667e-1f;
-  p = p * r + 0.5f;
-  p = p * r + 1.0f;
-  p = p * r + 1.0f;
-  const Int8 exponent = (__builtin_convertvector(n, Int8) + 127) << 23;
-  Float8 scale;
-  std::memcpy(&scale, &exponent, sizeof scale);
-  return p * scale;
+// Sum of the lanes, in one fixed order.
+inline float sum8(Float8 v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); }
+
+// Lane k is the sum of the lanes of in[k], in one fixed order: a third of the work of eight sum8.
+inline Float8 sums8(const Float8 in[8]) {
+  Float8 pairs[4], fours[2];  // lanes 0 + 2 and 1 + 3 of two vectors; then of four, lower and upper half apart
+  for (int k = 0; k < 4; ++k) {
+    const Float8 a = in[2 * k], b = in[2 * k + 1];
+    pairs[k] = __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13) +
+               __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
+  }
+  for (int k = 0; k < 2; ++k) {
+    const Float8 a = pairs[2 * k], b = pairs[2 * k + 1];
+    fours[k] = __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13) +
+               __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
+  }
+  return __builtin_shufflevector(fours[0], fours[1], 0, 1, 2, 3, 8, 9, 10, 11) +
+         __builtin_shufflevector(fours[0], fours[1], 4, 5, 6, 7, 12, 13, 14, 15);
+}
+
+// 2^x for x in [-126, 127], relative error below 3e-7; any value, NaN included, for x outside.
+// x = n + f with |f| <= 1/2; 2^f is a polynomial fitted for the relative error (8e-8), by pairs of terms: as many
+// operations as Horner's rule and two more, in half the time until the result is there.
+inline Float8 exp2_8(Float8 x) {
+  const Float8 shifted = x + 12582912.0f;  // 1.5 * 2^23 leaves the nearest integer in the low bits
+  const Float8 f = x - (shifted - 12582912.0f);
+  const Float8 ff = f * f;
+  const Float8 low = 0.6931469440f * f + 1.0000001192f;
+  const Float8 middle = 0.0555071309f * f + 0.2402212024f;
+  const Float8 high = 0.0013276471f * f + 0.0096755410f;
+  const Float8 p = (high * ff + middle) * ff + low;
+  return (Float8)((Int8)p + ((Int8)shifted << 23));
 }
 
 }  // namespace splatctrl
