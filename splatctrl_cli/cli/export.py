@@ -40,7 +40,7 @@ def register(subparsers: Subparsers) -> None:
         help="make anisotropic Gaussians round: same volume, opacity and mean colour",
     )
     add_output(
-        parser, default="SCENE.ply, beside SCENE", what=f"the file to write; its suffix says the format: {SUFFIXES}"
+        parser, default="SCENE.ply, beside SCENE", what=f"the file to write; its suffix is the format: {SUFFIXES}"
     )
 
 
@@ -121,10 +121,10 @@ def _splat_file(scene: Path) -> Path:
 
 
 def _format(out: Path, layout: str | None) -> "SplatFormat":
-    from splatctrl_cli.io.splat_formats import REFERENCE_PLY, format_of
+    from splatctrl_cli.io.splat_formats import FORMATS, REFERENCE_PLY, format_of
 
     kind = format_of(out)
-    if layout is not None and out.suffix.lower() != ".ply":
+    if layout is not None and kind is not FORMATS[".ply"]:
         raise UsageError(f"--layout {layout}: {out} is no PLY", remedy="leave it out")
     return REFERENCE_PLY if layout == "full" else kind
 

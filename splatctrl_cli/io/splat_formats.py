@@ -92,10 +92,10 @@ FORMATS = {
 
 
 def format_of(path: Path) -> SplatFormat:
-    """The format that the suffix of `path` names. Raises UsageError for an unknown one."""
-    found = FORMATS.get(path.suffix.lower())
+    """The format that the suffix of `path` names, PLY without one. Raises UsageError for an unknown one."""
+    found = FORMATS.get(path.suffix.lower() or ".ply")
     if found is None:
-        raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix or 'none'}")
+        raise UsageError(f"{path}: expected a suffix of {', '.join(FORMATS)}, got {path.suffix}")
     return found
 
 
@@ -104,10 +104,12 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 
     Raises InputError for a file that is missing, not whole, of an unknown kind, or holds what is no splat.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise InputError(f"{path}: expected a splat file ({', '.join(FORMATS)}), got {path.suffix or 'no suffix'}")
-    if path.suffix.lower() != ".ply":
-        gaussians, comments = format_of(path).read(path)
+    try:
+        kind = format_of(path)
+    except UsageError as error:
+        raise InputError(error.message) from None
+    if kind is not FORMATS[".ply"]:
+        gaussians, comments = kind.read(path)
         return (as_splats(gaussians, str(path)) if is_isotropic(gaussians) else gaussians), comments
     ply = read_table(path, "vertex", splats.REQUIRED)
     has_rest = any(name.startswith("f_rest_") and ply.column(name).any() for name in ply.names)

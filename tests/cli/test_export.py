@@ -228,7 +228,7 @@ def test_anisotropic_gaussians_are_made_isotropic_on_request_alone(
         (["scene", "-o", "scene/splats.ply", "--force"], 2, "is the input itself"),
         (["scene", "-o", "out.stl"], 2, "out.stl: expected a suffix of .ply, .splat, .spz, .glb, .usda, .usdc"),
         (["scene", "-o", "out.spz", "--layout", "full"], 2, "--layout full: out.spz is no PLY"),
-        (["notes.txt"], 4, "notes.txt: expected a splat file"),
+        (["notes.txt"], 4, "notes.txt: expected a suffix of .ply, .splat, .spz"),
         (["scene", "-o", "taken.ply"], 2, "taken.ply: already exists; give --force"),
         (["cut.ply"], 4, "cut.ply: cut short: expected"),
         (["robot.ply", "--labels", "human"], 5, "no splat to write among 3"),

@@ -153,8 +153,9 @@ def test_a_ply_without_rotation_is_read_where_it_is_round_and_refused_where_not(
 def test_an_unknown_suffix_names_the_known() -> None:
     with pytest.raises(UsageError, match=r"a\.stl: expected a suffix of \.ply, \.splat, \.spz, .*, got \.stl"):
         format_of(Path("a.stl"))
-    with pytest.raises(InputError, match=r"a: expected a splat file \(\.ply, .*\), got no suffix"):
-        read_splats(Path("a"))
+    with pytest.raises(InputError, match=r"a\.txt: expected a suffix of \.ply, .*, got \.txt"):
+        read_splats(Path("a.txt"))
+    assert format_of(Path("a")) is FORMATS[".ply"]
 
 
 def test_without_the_usd_library_the_remedy_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
