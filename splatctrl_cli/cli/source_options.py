@@ -29,6 +29,13 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=X,Y,Z,QX,QY,QZ,QW",
         help="pose of a fixed camera in the world, instead of tf (repeatable)",
     )
+    group.add_argument(
+        "--human-topic",
+        action="append",
+        default=[],
+        metavar="NAME=TOPIC",
+        help="mono8 masks of a camera's colour images, not 0 where they show a person (repeatable)",
+    )
     group.add_argument("--world-frame", metavar="FRAME", help="tf frame of poses (default: root of the tf tree)")
     group.add_argument("--depth-scale", type=float, metavar="M", help="metres per count of depth (default: 0.001)")
     group.add_argument(
@@ -57,6 +64,7 @@ def source_options(args: argparse.Namespace) -> "SourceOptions":
         cameras=_names(args.cameras),
         camera_topics=tuple(_topics(text) for text in args.camera),
         camera_poses=dict(_pose(text) for text in args.camera_pose),
+        human_topics=dict(_human_topic(text) for text in args.human_topic),
         depth_scale=args.depth_scale,
         pairing_tolerance_s=args.pairing_tolerance,
         joint_topic=args.joint_topic,
@@ -90,6 +98,13 @@ def _topics(text: str) -> "CameraTopics":
     if not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)):
         raise UsageError(f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO")
     return CameraTopics(name=name, color=topics[0], depth=topics[1], info=topics[2] if len(topics) == 3 else "")
+
+
+def _human_topic(text: str) -> tuple[str, str]:
+    name, _, topic = text.partition("=")
+    if not name or not topic:
+        raise UsageError(f"--human-topic {text}: expected NAME=TOPIC")
+    return name, topic
 
 
 def _pose(text: str) -> tuple[str, tuple[float, ...]]:

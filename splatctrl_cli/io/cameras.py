@@ -1,5 +1,7 @@
 """RGB-D cameras in a log: which colour, depth and CameraInfo topics belong together, by name and by content."""
 
+from collections.abc import Collection
+
 from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 from splatctrl_cli.io.messages import ImageMessage
 from splatctrl_cli.io.options import CameraTopics
@@ -15,13 +17,14 @@ def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
     return [t for t in topics if t.first_image is not None and t.first_image.kind == kind]
 
 
-def find_cameras(survey: Survey) -> tuple[CameraTopics, ...]:
+def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
     """Cameras by name: colour and depth topics that share a namespace, deepest namespaces first.
 
     /cam0/color/image_raw and /cam0/depth/image_raw make camera `cam0`. Registered depth is preferred to raw depth,
-    colour to grey, rectified images to raw ones, uncompressed to compressed.
+    colour to grey, rectified images to raw ones, uncompressed to compressed. Topics in `without` are left out.
     """
-    colors, depths = image_topics(survey, "color"), image_topics(survey, "depth")
+    colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
+    depths = image_topics(survey, "depth")
     groups: dict[tuple[str, ...], list[TopicSurvey]] = {}
     for depth in depths:
         prefixes = [common_prefix(depth.topic.name, color.topic.name) for color in colors]

@@ -16,18 +16,23 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError, WriteError
 from splatctrl_cli.geometry import quat_from_rotation, transform_from
+from splatctrl_cli.io.masks import human_mask
 from splatctrl_cli.io.messages import decode_file, metres
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256, write_json
 from splatctrl_cli.io.shot import Shot, ShotSource, merged
-from splatctrl_cli.records import Float32, Intrinsics, JointState, LossReport, Record, RgbdFrame
+from splatctrl_cli.records import Float32, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
 FORMAT, VERSION = "splatctrl-capture", 1
 INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
+MASKED_COLUMNS = (*COLUMNS, "human")  # where the recording has masks
 FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
 FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
-_NOT_FOR_CAPTURES = ("world_frame", "camera_topics", "camera_poses", "depth_scale", "joint_topic", "root", "holdout")
+_NOT_FOR_CAPTURES = (
+    *("world_frame", "camera_topics", "camera_poses", "human_topics"),
+    *("depth_scale", "joint_topic", "root", "holdout"),
+)
 PNG_LEVEL = 3  # zlib; 3 is half the time of OpenCV's default 6 and 5 % larger on apc_shelf depth
 
 
@@ -143,6 +148,7 @@ class CaptureSource:
     def _shots(self) -> Iterator[Shot]:
         for row in self._rows:
             color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
+            human_bytes = self._read(row["human"]) if row.get("human") else None
             if color_bytes is None or depth_bytes is None:
                 continue
             camera = self._cameras[row["camera"]]
@@ -151,19 +157,28 @@ class CaptureSource:
                 self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
                 continue
             pose = [float(row[key]) for key in COLUMNS[4:11]]
+            intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
             yield Shot(
                 frame=RgbdFrame(
                     stamp_ns=int(row["stamp_ns"]),
                     camera=row["camera"],
                     color=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8),
                     depth=depth,
-                    intrinsics=Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)}),
+                    intrinsics=intrinsics,
                     T_world_camera=transform_from(pose[:3], pose[3:]),
+                    human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
                 ),
                 color_file=color_bytes,
                 depth_unit=camera["depth_scale"] if row["depth"].endswith(".png") else None,
                 origin=row["source"],
             )
+
+    def _human(self, name: str, data: bytes, intrinsics: Intrinsics) -> UInt8 | None:
+        pixels = decode_file(data, color=False)
+        if pixels is None:
+            self._damaged.append(f"{name}: cannot be decoded")
+            return None
+        return human_mask(pixels, intrinsics, str(self._path / name))
 
     def _read(self, name: str) -> bytes | None:
         path = self._path / name
@@ -232,7 +247,12 @@ def _write_shot(folder: Path, shot: Shot, cameras: dict[str, dict[str, Any]], su
     T = frame.T_world_camera
     pose = [*T[:3, 3], *quat_from_rotation(T[:3, :3])]
     values = [frame.camera, frame.stamp_ns, color_name, depth_name, *(repr(float(v)) for v in pose), shot.origin]
-    return dict(zip(COLUMNS, map(str, values), strict=True))
+    row = dict(zip(COLUMNS, map(str, values), strict=True))
+    if frame.human is None:
+        return row
+    human_name = f"human/{frame.camera}/{stem}.png"
+    sums.write(folder, human_name, _encoded(frame.human * np.uint8(255)))
+    return row | {"human": human_name}
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
@@ -277,7 +297,8 @@ def _write_joints(folder: Path, joints: list[JointState], num_joints: int, sums:
 
 def _write_frames(folder: Path, rows: list[dict[str, str]], sums: _Sums) -> None:
     stream = StringIO()
-    writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+    columns = MASKED_COLUMNS if any("human" in row for row in rows) else COLUMNS
+    writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     sums.write(folder, "frames.csv", stream.getvalue().encode())
@@ -291,7 +312,7 @@ def _read_frames(path: Path) -> list[dict[str, str]]:
             rows = list(reader)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
-    if tuple(reader.fieldnames or ()) != COLUMNS:
+    if tuple(reader.fieldnames or ()) not in (COLUMNS, MASKED_COLUMNS):
         raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy="run `splatctrl ingest` again")
     try:
         for row in rows:

@@ -47,10 +47,14 @@ class CameraTable:
 
 @dataclass(frozen=True, kw_only=True)
 class FramesTable:
-    """``[frames]``: globs with one ``*``; colour and depth with the same text for it belong together."""
+    """``[frames]``: globs with one ``*``; files with the same text for it belong together.
+
+    human_mask: 8-bit grey images, not 0 where the colour image shows a person.
+    """
 
     color: str
     depth: str
+    human_mask: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from splatctrl_cli.io.folder_description import (
     check_camera,
     read_description,
 )
+from splatctrl_cli.io.masks import human_mask
 from splatctrl_cli.io.messages import decode_file, metres
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
@@ -31,20 +32,22 @@ from splatctrl_cli.io.poses import (
 )
 from splatctrl_cli.io.registration import DepthToColor, Undistortion
 from splatctrl_cli.io.shot import Shot, check_depth, is_kept
-from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, RgbdFrame
+from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, RgbdFrame, UInt8
 
 HOLDOUT = "holdout"
+_NOT_FOR_FOLDERS = ("world_frame", "camera_topics", "camera_poses", "human_topics", "joint_topic")
 _SECOND = 1_000_000_000
 _POSE_TOLERANCE_S = 0.02  # of poses that are matched by stamp
 
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """One pair of files; name is the text that `*` stood for."""
+    """One pair of files, and a mask where there is one; name is the text that `*` stood for."""
 
     name: str
     color: Path
     depth: Path
+    human: Path | None
     T_world_camera: Float64
     stamp_ns: int
     camera: str
@@ -57,7 +60,7 @@ class ImageFolderSource:
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
-        options.refuse(("world_frame", "camera_topics", "camera_poses", "joint_topic"), "an image folder", path)
+        options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
         self.name = path.name
         self._description = _completed(read_description(path, options.root))
         self._scale = self._description.depth.scale if options.depth_scale is None else options.depth_scale
@@ -130,7 +133,7 @@ class ImageFolderSource:
     @cached_property
     def _digests(self) -> dict[str, str]:
         description = self._description
-        files = [path for view in self._views for path in (view.color, view.depth)]
+        files = [path for view in self._views for path in (view.color, view.depth, view.human) if path is not None]
         files.extend(path for _, path in _glob(description.root, description.poses.file))
         named = {str(path.relative_to(description.root)): path for path in files}
         return {
@@ -155,6 +158,7 @@ class ImageFolderSource:
         if self._undistortion is not None:
             color = self._undistortion.color(np.asarray(color))
             depth = self._undistortion.depth(depth) if self._registration is None else depth
+        human = None if view.human is None else self._human(view.human)
         is_counts = self._registration is None and self._description.depth.encoding != "float32"
         is_plain = self._undistortion is None and is_kept(color_bytes)
         return Shot(
@@ -165,11 +169,20 @@ class ImageFolderSource:
                 depth=depth,
                 intrinsics=self._intrinsics,
                 T_world_camera=view.T_world_camera,
+                human=human,
             ),
             color_file=color_bytes if is_plain else None,
             depth_unit=self._scale if is_counts else None,
             origin=f"{view.color.name} {view.depth.name}",
         )
+
+    def _human(self, path: Path) -> UInt8 | None:
+        pixels = decode_file(path.read_bytes(), color=False)
+        if pixels is None:
+            self._damaged.append(f"{path}: not an image that can be read")
+            return None
+        human = human_mask(pixels, self._intrinsics, str(path))
+        return human if self._undistortion is None else self._undistortion.labels(human)
 
     def _depth(self, path: Path) -> Float32 | None:
         encoding = self._description.depth.encoding
@@ -254,6 +267,7 @@ def _views(description: Description, camera: str, options: SourceOptions, loss: 
             raise InputError(
                 f"{description.path}: no file matches {description.root / pattern}", remedy="correct [frames] or root"
             )
+    masks = _masks(description, list(colors), loss)
     names = [name for name in colors if name in depths]
     if not names:
         raise InputError(
@@ -273,6 +287,7 @@ def _views(description: Description, camera: str, options: SourceOptions, loss: 
                     name=name,
                     color=colors[name],
                     depth=depths[name],
+                    human=masks.get(name),
                     T_world_camera=world_camera(
                         poses[name], description.poses.convention, description.poses.axes, where
                     ),
@@ -292,6 +307,24 @@ def _views(description: Description, camera: str, options: SourceOptions, loss: 
             raise UsageError(f"--holdout: all {len(views)} views are held out", remedy=remedy)
         raise InputError(f"{description.path}: [split] holds all {len(views)} views out", remedy=remedy)
     return sorted(views, key=lambda view: (view.stamp_ns, view.name))
+
+
+def _masks(description: Description, names: list[str], loss: LossReport) -> dict[str, Path]:
+    """Mask files by view name; views without one are noted in `loss`."""
+    assert description.frames is not None
+    pattern = description.frames.human_mask
+    if not pattern:
+        return {}
+    masks = dict(_glob(description.root, pattern))
+    if not any(name in masks for name in names):
+        raise InputError(
+            f"{description.path}: no file of {description.root / pattern} is named like a colour image",
+            remedy="the * of [frames] human_mask and color must stand for the same text",
+        )
+    num_without = sum(name not in masks for name in names)
+    if num_without:
+        loss.notes.append(f"{num_without} of {len(names)} colour images have no mask")
+    return masks
 
 
 def _glob(root: Path, pattern: str) -> list[tuple[str, Path]]:

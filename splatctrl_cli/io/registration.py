@@ -69,6 +69,10 @@ class Undistortion:
         """Colour (H, W, 3), interpolated; black where the lens saw nothing."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
 
+    def labels(self, image: UInt8) -> UInt8:
+        """Labels (H, W), nearest pixel; 0 where the lens saw nothing."""
+        return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.uint8)
+
     def depth(self, image: Float32) -> Float32:
         """Depth (H, W) [m], nearest pixel; 0 where the lens saw nothing."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)

@@ -9,6 +9,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.io.cameras import find_cameras, find_info, image_topics, is_registered
 from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from splatctrl_cli.io.masks import check_mask_topics
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.registration import DISTORTION_MODELS, DepthToColor, Undistortion
@@ -19,7 +20,7 @@ from splatctrl_cli.records import Float64, Intrinsics
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """One RGB-D camera of a log; fixed_pose is T_world_camera where a person gave it."""
+    """One RGB-D camera of a log; fixed_pose is T_world_camera where a person gave it, human_topic its masks."""
 
     name: str
     color_topic: str
@@ -30,6 +31,7 @@ class Camera:
     undistortion: Undistortion | None = None
     depth_to_color: DepthToColor | None = None
     fixed_pose: Float64 | None = None
+    human_topic: str = ""
 
     def pose_at(self, tf: TfTree, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
         """T_world_camera at a time; None where tf does not know it."""
@@ -48,6 +50,7 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
     for name in (*names, *options.camera_poses):
         if name not in known:
             raise InputError(f"{log.path}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")
+    check_mask_topics(log.path, survey, options.human_topics, tuple(known))
     try:
         cameras = tuple(_Builder(log, survey, options, known[name]).build() for name in names)
     except InputError as error:
@@ -65,8 +68,8 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
 
 
 def camera_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The cameras that the options name, else those found."""
-    return _given_topics(log, survey, options) or find_cameras(survey)
+    """The cameras that the options name, else those found; a mask is no camera's colour."""
+    return _given_topics(log, survey, options) or find_cameras(survey, without=options.human_topics.values())
 
 
 def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
@@ -149,6 +152,7 @@ class _Builder:
             undistortion=self._undistortion(calibration, intrinsics),
             depth_to_color=None if self._is_registered else self._registration(intrinsics),
             fixed_pose=None if fixed is None else transform_from(fixed[:3], fixed[3:]),
+            human_topic=self._options.human_topics.get(topics.name, ""),
         )
 
     def problems(self) -> list[str]:

@@ -11,6 +11,7 @@ from functools import cached_property
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.io.joints import joint_records
+from splatctrl_cli.io.masks import human_mask, mask_by_color
 from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, read_image
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
@@ -19,19 +20,20 @@ from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.io.shot import Shot, check_depth, is_kept, merged
 from splatctrl_cli.io.survey import Survey, survey
-from splatctrl_cli.records import Float64, JointState, LossReport, Record, RgbdFrame
+from splatctrl_cli.records import Float64, JointState, LossReport, Record, RgbdFrame, UInt8
 
 _SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Planned:
-    """A frame to be: message numbers within the colour and depth topics, and the pose."""
+    """A frame to be: message numbers within the colour, depth and mask topics (None: no mask), and the pose."""
 
     stamp_ns: int
     camera: Camera
     color_index: int
     depth_index: int
+    human_index: int | None
     T_world_camera: Float64
 
 
@@ -101,6 +103,8 @@ class RosLogSource:
     def _with_pose(self, found: Survey, camera: Camera, pairs: list[tuple[int, int]]) -> list[_Planned]:
         tolerance_ns = round(self._options.pose_tolerance_s * _SECOND)
         color_ns = found.topics[camera.color_topic].stamps_ns
+        pairing_ns = round(self._options.pairing_tolerance_s * _SECOND)
+        masks = mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
         planned = []
         for color_index, depth_index in pairs:
             stamp_ns = color_ns[color_index]
@@ -112,6 +116,7 @@ class RosLogSource:
                         camera=camera,
                         color_index=color_index,
                         depth_index=depth_index,
+                        human_index=masks.get(color_index),
                         T_world_camera=T,
                     )
                 )
@@ -127,8 +132,9 @@ class RosLogSource:
     def _shots(self) -> Iterator[Shot]:
         images = _PlannedImages(self._log, self._plan)
         checked: set[str] = set()
-        for planned, color, depth in images.pairs(self._damage):
-            shot = _shot(planned, color, depth, self._options.depth_scale)
+        for planned, (color, depth, *masks) in images.of_frames(self._damage):
+            human = self._human(planned.camera, masks[0]) if masks else None
+            shot = _shot(planned, color, depth, human, self._options.depth_scale)
             camera = planned.camera
             if camera.name not in checked:
                 scale = _scale(depth, self._options.depth_scale)
@@ -136,9 +142,13 @@ class RosLogSource:
                     checked.add(camera.name)
             yield shot
 
+    def _human(self, camera: Camera, mask: ImageMessage) -> UInt8:
+        human = human_mask(mask.pixels, camera.intrinsics, f"{self._log.path}: topic {camera.human_topic}")
+        return human if camera.undistortion is None else camera.undistortion.labels(human)
+
 
 class _PlannedImages:
-    """The second pass: brings the two images of each planned frame together, in the plan's order."""
+    """The second pass: brings the images of each planned frame together, in the plan's order."""
 
     def __init__(self, log: RawLog, plan: list[_Planned]) -> None:
         self._log = log
@@ -149,8 +159,8 @@ class _PlannedImages:
             for key in _keys(planned):
                 self._uses[key] = self._uses.get(key, 0) + 1
 
-    def pairs(self, damage: Damage) -> Iterator[tuple[_Planned, ImageMessage, ImageMessage]]:
-        """Yield each planned frame with its images; one that does not decode goes to `damage`."""
+    def of_frames(self, damage: Damage) -> Iterator[tuple[_Planned, list[ImageMessage]]]:
+        """Yield each planned frame with its colour, depth and mask; one that does not decode goes to `damage`."""
         topics = {key[0] for key in self._uses}
         numbers = dict.fromkeys(topics, 0)
         decoder = MessageDecoder()
@@ -164,25 +174,28 @@ class _PlannedImages:
             while position < len(self._plan) and all(key in self._held for key in _keys(self._plan[position])):
                 planned = self._plan[position]
                 position += 1
-                color, depth = (self._take(key) for key in _keys(planned))
+                taken = [self._take(key) for key in _keys(planned)]
                 try:
-                    images = [read_image(decoder.decode(m), m.topic.type_name) for m in (color, depth)]
+                    images = [read_image(decoder.decode(m), m.topic.type_name) for m in taken]
                 except UndecodableMessageError as error:
                     damage.add(f"camera {planned.camera.name} at {planned.stamp_ns} ns: {error}")
                     continue
-                yield planned, images[0], images[1]
+                yield planned, images
 
     def _take(self, key: tuple[str, int]) -> RawMessage:
         self._uses[key] -= 1
         return self._held[key] if self._uses[key] else self._held.pop(key)
 
 
-def _keys(planned: _Planned) -> tuple[tuple[str, int], tuple[str, int]]:
+def _keys(planned: _Planned) -> list[tuple[str, int]]:
     camera = planned.camera
-    return (camera.color_topic, planned.color_index), (camera.depth_topic, planned.depth_index)
+    keys = [(camera.color_topic, planned.color_index), (camera.depth_topic, planned.depth_index)]
+    return keys if planned.human_index is None else [*keys, (camera.human_topic, planned.human_index)]
 
 
-def _shot(planned: _Planned, color: ImageMessage, depth: ImageMessage, scale: float | None) -> Shot:
+def _shot(
+    planned: _Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, scale: float | None
+) -> Shot:
     camera = planned.camera
     pixels, metres = color_of(color), depth_of(depth, scale)
     is_counts = depth.pixels.dtype.kind == "u"
@@ -200,6 +213,7 @@ def _shot(planned: _Planned, color: ImageMessage, depth: ImageMessage, scale: fl
         depth=metres,
         intrinsics=camera.intrinsics,
         T_world_camera=planned.T_world_camera,
+        human=human,
     )
     return Shot(
         frame=frame,

@@ -138,6 +138,7 @@ def test_an_unwritable_output_is_exit_2(tmp_path: Path, capsys: pytest.CaptureFi
         ("--camera", "../x=/a,/b"),
         ("--camera-pose", "cam0=1,2,3"),
         ("--camera-pose", "cam0=0,0,0,0,0,0,0"),
+        ("--human-topic", "cam0"),
         ("--pairing-tolerance", "-0.1"),
     ],
 )

@@ -44,6 +44,8 @@ class LogRecipe:
     color_name: str = "image_raw"
     projection_focal: float = 0.0
     chunk_size: int = 4096
+    mask_every: int = 0  # frames; 0: no masks
+    mask_encoding: str = "mono8"
 
 
 def camera_x(index: int) -> float:
@@ -63,6 +65,13 @@ def color_pixels(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     image[..., 1] = np.linspace(20, 200, WIDTH, dtype=np.uint8)
     image[..., 2] = 90
     return image
+
+
+def mask_pixels(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """The mask of a frame: a person in rows 5 to 15, from the column of the frame's number on."""
+    mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    mask[5:16, index:] = 200
+    return mask
 
 
 class _LogWriter:
@@ -125,6 +134,9 @@ class _LogWriter:
                 yield late, f"/{camera}/depth/image_raw", *self._depth(late, frame)
                 if recipe.depth_frame is not None:
                     yield stamp, f"/{camera}/depth/camera_info", *self._info(stamp, frame, recipe.depth_size)
+            if recipe.mask_every and index % recipe.mask_every == 0:
+                mask = self._image(late, optical, recipe.mask_encoding, mask_pixels(index))
+                yield late, f"/{camera}/people/mask", "sensor_msgs/msg/Image", mask
         if recipe.has_joints:
             yield stamp, "/joint_states", *self._joints(stamp, index)
 

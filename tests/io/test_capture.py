@@ -166,3 +166,29 @@ def test_an_index_that_was_changed_is_refused(tmp_path: Path, name: str) -> None
     (folder / name).write_bytes((folder / name).read_bytes() + b"\n")
     with pytest.raises(InputError, match=f"{name}: its checksum differs"):
         open_source(folder)
+
+
+def test_masks_come_back_and_frames_without_one_stay_without(tmp_path: Path) -> None:
+    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=2)), options)
+    folder = tmp_path / "x.capture"
+    folder.mkdir()
+    write_capture(folder, source)
+    before, after = list(source.records()), list(open_source(folder).records())
+    assert_same(before, after)
+    masks = [(a.human, b.human) for a, b in zip(before, after, strict=True) if isinstance(a, RgbdFrame)
+             and isinstance(b, RgbdFrame)]  # fmt: skip
+    assert [a is not None for a, _ in masks] == [True, False, True, False, True]
+    assert all((a is None and b is None) or np.array_equal(a, b) for a, b in masks)
+
+
+def test_a_damaged_mask_is_counted_and_its_frame_kept(tmp_path: Path) -> None:
+    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+    folder = tmp_path / "x.capture"
+    folder.mkdir()
+    write_capture(folder, open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1)), options))
+    (folder / "human/cam0/000001.png").write_bytes(b"no image")
+    source = open_source(folder)
+    frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
+    assert [frame.human is not None for frame in frames] == [True, False, True, True, True]
+    assert source.loss.damaged == 1

@@ -250,3 +250,34 @@ def test_real_folders_open_and_their_views_agree(
     difference = np.abs(measured - seen[inside, 2])[measured > 0]
     assert len(difference) > 10_000
     assert np.median(difference) < agreement
+
+
+def with_masks(tmp_path: Path, names: tuple[str, ...], mask: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Path:
+    path = described(tmp_path)
+    path.write_text(
+        path.read_text().replace('depth = "depth/*.png"', 'depth = "depth/*.png"\nhuman_mask = "who/*.png"')
+    )
+    (tmp_path / "images/who").mkdir()
+    for name in names:
+        cv2.imwrite(str(tmp_path / f"images/who/{name}.png"), mask)
+    return path
+
+
+def test_masks_go_with_the_colour_image_of_the_same_name(tmp_path: Path) -> None:
+    mask = np.zeros((6, 8), np.uint8)
+    mask[2:4, 5] = 9
+    source = open_source(with_masks(tmp_path, ("7", "12"), mask))
+    frames = frames_of(list(source.records()))
+    found = {int(frame.color[0, 0, 0]): frame.human for frame in frames}
+    assert found[8] is None
+    assert found[7] is not None and found[7].tolist() == (mask > 0).tolist()
+    assert found[12] is not None
+    assert source.loss.notes == ["1 of 3 colour images have no mask"]
+    assert "who/7.png" in source.digests()
+
+
+def test_masks_of_another_size_or_name_are_refused(tmp_path: Path) -> None:
+    path = with_masks(tmp_path / "a", ("7",), np.zeros((6, 9), np.uint8))
+    assert "expected an 8-bit grey mask of 8x6, as the colour images, got 9x6" in refusal(path)
+    path = with_masks(tmp_path / "b", ("99",), np.zeros((6, 8), np.uint8))
+    assert "is named like a colour image" in refusal(path)

@@ -9,7 +9,17 @@ import pytest
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.source import CameraTopics, SourceOptions, open_source
 from splatctrl_cli.records import JointState, Record, RgbdFrame
-from tests.io.make_log import FRAME_NS, HEIGHT, START_NS, WIDTH, LogRecipe, camera_x, color_pixels, make_log
+from tests.io.make_log import (
+    FRAME_NS,
+    HEIGHT,
+    START_NS,
+    WIDTH,
+    LogRecipe,
+    camera_x,
+    color_pixels,
+    make_log,
+    mask_pixels,
+)
 
 
 def records_of(path: Path, options: SourceOptions | None = None) -> list[Record]:
@@ -285,3 +295,52 @@ def test_depth_of_another_lens_without_calibration_names_what_is_missing(tmp_pat
     said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(depth_size=(16, 12))))
     assert "depth 16UC1 16x12 of /cam0/depth/image_raw is not registered to colour" in said
     assert "/cam0/depth/image_raw has no CameraInfo" in said
+
+
+MASKED = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+
+
+def test_masks_come_with_the_image_of_their_stamp(tmp_path: Path) -> None:
+    path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1))
+    frames = frames_of(path, MASKED)
+    assert len(frames) == 5
+    for index, frame in enumerate(frames):
+        assert frame.human is not None
+        assert frame.human.dtype == np.uint8
+        assert np.array_equal(frame.human, mask_pixels(index) > 0)
+    assert all(frame.human is None for frame in frames_of(path))  # nobody asked for them
+
+
+def test_images_without_a_mask_are_kept_and_noted(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=2)), MASKED)
+    frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
+    assert [frame.human is not None for frame in frames] == [True, False, True, False, True]
+    assert source.loss.notes == ["camera cam0: 2 of 5 images have no mask on /cam0/people/mask within 20 ms"]
+
+
+def test_a_mask_is_not_taken_for_the_colour_of_a_grey_camera(tmp_path: Path) -> None:
+    recipe = LogRecipe(mask_every=1, color_format="mono8", color_name="zz_image")
+    path = make_log(tmp_path / "log.mcap", recipe)
+    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+    assert frames_of(path, options)[0].color[0].tolist() == [[g, g, g] for g in color_pixels(0)[0, :, 1].tolist()]
+
+
+@pytest.mark.parametrize(
+    ("topics", "message"),
+    [
+        ({"cam7": "/cam0/people/mask"}, "--human-topic cam7=/cam0/people/mask: no camera 'cam7'"),
+        ({"cam0": "/cam0/nothing"}, "--human-topic cam0=/cam0/nothing: no mono8 or 8UC1 images on that topic"),
+        ({"cam0": "/cam0/depth/image_raw"}, "no mono8 or 8UC1 images on that topic"),
+    ],
+)
+def test_a_mask_topic_that_cannot_be_one_is_named(tmp_path: Path, topics: dict[str, str], message: str) -> None:
+    path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1))
+    assert message in refusal(path, SourceOptions(human_topics=topics))
+
+
+def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) -> None:
+    path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1, distortion=(0.3, 0.0, 0.0, 0.0, 0.0)))
+    human = frames_of(path, MASKED)[0].human
+    assert human is not None
+    assert set(np.unique(human)) == {0, 1}
+    assert not np.array_equal(human, mask_pixels(0) > 0)
