@@ -49,7 +49,9 @@ class SceneConfig:
     window: int = 12  # keyframes kept beside the newest frame of each camera
     keyframe_distance: float = 0.05  # [m] a camera that moved further than this makes a keyframe
     keyframe_angle: float = 5.0  # [deg] or turned further than this
-    snapshot_every: int = 1  # time steps
+    snapshot_every: int = 1  # time steps between snapshots
+    snapshot_period: float = 0.0  # [s] of the log between snapshots, beside snapshot_every; 0: no matter
+    checkpoint_period: float = 10.0  # [s] between checkpoints, or 50 times what one takes to write; 0: each time step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +201,15 @@ _AT_LEAST_ZERO = (
     *("scene.iterations_per_step", "scene.first_iterations", "scene.refine_iterations", "scene.refine_geometry"),
     *("scene.lr_center", "scene.lr_log_radius", "scene.lr_color", "scene.lr_logit_opacity", "scene.window"),
     *("scene.keyframe_distance", "scene.keyframe_angle", "occupancy.min_range", "occupancy.see_through"),
-    *("occupancy.uncertain_patience", "occupancy.robot_margin", "field.noise", "field.padding", "scene.noise"),
+    *(
+        "occupancy.uncertain_patience",
+        "scene.snapshot_period",
+        "scene.checkpoint_period",
+        "occupancy.robot_margin",
+        "field.noise",
+        "field.padding",
+        "scene.noise",
+    ),
 )
 _SHARES = (
     *("scene.initial_opacity", "scene.min_opacity"),

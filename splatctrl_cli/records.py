@@ -30,6 +30,16 @@ class Label(IntEnum):
 SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
 
 
+class VoxelState(IntEnum):
+    """What is known of a voxel."""
+
+    NEVER_SEEN = 0
+    FREE = 1
+    OCCUPIED = 2
+    UNCERTAIN = 3
+    SWEPT_BY_ROBOT = 4  # never seen, but the robot was in it
+
+
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
     """Pinhole camera; pixel (0, 0) has its centre at u = v = 0 (the ROS and OpenCV convention).
@@ -218,6 +228,28 @@ class OccupancyGrid:
     log_odds: Float32
     num_updates: NDArray[np.uint16]
     entity: UInt8
+
+    def states(self, free_below: float, occupied_above: float) -> UInt8:
+        """`VoxelState` (X, Y, Z) by these thresholds of occupancy."""
+        low, high = (float(np.log(p / (1.0 - p))) for p in (free_below, occupied_above))
+        states = np.full(self.log_odds.shape, VoxelState.UNCERTAIN, np.uint8)
+        states[self.log_odds < low] = VoxelState.FREE
+        states[self.log_odds > high] = VoxelState.OCCUPIED
+        is_never_seen = self.num_updates == 0
+        states[is_never_seen] = VoxelState.NEVER_SEEN
+        states[is_never_seen & (self.entity & SWEPT > 0)] = VoxelState.SWEPT_BY_ROBOT
+        return states
+
+    @classmethod
+    def from_states(cls, origin: Float64, voxel: float, states: UInt8) -> "OccupancyGrid":
+        """A grid that has these `states` (X, Y, Z) by any thresholds: log-odds of -20, 0 or 20, updates of 0 or 1."""
+        is_seen = (states != VoxelState.NEVER_SEEN) & (states != VoxelState.SWEPT_BY_ROBOT)
+        log_odds = np.zeros(states.shape, np.float32)
+        log_odds[states == VoxelState.FREE] = -20.0
+        log_odds[states == VoxelState.OCCUPIED] = 20.0
+        entity = np.where(states == VoxelState.SWEPT_BY_ROBOT, np.uint8(SWEPT), np.uint8(0))
+        num_updates = is_seen.astype(np.uint16)
+        return cls(origin=origin, voxel=voxel, log_odds=log_odds, num_updates=num_updates, entity=entity)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,24 +51,26 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
 def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
     from splatctrl_cli.io.output import sha256
     from splatctrl_cli.io.scene_folder import open_scene
+    from splatctrl_cli.io.splats import read_ply
 
     scene = open_scene(path)
-    occupancy = scene.occupancy()
+    final = scene.occupancy()
+    occupancy: OccupancyGrid | None
     if at_seconds is None:
-        splats, stamp_ns = scene.splats(), scene.stamp_ns
+        splats, occupancy, stamp_ns = scene.splats(), final, scene.stamp_ns
         files = [path / "splats.ply", path / "occupancy.npz"]
     else:
         if not scene.snapshots:
             raise NotEvaluableError(f"{path}: has no snapshots", remedy="bake without --at")
         wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
-        splats = scene.splats_at(wanted_ns)
-        snapshot = max((s for s in scene.snapshots if s.stamp_ns <= wanted_ns), key=lambda s: s.stamp_ns)
-        stamp_ns, files = snapshot.stamp_ns, [snapshot.path]
+        snapshot = scene.snapshot_at(wanted_ns)
+        splats, occupancy, stamp_ns = read_ply(snapshot.path)[0], snapshot.occupancy(), snapshot.stamp_ns
+        files = [snapshot.path] if occupancy is None else [snapshot.path, snapshot.occupancy_path]
     return BakeSource(
         splats=splats,
-        occupancy=occupancy if at_seconds is None else None,  # the one on disk is that of the end
+        occupancy=occupancy,
         stamp_ns=stamp_ns,
-        workspace=_workspace(occupancy),
+        workspace=_workspace(final),
         cameras=scene.cameras,
         digests={file.name: sha256(file) for file in files},
     )

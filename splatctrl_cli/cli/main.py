@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SplatCtrlError as error:
         return _fail(error, str(error), error.exit_code, verbose)
     except KeyboardInterrupt as error:
-        return _fail(error, "interrupted", 130, verbose)
+        return _fail(error, str(error) or "interrupted", 130, verbose)
     except BrokenPipeError:
         sys.stderr.close()
         return 0

@@ -1,7 +1,8 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,15 +19,12 @@ from splatctrl_cli.cli.common import (
     table,
 )
 from splatctrl_cli.cli.source_options import add_source, source_options
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
     from splatctrl_cli.records import Box, RecordSource
     from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.scene.fitter import AuditRow, SceneFitter
-    from splatctrl_cli.scene.posture import RobotPosture
-    from splatctrl_cli.scene.time_steps import TimeStep
 
 DAMAGED = 3
 GATED = (
@@ -49,6 +47,9 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--box", metavar="X0,Y0,Z0,X1,Y1,Z1", help="workspace [m] (default: the robot's reach, else the valid depth)"
     )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with a run that was interrupted, to the same bytes"
+    )
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     add_config(parser)
     add_gates(parser)
@@ -56,24 +57,53 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.output import Stopwatch, output_path, write_run
+    from splatctrl_cli.cli.reconstruction import Reconstruction, training_cameras
+    from splatctrl_cli.cli.resume import checkpoint_to_go_on_from, identity
+    from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
+    from splatctrl_cli.io.scene_writer import CHECKPOINT
 
     if args.device == "cuda":
         raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
     check_gate_names(args.require, GATED)
     console, stopwatch, config = Console(args), Stopwatch(), _config(args)
-    source = _open(args)
+    source, box = _open(args), _box(args)
+    training_cameras(source)
     robot = _robot(args, source)
     for doubt in () if robot is None else robot.doubts:
         console.log(f"warning: {doubt}")
     out = args.out or Path("scene")
-    with output_path(out, force=args.force, is_folder=True) as partial:
-        fitted = _Reconstruction(args, config, source, robot, partial)
-        with stopwatch.stage("fit"):
+    checkpoint_file = partial_path(out) / CHECKPOINT
+    can_go_on = checkpoint_file.is_file()
+    if can_go_on and not args.resume:
+        console.log(
+            f"warning: {partial_path(out)}: an interrupted run is replaced; --resume would have gone on with it"
+        )
+    if args.resume and not can_go_on:
+        console.log(f"{partial_path(out)}: has no checkpoint to go on from; starts at the beginning")
+    with (
+        _told_how_to_go_on(checkpoint_file),
+        output_path(out, force=args.force, is_folder=True, checkpoint=CHECKPOINT, resume=args.resume) as partial,
+    ):
+        inputs = source.digests()
+        run_identity = identity(args, config, inputs)
+        fitted = Reconstruction(
+            source,
+            robot,
+            config,
+            partial,
+            box=box,
+            seed=args.seed,
+            threads=args.threads,
+            identity=run_identity,
+            checkpoint=checkpoint_to_go_on_from(partial, run_identity) if args.resume and can_go_on else None,
+        )
+        is_resumed = fitted.num_read > 0
+        if is_resumed:
+            console.log(f"{partial}: goes on after {fitted.num_read} time steps")
+        with stopwatch.stage("fit_since_resume" if is_resumed else "fit"):
             fitted.run(console)
         with stopwatch.stage("write"):
             fitted.finish()
-        inputs = source.digests()
         metrics = fitted.metrics()
         write_run(
             partial,
@@ -86,12 +116,13 @@ def run(args: argparse.Namespace) -> int:
         )
     last = fitted.rows[-1]
     removed = {name: sum(row.removed[name] for row in fitted.rows) for name in last.removed}
+    seconds = f"{sum(stopwatch.seconds.values()):.1f}"
     lines = table(
         ["time steps", "splats", "robot", "added", "relocated", "unmet", "training dB", "seconds"],
         [
             [
                 metrics["time_steps"], last.alive, last.robot, metrics["added"], metrics["relocated"],
-                metrics["unmet"], "-" if last.psnr is None else f"{last.psnr:.2f}", f"{stopwatch.seconds['fit']:.1f}",
+                metrics["unmet"], "-" if last.psnr is None else f"{last.psnr:.2f}", seconds,
             ]
         ],
     )  # fmt: skip
@@ -100,6 +131,25 @@ def run(args: argparse.Namespace) -> int:
     console.result({"scene": str(out), "metrics": metrics, "removed": removed}, [*lines, f"wrote {out}"])
     check_gates(args.require, {name: _number(metrics[name]) for name in GATED})
     return DAMAGED if source.loss.damaged else 0
+
+
+@contextmanager
+def _told_how_to_go_on(checkpoint: Path) -> Iterator[None]:
+    """Says after Ctrl-C what was kept."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if checkpoint.is_file():
+            raise KeyboardInterrupt(
+                f"interrupted: {checkpoint.parent.parent} is kept; go on with the same command and --resume"
+            ) from None
+        raise KeyboardInterrupt("interrupted before the first checkpoint: nothing to go on from") from None
+
+
+def _box(args: argparse.Namespace) -> "Box | None":
+    from splatctrl_cli.records import Box
+
+    return None if args.box is None else Box.from_text(args.box)
 
 
 def _number(value: object) -> float | None:
@@ -140,158 +190,3 @@ def _robot(args: argparse.Namespace, source: "RecordSource") -> "RobotModel | No
     if source.joint_names:
         model.joint_order(source.joint_names)
     return model
-
-
-class _Reconstruction:
-    """The fitter over a source's time steps, with what it writes on the way."""
-
-    def __init__(
-        self,
-        args: argparse.Namespace,
-        config: "Config",
-        source: "RecordSource",
-        robot: "RobotModel | None",
-        folder: Path,
-    ) -> None:
-        from splatctrl_cli.io.scene_folder import FORMAT, SceneWriter
-
-        self.args = args
-        self.config = config
-        self.source = source
-        self.robot = robot
-        self.cameras = [camera for camera in source.cameras if camera != "holdout"]
-        if not self.cameras:
-            raise UsageError(
-                f"{source.name}: no camera is left to train on", remedy="camera 'holdout' is kept for score"
-            )
-        self.writer = SceneWriter(folder, {"format": FORMAT, "frame": "world", "units": "m", "source": source.name})
-        self.fitter: SceneFitter | None = None
-        self.rows: list[AuditRow] = []
-        self.stamps: list[int] = []
-
-    def run(self, console: Console) -> None:
-        """Step through the log."""
-        from tqdm import tqdm
-
-        scene = self.config.scene
-        steps = tqdm(self._steps(), disable=True if console.is_quiet else None, unit=" steps")
-        early: TimeStep | None = None
-        for index, step in enumerate(steps):
-            if self.fitter is None and not step.has_depth and self._needs_depth():
-                console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
-                early = early or step
-                continue
-            if self.fitter is None:
-                self.fitter = self._new_fitter(step)
-            elif not self.source.has_clock and self.fitter.num_steps == 1:
-                console.log(
-                    "warning: more views than fit in one time step; the last ones are refined on, the rest seed"
-                )
-            row = self.fitter.step(step.frames, self._posture(step))
-            self.stamps.extend(frame.stamp_ns for frame in step.frames)
-            self.rows.append(row)
-            self.writer.audit(row)
-            if index % 10 == 0 and not steps.disable:
-                steps.set_postfix(splats=row.alive, dB=row.psnr)
-            if steps.disable and index % 10 == 0:
-                quality = (
-                    "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB on its own views"
-                )
-                console.log(f"time step {index}: {row.alive} splats, {quality}")
-            if index % scene.snapshot_every == 0 and self.source.has_clock:
-                self.writer.snapshot(step.stamp_ns, self.fitter.splats())
-        if self.fitter is None and early is not None:
-            self._workspace(early)  # says that there is no depth
-        if self.fitter is None:
-            raise InputError(
-                f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
-                remedy="'splatctrl info' says what the input lacks",
-            )
-        if not any(row.alive for row in self.rows):
-            raise InputError(
-                f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
-                remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
-            )
-        if not self.source.has_clock:
-            row = self.fitter.refine(scene.refine_iterations, progress=self._refined(console))
-            self.rows.append(row)
-            self.writer.audit(row)
-            self.writer.snapshot(self.rows[-1].stamp_ns, self.fitter.splats())
-
-    def _refined(self, console: Console) -> "Callable[[int], None]":
-        total = self.config.scene.refine_iterations
-        return lambda done: console.log(f"refined {done} of {total} iterations")
-
-    def _steps(self) -> "Iterator[TimeStep]":
-        from splatctrl_cli.scene.time_steps import time_steps
-
-        return time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)
-
-    def _new_fitter(self, first: "TimeStep") -> "SceneFitter":
-        from splatctrl_cli.scene.fitter import SceneFitter
-
-        return SceneFitter(
-            self.config.scene,
-            self.config.occupancy,
-            self._workspace(first),
-            seed=self.args.seed,
-            threads=self.args.threads,
-        )
-
-    def _needs_depth(self) -> bool:
-        """Whether only depth can say where the workspace is."""
-        return self.args.box is None and self.robot is None
-
-    def _workspace(self, first: "TimeStep") -> "Box":
-        from splatctrl_cli.records import Box
-        from splatctrl_cli.scene.time_steps import depth_box
-
-        if self.args.box:
-            return Box.from_text(self.args.box)
-        if self.robot is not None:
-            reach, base = self.robot.reach(), self.robot.base_position
-            return Box(lower=base - reach, upper=base + reach)
-        return depth_box(first.frames, self.config.occupancy.max_range)
-
-    def _posture(self, step: "TimeStep") -> "RobotPosture | None":
-        import numpy as np
-
-        from splatctrl_cli.scene.posture import RobotPosture
-
-        if self.robot is None or step.position is None:
-            return None
-        q = step.position[self.robot.joint_order(self.source.joint_names)]
-        spheres = self.robot.sphere_set
-        pose = {link: self.robot.frame_pose(q, link) for link in set(spheres.links)}
-        return RobotPosture(
-            centers=self.robot.sphere_centers(q),
-            radii=spheres.radii,
-            T_world_link=np.array([pose[link] for link in spheres.links]),
-        )
-
-    def finish(self) -> None:
-        """Write what the end of the log left."""
-        assert self.fitter is not None
-        fitter = self.fitter
-        self.writer.finish(self.rows[-1].stamp_ns, fitter.splats(), fitter.occupancy_grid(), fitter.state())
-
-    def metrics(self) -> dict[str, object]:
-        """For ``run.json`` and gates."""
-        assert self.fitter is not None
-        last = self.rows[-1]
-        return {
-            "cameras": self.cameras,
-            "has_clock": self.source.has_clock,
-            "stamp_ns": last.stamp_ns,
-            "training_stamps_ns": [] if self.source.has_clock else self.stamps,
-            "time_steps": self.fitter.num_steps,
-            "iterations": self.fitter.num_iterations,
-            "splats": last.alive,
-            "robot_splats": last.robot,
-            "added": sum(row.added for row in self.rows),
-            "relocated": sum(row.relocated for row in self.rows),
-            "unmet": sum(row.unmet for row in self.rows),
-            "loss": last.loss,
-            "psnr": last.psnr,
-            "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
-        }

@@ -12,12 +12,11 @@ from splatctrl_cli.field.distance import GpdfField, SphereField
 from splatctrl_cli.field.health import field_health
 from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats, label_counts
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.records import SWEPT, Box, DistanceGrid, Float64, Label, OccupancyGrid, SplatSet, UInt8
+from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, OccupancyGrid, SplatSet, UInt8, VoxelState
 
 FORMAT_VERSION = 1
 BYTES_PER_CELL = 25  # three distances and three gradient components of 4 bytes, one of observed
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
-NEVER_SEEN, FREE, OCCUPIED, UNCERTAIN, SWEPT_BY_ROBOT = 0, 1, 2, 3, 4
 
 Shape = tuple[int, int, int]
 
@@ -134,10 +133,10 @@ def observed_channel(
     occupancy: OccupancyGrid | None, origin: Float64, voxel: float, shape: Shape, thresholds: OccupancyConfig
 ) -> UInt8:
     """What the occupancy voxel that holds each cell centre says (X, Y, Z); never seen outside the occupancy grid."""
-    observed = np.full(shape, NEVER_SEEN, dtype=np.uint8)
+    observed = np.full(shape, VoxelState.NEVER_SEEN, dtype=np.uint8)
     if occupancy is None:
         return observed
-    states = _states(occupancy, thresholds)
+    states = occupancy.states(thresholds.free_below, thresholds.occupied_above)
     nodes, inside = [], []
     for axis in range(3):
         centers = origin[axis] + voxel * np.arange(shape[axis])
@@ -147,20 +146,6 @@ def observed_channel(
         inside.append(np.flatnonzero(is_inside))
     observed[np.ix_(*inside)] = states[np.ix_(*nodes)]
     return observed
-
-
-def _states(occupancy: OccupancyGrid, thresholds: OccupancyConfig) -> UInt8:
-    states = np.full(occupancy.log_odds.shape, UNCERTAIN, dtype=np.uint8)
-    states[occupancy.log_odds < _logit(thresholds.free_below)] = FREE
-    states[occupancy.log_odds > _logit(thresholds.occupied_above)] = OCCUPIED
-    never_seen = occupancy.num_updates == 0
-    states[never_seen] = NEVER_SEEN
-    states[never_seen & (occupancy.entity & SWEPT > 0)] = SWEPT_BY_ROBOT
-    return states
-
-
-def _logit(probability: float) -> float:
-    return float(np.log(probability / (1.0 - probability)))
 
 
 def _header(

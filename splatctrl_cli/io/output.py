@@ -3,11 +3,12 @@
 import errno
 import hashlib
 import json
+import os
 import platform
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -17,6 +18,8 @@ from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError, WriteError
 
 MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
+PARTIAL = ".partial"  # ends the name of an output that is not whole
+PACKAGES = ("numpy", "scipy", "torch", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG})
 
 
@@ -30,10 +33,14 @@ def is_write_failure(error: OSError, output: Path | None = None) -> bool:
 
 
 @contextmanager
-def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
+def output_path(
+    path: Path, *, force: bool, is_folder: bool, checkpoint: str | None = None, resume: bool = False
+) -> Iterator[Path]:
     """Yield ``NAME.partial`` (an empty folder, or a file name to write to); rename it to `path` on success.
 
-    A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``.
+    A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``. `checkpoint` names the file in that
+    folder from which a run can go on: where it is there, a failure to write leaves the folder, too. With `resume`
+    such a folder is yielded as it is, and no failure removes it.
     Raises UsageError when `path` has no name of its own, exists without `force`, is not of the kind to write, or
     is a folder that no command wrote, and when its parent cannot be written; WriteError where `is_write_failure`
     (a full disk); every other error as it is.
@@ -41,12 +48,18 @@ def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
     _check_replaceable(path, is_folder=is_folder)
     if path.exists() and not force:
         raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
-    partial = path.with_name(path.name + ".partial")
+    partial = partial_path(path)
+
+    def can_go_on() -> bool:
+        return checkpoint is not None and (partial / checkpoint).is_file()
+
+    is_resumed = resume and can_go_on()
     try:
-        _remove(partial)
+        if not is_resumed:
+            _remove(partial)
         partial.parent.mkdir(parents=True, exist_ok=True)
         if is_folder:
-            partial.mkdir()
+            partial.mkdir(exist_ok=is_resumed)
         else:
             partial.touch()
     except OSError as error:
@@ -55,13 +68,44 @@ def output_path(path: Path, *, force: bool, is_folder: bool) -> Iterator[Path]:
         yield partial
         _replace(partial, path)
     except Exception as error:
-        _remove(partial)
-        if isinstance(error, OSError) and is_write_failure(error, partial):
+        failed_to_write = isinstance(error, OSError) and is_write_failure(error, partial)
+        is_kept = can_go_on() and (failed_to_write or is_resumed)
+        if not is_kept:
+            _remove(partial)
+        if isinstance(error, OSError) and failed_to_write:
+            remedy = f"make room and go on from {partial} with --resume" if is_kept else "make room"
             raise WriteError(
                 f"{error.filename or path}: writing failed: {error.strerror or error}",
-                remedy="make room, or give another --out",
+                remedy=f"{remedy}, or give another --out",
             ) from error
         raise
+
+
+def partial_path(path: Path) -> Path:
+    """``NAME.partial``, under which an output is written."""
+    return path.with_name(path.name + PARTIAL)
+
+
+def write_durably(path: Path, write: Callable[[Path], object]) -> None:
+    """Call `write` with a temporary name, and put what it wrote in the place of `path` in one step, on disk."""
+    temporary = path.with_name(path.name + ".new")
+    try:
+        write(temporary)
+        flush(temporary)
+        temporary.replace(path)
+        flush(path.parent)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def flush(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _check_replaceable(path: Path, *, is_folder: bool) -> None:
@@ -81,14 +125,14 @@ def _check_replaceable(path: Path, *, is_folder: bool) -> None:
 
 
 def _replace(partial: Path, path: Path) -> None:
+    old = path.with_name(path.name + ".partial.old")  # no name that a person gives to a copy
     if path.is_dir() and not path.is_symlink():
-        old = path.with_name(path.name + ".partial.old")  # no name that a person gives to a copy
         _remove(old)
         path.rename(old)
         partial.rename(path)
-        _remove(old)
     else:
         partial.replace(path)
+    _remove(old)  # also that of a run which was killed right above
 
 
 def _remove(path: Path) -> None:
@@ -124,13 +168,15 @@ def write_run(
     stopwatch: Stopwatch,
     seed: int = 0,
 ) -> None:
-    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, and what came out."""
-    packages = ("numpy", "scipy", "torch", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
+    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, and what came out.
+
+    ``--resume`` is left out of the arguments: an interrupted run leaves what an uninterrupted one does.
+    """
     run = {
         "command": command,
-        "arguments": sys.argv[1:],
+        "arguments": [argument for argument in sys.argv[1:] if argument != "--resume"],
         "splatctrl": __version__,
-        "versions": {name: metadata.version(name) for name in packages},
+        "versions": {name: metadata.version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "machine": platform.machine(),
         "seed": seed,

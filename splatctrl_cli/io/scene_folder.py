@@ -1,12 +1,11 @@
-"""The ``scene/`` folder: splats, occupancy, audit, snapshots by time, checkpoint, run.json.
+"""Reads the ``scene/`` folder that `SceneWriter` writes, and its occupancy grids.
 
-splats.ply  occupancy.npz  audit.jsonl  snapshots.csv  snapshots/NNNNNN.ply  checkpoint/state.npz  run.json
+splats.ply  occupancy.npz  audit.jsonl  snapshots.csv  snapshots/NNNNNN.ply and .npz  checkpoint/state.npz  run.json
 """
 
 import csv
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.io.splats import read_ply, write_ply
-from splatctrl_cli.records import OccupancyGrid, SplatSet
+from splatctrl_cli.io.arrays import savez
+from splatctrl_cli.io.output import PARTIAL
+from splatctrl_cli.io.splats import read_ply
+from splatctrl_cli.records import OccupancyGrid, SplatSet, UInt8, VoxelState
 
 FORMAT = "splatctrl-scene 1"
 
@@ -29,54 +30,14 @@ class Snapshot:
     path: Path
     num_splats: int
 
+    @property
+    def occupancy_path(self) -> Path:
+        """What was known of each voxel then."""
+        return self.path.with_suffix(".npz")
 
-class SceneWriter:
-    """Writes a scene into an empty folder, as the fitter goes."""
-
-    def __init__(self, folder: Path, comments: Mapping[str, str]) -> None:
-        self.folder = folder
-        self.comments = dict(comments)
-        self._snapshots: list[Snapshot] = []
-        (folder / "snapshots").mkdir()
-        (folder / "checkpoint").mkdir()
-
-    def audit(self, row: object) -> None:
-        """Append one row to ``audit.jsonl``."""
-        assert is_dataclass(row) and not isinstance(row, type)
-        with (self.folder / "audit.jsonl").open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(asdict(row)) + "\n")
-
-    def snapshot(self, stamp_ns: int, splats: SplatSet) -> None:
-        """Write the splats as they are at `stamp_ns`."""
-        path = self.folder / "snapshots" / f"{len(self._snapshots):06d}.ply"
-        write_ply(path, splats, self.comments | {"stamp_ns": str(stamp_ns)})
-        self._snapshots.append(Snapshot(stamp_ns=stamp_ns, path=path, num_splats=len(splats)))
-
-    def finish(
-        self, stamp_ns: int, splats: SplatSet, grid: OccupancyGrid, state: Mapping[str, NDArray[np.generic]]
-    ) -> None:
-        """Write the final splats, the occupancy grid, the index of snapshots, and the checkpoint."""
-        write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
-        write_occupancy(self.folder / "occupancy.npz", grid)
-        with (self.folder / "snapshots.csv").open("w", newline="", encoding="utf-8") as stream:
-            table = csv.writer(stream, lineterminator="\n")
-            table.writerow(["stamp_ns", "file", "num_splats"])
-            table.writerows([s.stamp_ns, f"snapshots/{s.path.name}", s.num_splats] for s in self._snapshots)
-        _savez(self.folder / "checkpoint" / "state.npz", dict(state))
-
-
-def _savez(path: Path, arrays: dict[str, NDArray[np.generic]]) -> None:
-    """`np.savez_compressed` without the clock: the same arrays give the same bytes."""
-    import io
-    import zipfile
-
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, np.asarray(array), allow_pickle=False)
-            entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, buffer.getvalue())
+    def occupancy(self) -> OccupancyGrid | None:
+        """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
+        return read_states(self.occupancy_path) if self.occupancy_path.is_file() else None
 
 
 def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
@@ -96,7 +57,32 @@ def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
         "num_updates": grid.num_updates,
         "entity": grid.entity,
     }
-    _savez(path, arrays)
+    savez(path, arrays)
+
+
+def write_states(path: Path, grid: OccupancyGrid, states: UInt8) -> None:
+    """Write `states` (X, Y, Z) of the voxels of `grid`: a tenth of the size of its occupancy."""
+    header = {
+        "format": "splatctrl-voxel-states 1",
+        "frame": "world",
+        "units": "m",
+        "origin": grid.origin.tolist(),
+        "voxel": grid.voxel,
+        "shape": list(states.shape),
+        "values": {state.name.lower(): int(state) for state in VoxelState},
+    }
+    savez(path, {"header": np.array(json.dumps(header)), "states": states}, level=6)
+
+
+def read_states(path: Path) -> OccupancyGrid:
+    """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            header = json.loads(str(archive["header"]))
+            origin = np.array(header["origin"], np.float64)
+            return OccupancyGrid.from_states(origin, float(header["voxel"]), archive["states"])
+    except Exception as error:
+        raise InputError(f"{path}: not the voxel states of a snapshot: {error}") from error
 
 
 def read_occupancy(path: Path) -> OccupancyGrid:
@@ -177,7 +163,7 @@ class SceneFolder:
         except (OSError, KeyError, ValueError) as error:
             raise InputError(f"{path}: cannot be read: {error}") from None
 
-    def splats_at(self, stamp_ns: int) -> SplatSet:
+    def snapshot_at(self, stamp_ns: int) -> Snapshot:
         """The newest snapshot not later than `stamp_ns`; NotEvaluableError before the first."""
         known = [s for s in self.snapshots if s.stamp_ns <= stamp_ns]
         if not known:
@@ -185,13 +171,19 @@ class SceneFolder:
                 f"{self.path}: no snapshot at or before stamp {stamp_ns}",
                 remedy="the scene was not known yet; ask for a later time",
             )
-        return read_ply(known[-1].path)[0]
+        return known[-1]
+
+    def splats_at(self, stamp_ns: int) -> SplatSet:
+        """The splats of `snapshot_at`."""
+        return read_ply(self.snapshot_at(stamp_ns).path)[0]
 
 
 def open_scene(path: Path) -> SceneFolder:
     """The scene in a folder. Raises InputError where it is none."""
     if not path.exists():
         raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
+    if path.name.endswith(PARTIAL):
+        raise InputError(f"{path}: an interrupted run", remedy="continue it: the same command and --resume")
     if not (path / "splats.ply").is_file() or not (path / "run.json").is_file():
         raise InputError(
             f"{path}: expected a scene folder with splats.ply and run.json",

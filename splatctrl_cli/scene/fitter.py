@@ -1,11 +1,9 @@
 """`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to an up-to-date splat set."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.errors import UsageError
@@ -19,12 +17,12 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
     unpack_parameters,
 )
-from splatctrl_cli.records import Bool, Box, Float32, Intrinsics, Label, OccupancyGrid, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Label, OccupancyGrid, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.labels import relabel
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture, carried
-from splatctrl_cli.scene.removal import removals, seen_through
+from splatctrl_cli.scene.posture import RobotPosture, carried
+from splatctrl_cli.scene.removal import REASONS, removals, seen_through
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
@@ -38,7 +36,6 @@ from splatctrl_cli.scene.seeding import (
 )
 from splatctrl_cli.scene.window import View, Window, make_view
 
-DENSITY_NAMES = ("edge", "tolerance", "num_candidates")
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
@@ -65,10 +62,19 @@ class AuditRow:
     psnr: float | None
 
 
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """How far refining has come: blocks done, where their seeds went, and what they removed by reason."""
+
+    num_blocks: int
+    filled: Filled
+    removed: dict[str, int]
+
+
 class SceneFitter:
     """Fits a fixed budget of isotropic splats to a stream of RGB-D frames.
 
-    The whole state is `state()`; the same frames and seed give the same bytes at any thread count.
+    The whole state is in `checkpoint.fitter_state`; the same frames and seed give the same bytes at any thread count.
     """
 
     def __init__(
@@ -91,7 +97,10 @@ class SceneFitter:
         self.num_steps = 0
         self.num_iterations = 0
         self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
-        self._posture: RobotPosture | None = None
+        self.posture: RobotPosture | None = None
+        self.refined = Refined(
+            num_blocks=0, filled=Filled(added=0, relocated=0, unmet=0), removed=dict.fromkeys(REASONS, 0)
+        )
         self._raster = Rasteriser(self.num_threads)
         self._loss = ImageLoss(self.num_threads)
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
@@ -99,7 +108,7 @@ class SceneFitter:
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
-        views = [self._view(frame) for frame in frames]
+        views = [self.view(frame) for frame in frames]
         for frame in frames:
             self.occupancy.integrate(frame)
         self.occupancy.mark_humans(frames)
@@ -121,23 +130,31 @@ class SceneFitter:
     def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
         """Optimise over the window with learning rates that fall to `final_rate`; for scenes that do not move.
 
-        `progress` is called with the number of iterations done, ten times.
+        `progress` is called with the number of iterations done, after each of ten blocks; a restored fitter goes on
+        with the block after the last one done.
         """
-        rng = np.random.default_rng([self.seed, self.num_steps, 1])
         views = [*self.window.newest, *self.window.keyframes]
+        for block in range(self.refined.num_blocks, NUM_BLOCKS):
+            self._refine_block(block, num_iterations, views)
+            progress(num_iterations * (block + 1) // NUM_BLOCKS)
+        filled = self.refined.filled + self._fill_gaps(views)
+        return self._audit(views, filled, self.refined.removed)
+
+    def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
+        rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
         nowhere = np.zeros(self.config.max_splats, bool)
-        filled, removed = Filled(added=0, relocated=0, unmet=0), Counter[str]()
-        for block in range(NUM_BLOCKS):
-            rate = self.config.final_rate ** (block / (NUM_BLOCKS - 1))
-            done = num_iterations * block // NUM_BLOCKS
-            count = num_iterations * (block + 1) // NUM_BLOCKS - done
-            self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
-            removed.update(self._remove(nowhere, self._floating([view.frame for view in views]), counts_time=False))
-            if block < NUM_BLOCKS - 2:
-                filled += self._seed(views)
-            progress(done + count)
-        filled += self._fill_gaps(views)
-        return self._audit(views, filled, dict(removed))
+        rate = self.config.final_rate ** (block / (NUM_BLOCKS - 1))
+        count = num_iterations * (block + 1) // NUM_BLOCKS - num_iterations * block // NUM_BLOCKS
+        self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
+        removed = self._remove(nowhere, self._floating([view.frame for view in views]), counts_time=False)
+        filled = self.refined.filled
+        if block < NUM_BLOCKS - 2:
+            filled += self._seed(views)
+        self.refined = Refined(
+            num_blocks=block + 1,
+            filled=filled,
+            removed={reason: before + removed[reason] for reason, before in self.refined.removed.items()},
+        )
 
     def splats(self) -> SplatSet:
         """The live splats."""
@@ -147,13 +164,14 @@ class SceneFitter:
         """The occupancy grid as it is now."""
         return self.occupancy.grid()
 
-    def _view(self, frame: RgbdFrame) -> View:
+    def view(self, frame: RgbdFrame) -> View:
+        """A frame as the optimiser takes it."""
         min_range = self.occupancy.config.min_range
         return make_view(frame, inside_workspace(frame, world_points(frame), self.workspace, min_range))
 
     def _carry(self, robot: RobotPosture | None) -> None:
         """Move the robot's splats with the link of the sphere they are nearest to."""
-        before, self._posture = self._posture, robot
+        before, self.posture = self.posture, robot
         if before is None or robot is None:
             return
         slots = np.flatnonzero(self.buffer.is_alive & (self.buffer.labels == Label.ROBOT))
@@ -305,69 +323,3 @@ class SceneFitter:
             loss=round(float(np.mean(image)) + c.lambda_reg * opacity, 6) if image else None,
             psnr=None if squared is None else round(-10.0 * float(np.log10(max(squared, 1e-12))), 4),
         )
-
-    def state(self) -> dict[str, NDArray[np.generic]]:
-        """Everything a fitter needs to go on exactly, as arrays: splats, Adam, occupancy, window, counters."""
-        arrays = self.buffer.arrays() | {
-            "log_odds": self.occupancy.log_odds,
-            "num_updates": self.occupancy.num_updates,
-            "entity": self.occupancy.entity,
-            "counters": np.array([self.num_steps, self.num_iterations], np.int64),
-        }
-        if self.density is not None:
-            arrays["density"] = np.array([getattr(self.density, name) for name in DENSITY_NAMES])
-        if self._posture is not None:
-            arrays |= {f"posture/{name}": getattr(self._posture, name) for name in POSTURE_NAMES}
-        for kind, views in (("newest", self.window.newest), ("keyframe", self.window.keyframes)):
-            for index, view in enumerate(views):
-                arrays |= {f"{kind}/{index}/{name}": array for name, array in _frame_arrays(view.frame).items()}
-        return arrays
-
-    def restore(self, arrays: dict[str, NDArray[np.generic]]) -> None:
-        """Take over the state that `state` of a fitter with the same configuration gave."""
-        for name, array in self.buffer.arrays().items():
-            array[...] = arrays[name]
-        for name in ("log_odds", "num_updates", "entity"):
-            getattr(self.occupancy, name)[...] = arrays[name]
-        self.num_steps, self.num_iterations = (int(n) for n in arrays["counters"])
-        if "density" in arrays:
-            edge, tolerance, num_candidates = (float(x) for x in arrays["density"])
-            self.density = SeedDensity(edge=edge, tolerance=tolerance, num_candidates=int(num_candidates))
-        if "posture/radii" in arrays:
-            self._posture = RobotPosture(**{n: np.asarray(arrays[f"posture/{n}"], float) for n in POSTURE_NAMES})
-        self.window = Window(self.config)
-        self.window.newest = [self._view(frame) for frame in _frames(arrays, "newest")]
-        self.window.keyframes = [self._view(frame) for frame in _frames(arrays, "keyframe")]
-
-
-def _frame_arrays(frame: RgbdFrame) -> dict[str, NDArray[np.generic]]:
-    k = frame.intrinsics
-    return {
-        "color": frame.color,
-        "depth": frame.depth,
-        "T_world_camera": frame.T_world_camera,
-        "intrinsics": np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height]),
-        "stamp_ns": np.array(frame.stamp_ns, np.int64),
-        "camera": np.array(frame.camera),
-    }
-
-
-def _frames(arrays: dict[str, NDArray[np.generic]], kind: str) -> list[RgbdFrame]:
-    frames: list[RgbdFrame] = []
-    while f"{kind}/{len(frames)}/color" in arrays:
-        a = {name: arrays[f"{kind}/{len(frames)}/{name}"] for name in _FRAME_NAMES}
-        fx, fy, cx, cy, width, height = (float(x) for x in a["intrinsics"])
-        frames.append(
-            RgbdFrame(
-                stamp_ns=int(a["stamp_ns"]),
-                camera=str(a["camera"]),
-                color=np.asarray(a["color"], np.uint8),
-                depth=np.asarray(a["depth"], np.float32),
-                intrinsics=Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height)),
-                T_world_camera=np.asarray(a["T_world_camera"], np.float64),
-            )
-        )
-    return frames
-
-
-_FRAME_NAMES = ("color", "depth", "T_world_camera", "intrinsics", "stamp_ns", "camera")

@@ -15,7 +15,7 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.io import source
 from splatctrl_cli.io.grid import write_npz
-from splatctrl_cli.io.scene_folder import SceneWriter
+from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.records import Box, Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 
@@ -77,8 +77,8 @@ def write_scene(folder: Path, *snapshots: tuple[int, SplatSet], is_seen: bool = 
     folder.mkdir()
     writer = SceneWriter(folder, {"frame": "world"})
     for stamp_ns, splats in snapshots:
-        writer.snapshot(stamp_ns, splats)
-    writer.finish(*snapshots[-1], grid_seen(is_seen), {})
+        writer.snapshot(stamp_ns, splats, grid_seen(is_seen), grid_seen(is_seen).states(0.3, 0.7))
+    writer.finish(*snapshots[-1], grid_seen(is_seen))
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": snapshots[-1][0]}
     (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
     return folder

@@ -10,7 +10,7 @@ from splatctrl_cli.cli.field_truth import FIELDS
 from splatctrl_cli.cli.sdf_bake import SUMMARY_METRICS
 from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.io.grid import read_npz
-from splatctrl_cli.io.scene_folder import SceneWriter
+from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.simulate.truth import load_truth
@@ -134,8 +134,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = SceneWriter(folder, {})
     start_ns, shape = 7_000_000_000, (4, 4, 4)
     at = [splat_set(np.array([[0.0, 0.0, 0.1 * second]]), np.array([0.01])) for second in range(3)]
-    for second, splats in enumerate(at):
-        writer.snapshot(start_ns + second * 10**9, splats)
     free = OccupancyGrid(
         origin=np.full(3, -1.5),
         voxel=1.0,
@@ -143,13 +141,16 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         num_updates=np.ones(shape, np.uint16),
         entity=np.zeros(shape, np.uint8),
     )
-    writer.finish(start_ns + 2 * 10**9, at[-1], free, {})
+    for second, splats in enumerate(at):
+        writer.snapshot(start_ns + second * 10**9, splats, free, np.full(shape, second, np.uint8))
+    (folder / "snapshots" / "000000.npz").unlink()  # as in a scene of an older version
+    writer.finish(start_ns + 2 * 10**9, at[-1], free)
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": start_ns + 2 * 10**9}
     (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
     return folder
 
 
-@pytest.mark.parametrize(("at", "height", "observed"), [(None, 0.2, 1), (0.0, 0.0, 0), (1.9, 0.1, 0)])
+@pytest.mark.parametrize(("at", "height", "observed"), [(None, 0.2, 1), (0.0, 0.0, 0), (1.9, 0.1, 1), (2.0, 0.2, 2)])
 def test_a_scene_is_baked_as_it_was_known_then(
     tmp_path: Path, scene: Path, at: float | None, height: float, observed: int
 ) -> None:
@@ -158,10 +159,11 @@ def test_a_scene_is_baked_as_it_was_known_then(
     assert result.returncode == 0, result.stderr
     grid = read_npz(tmp_path / "field" / "field.npz")
     assert grid.channels["hard"][1, 1, 4] == pytest.approx(0.3 - height - 0.01, abs=1e-6)
-    assert (grid.channels["observed"] == observed).all()  # the occupancy grid on disk is that of the end
+    assert (grid.channels["observed"] == observed).all()
     digests = grid.header["digests"]
     assert isinstance(digests, dict)
-    assert ("occupancy.npz" in digests) == (at is None)
+    names = {None: "occupancy.npz", 0.0: "000000.ply", 1.9: "000001.npz", 2.0: "000002.npz"}
+    assert list(digests)[-1] == names[at]
 
 
 def test_a_box_that_no_camera_saw_is_warned_about(tmp_path: Path, scene: Path) -> None:

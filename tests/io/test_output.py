@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError, WriteError
-from splatctrl_cli.io.output import output_path
+from splatctrl_cli.io.output import output_path, write_durably
 
 
 def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
@@ -157,3 +157,65 @@ def test_a_fault_of_our_own_leaves_nothing(tmp_path: Path) -> None:
         partial.write_text("1")
         raise ZeroDivisionError
     assert not list(tmp_path.iterdir())
+
+
+FULL = OSError(28, "No space left on device", "a")
+
+
+@pytest.mark.parametrize(
+    ("resume", "error", "is_kept"),
+    [
+        (False, FULL, True),
+        (False, InputError("bad"), False),
+        (False, ZeroDivisionError(), False),
+        (True, FULL, True),
+        (True, InputError("another log"), True),
+        (True, ZeroDivisionError(), True),
+    ],
+)
+def test_a_failure_leaves_what_a_run_can_go_on_from(
+    tmp_path: Path, resume: bool, error: Exception, is_kept: bool
+) -> None:
+    out, partial = tmp_path / "out", tmp_path / "out.partial"
+    if resume:
+        partial.mkdir()
+        (partial / "state").write_text("1")
+    with (
+        pytest.raises(WriteError if error is FULL else type(error)),
+        output_path(out, force=False, is_folder=True, checkpoint="state", resume=resume) as folder,
+    ):
+        assert (folder / "state").exists() == resume
+        (folder / "state").write_text("1")
+        raise error
+    assert partial.exists() == is_kept
+
+
+def test_a_partial_without_a_checkpoint_is_begun_again(tmp_path: Path) -> None:
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "rest").write_text("1")
+    with output_path(tmp_path / "out", force=False, is_folder=True, checkpoint="state", resume=True) as folder:
+        assert not list(folder.iterdir())
+    assert (tmp_path / "out").is_dir()
+
+
+def test_what_a_killed_replacement_left_of_the_old_output_goes_with_the_next(tmp_path: Path) -> None:
+    (tmp_path / "out.partial.old").mkdir()
+    with output_path(tmp_path / "out", force=False, is_folder=True):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    write_durably(path, lambda p: p.write_text("old"))
+
+    def half(p: Path) -> None:
+        p.write_text("ne")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        write_durably(path, half)
+    assert path.read_text() == "old"
+    write_durably(path, lambda p: p.write_text("new"))
+    assert path.read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["state"]

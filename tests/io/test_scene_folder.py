@@ -8,13 +8,17 @@ import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.io.output import write_json
-from splatctrl_cli.io.scene_folder import SceneWriter, open_scene, read_occupancy, write_occupancy
-from splatctrl_cli.records import OccupancyGrid, SplatSet
+from splatctrl_cli.io.scene_folder import open_scene, read_occupancy, read_states, write_occupancy, write_states
+from splatctrl_cli.io.scene_writer import CHECKPOINT, SceneWriter, read_checkpoint
+from splatctrl_cli.records import SWEPT, OccupancyGrid, SplatSet
 
 
 @dataclass(frozen=True)
 class Row:
     stamp_ns: int
+
+
+STATE = {"a": np.arange(4), "scalar": np.array(2.5)}
 
 
 def splats(count: int) -> SplatSet:
@@ -45,8 +49,9 @@ def written(folder: Path) -> Path:
     writer = SceneWriter(folder, {"frame": "world"})
     for stamp in (100, 200, 300):
         writer.audit(Row(stamp))
-        writer.snapshot(stamp, splats(stamp // 100))
-    writer.finish(300, splats(3), grid(), {"a": np.arange(4), "scalar": np.array(2.5)})
+        writer.snapshot(stamp, splats(stamp // 100), grid(), grid().states(0.3, 0.7))
+    writer.finish(300, splats(3), grid())
+    writer.checkpoint({}, STATE, is_last=True)
     write_json(folder / "run.json", {"metrics": {"cameras": ["cam0"], "has_clock": True, "stamp_ns": 300}})
     return folder
 
@@ -76,9 +81,66 @@ def test_the_same_scene_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_keeps_scalars_scalar(tmp_path: Path) -> None:
-    with np.load(written(tmp_path / "scene") / "checkpoint" / "state.npz", allow_pickle=False) as state:
-        assert state["scalar"].shape == ()
-        assert state["a"].tolist() == [0, 1, 2, 3]
+    state = read_checkpoint(written(tmp_path / "scene")).state
+    assert state["scalar"].shape == ()
+    assert state["a"].tolist() == [0, 1, 2, 3]
+
+
+def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
+    straight, cut = tmp_path / "straight", tmp_path / "cut"
+    for folder in (straight, cut):
+        folder.mkdir()
+        writer = SceneWriter(folder, {"frame": "world"})
+        for stamp in (100, 200):
+            writer.audit(Row(stamp))
+            writer.snapshot(stamp, splats(2), grid(), grid().states(0.3, 0.7))
+        writer.checkpoint({"num_read": 2}, STATE)
+        if folder is cut:
+            writer.audit(Row(999))
+            writer.snapshot(999, splats(9), grid(), grid().states(0.3, 0.7))
+            for name in ("audit.jsonl", "snapshots/000003.ply", f"{CHECKPOINT}.new", "splats.ply", "run.json"):
+                with (folder / name).open("ab") as stream:
+                    stream.write(b'{"stamp')
+            again = read_checkpoint(folder)
+            assert again.progress == {"num_read": 2}
+            writer = SceneWriter(folder, {"frame": "world"}, again)
+            assert [row["stamp_ns"] for row in writer.audited()] == [100, 200]
+        writer.audit(Row(300))
+        writer.snapshot(300, splats(3), grid(), grid().states(0.3, 0.7))
+        writer.finish(300, splats(3), grid())
+        writer.checkpoint({"num_read": 3}, STATE, is_last=True)
+    files = {p.relative_to(cut): p.read_bytes() for p in cut.rglob("*") if p.is_file()}
+    assert files == {p.relative_to(straight): p.read_bytes() for p in straight.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("name", ["audit.jsonl", "snapshots/000001.npz", CHECKPOINT])
+def test_a_partial_scene_that_lacks_a_file_does_not_go_on(tmp_path: Path, name: str) -> None:
+    folder = written(tmp_path / "scene.partial")
+    (folder / name).unlink()
+    with pytest.raises(InputError, match="start over"):
+        SceneWriter(folder, {}, read_checkpoint(folder))
+
+
+def test_an_interrupted_run_is_not_read_as_a_scene(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"an interrupted run; continue it: .*--resume"):
+        open_scene(written(tmp_path / "scene.partial"))
+
+
+def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
+    want = grid()
+    want.num_updates[0], want.entity[0] = 0, 0
+    want.num_updates[1, 0], want.entity[1, 0] = 0, SWEPT
+    states = want.states(0.3, 0.7)
+    assert set(states.ravel().tolist()) == {0, 1, 2, 3, 4}
+    write_states(tmp_path / "a.npz", want, states)
+    again = read_states(tmp_path / "a.npz")
+    assert again.voxel == want.voxel
+    assert again.origin.tobytes() == want.origin.tobytes()
+    for thresholds in ((0.3, 0.7), (0.01, 0.99)):
+        assert (again.states(*thresholds) == states).all()
+    (tmp_path / "b.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match="not the voxel states"):
+        read_states(tmp_path / "b.npz")
 
 
 def test_what_is_no_scene_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,256 @@
+"""The fitter over a source's time steps, with what is written on the way and the checkpoints to go on from."""
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.common import Console
+from splatctrl_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.config import Config
+    from splatctrl_cli.io.scene_writer import Checkpoint
+    from splatctrl_cli.records import Box, RecordSource
+    from splatctrl_cli.robot.model import RobotModel
+    from splatctrl_cli.scene.fitter import AuditRow, SceneFitter
+    from splatctrl_cli.scene.posture import RobotPosture
+    from splatctrl_cli.scene.time_steps import TimeStep
+
+LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
+SAME_MOMENT_NS = 20_000_000  # frames of one time step are at most so far apart
+
+
+def training_cameras(source: "RecordSource") -> list[str]:
+    """The cameras that may train. Raises UsageError where there are none."""
+    cameras = [camera for camera in source.cameras if camera != "holdout"]
+    if not cameras:
+        raise UsageError(f"{source.name}: no camera is left to train on", remedy="camera 'holdout' is kept for score")
+    return cameras
+
+
+class Reconstruction:
+    """One run over `source` into `folder`; with `checkpoint` it goes on where that was written.
+
+    identity: plain values that a run which goes on must have in common with this one.
+    """
+
+    def __init__(
+        self,
+        source: "RecordSource",
+        robot: "RobotModel | None",
+        config: "Config",
+        folder: Path,
+        *,
+        box: "Box | None",
+        seed: int,
+        threads: int,
+        identity: Mapping[str, Any],
+        checkpoint: "Checkpoint | None" = None,
+    ) -> None:
+        from splatctrl_cli.io.scene_folder import FORMAT
+        from splatctrl_cli.io.scene_writer import SceneWriter
+
+        self.source = source
+        self.robot = robot
+        self.config = config
+        self.box = box
+        self.seed = seed
+        self.threads = threads
+        self.identity = identity
+        self.cameras = training_cameras(source)
+        comments = {"format": FORMAT, "frame": "world", "units": "m", "source": source.name}
+        self.writer = SceneWriter(folder, comments, checkpoint)
+        self.fitter: SceneFitter | None = None
+        self.rows: list[AuditRow] = []
+        self.stamps: list[int] = []
+        self.num_read = 0  # time steps of the source, those that were left out included
+        self.is_refined = False
+        self._saved_at, self._save_time = -float("inf"), 0.0
+        if checkpoint is not None:
+            self._restore(checkpoint)
+
+    def run(self, console: Console) -> None:
+        """Step through what is left of the log."""
+        early = self._step_through(console)
+        if self.fitter is None and early is not None:
+            self._workspace(early)  # says that there is no depth
+        if self.fitter is None:
+            raise InputError(
+                f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
+                remedy="'splatctrl info' says what the input lacks",
+            )
+        if not any(row.alive for row in self.rows):
+            raise InputError(
+                f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
+                remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
+            )
+        if not self.source.has_clock and not self.is_refined:
+            self._refine(self.fitter, console)
+
+    def _step_through(self, console: Console) -> "TimeStep | None":
+        """Take in the time steps; returns the first one that said nothing yet of where the workspace is."""
+        from tqdm import tqdm
+
+        steps = tqdm(self._steps(), disable=True if console.is_quiet else None, unit=" steps")
+        early: TimeStep | None = None
+        for index, step in enumerate(steps):
+            if index < self.num_read:
+                continue
+            self.num_read = index + 1
+            if self.fitter is None and not step.has_depth and self._needs_depth():
+                console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
+                early = early or step
+                continue
+            if self.fitter is None:
+                self.fitter = self._new_fitter(self._workspace(step))
+            elif not self.source.has_clock and self.fitter.num_steps == 1:
+                console.log(
+                    "warning: more views than fit in one time step; the last ones are refined on, the rest seed"
+                )
+            row = self.fitter.step(step.frames, self._posture(step))
+            self.stamps.extend(frame.stamp_ns for frame in step.frames)
+            self._record(row)
+            if index % 10 == 0 and not steps.disable:
+                steps.set_postfix(splats=row.alive, dB=row.psnr)
+            if steps.disable and index % 10 == 0:
+                quality = (
+                    "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB on its own views"
+                )
+                console.log(f"time step {index}: {row.alive} splats, {quality}")
+            if self.source.has_clock and self._is_snapshot_due(index, step.stamp_ns):
+                self._snapshot(step.stamp_ns)
+            self._save_if_due()
+        return early
+
+    def _refine(self, fitter: "SceneFitter", console: Console) -> None:
+        total = self.config.scene.refine_iterations
+
+        def progress(done: int) -> None:
+            console.log(f"refined {done} of {total} iterations")
+            self._save_if_due()
+
+        self._record(fitter.refine(total, progress))
+        self._snapshot(self.rows[-1].stamp_ns)
+        self.is_refined = True
+
+    def finish(self) -> None:
+        """Write what the end of the log left."""
+        assert self.fitter is not None
+        self.writer.finish(self.rows[-1].stamp_ns, self.fitter.splats(), self.fitter.occupancy_grid())
+        self._save(is_last=True)
+
+    def metrics(self) -> dict[str, object]:
+        """For ``run.json`` and gates."""
+        assert self.fitter is not None
+        last = self.rows[-1]
+        return {
+            "cameras": self.cameras,
+            "has_clock": self.source.has_clock,
+            "stamp_ns": last.stamp_ns,
+            "training_stamps_ns": [] if self.source.has_clock else self.stamps,
+            "time_steps": self.fitter.num_steps,
+            "iterations": self.fitter.num_iterations,
+            "splats": last.alive,
+            "robot_splats": last.robot,
+            "added": sum(row.added for row in self.rows),
+            "relocated": sum(row.relocated for row in self.rows),
+            "unmet": sum(row.unmet for row in self.rows),
+            "loss": last.loss,
+            "psnr": last.psnr,
+            "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
+        }
+
+    def _record(self, row: "AuditRow") -> None:
+        self.rows.append(row)
+        self.writer.audit(row)
+
+    def _is_snapshot_due(self, index: int, stamp_ns: int) -> bool:
+        """Every `snapshot_every` time steps, and then only if a multiple of `snapshot_period` has passed since."""
+        scene, taken = self.config.scene, self.writer.snapshots
+        if index % scene.snapshot_every:
+            return False
+        period_ns = round(scene.snapshot_period * 1e9)
+        if not taken or period_ns == 0:
+            return True
+        first, last = taken[0].stamp_ns - SAME_MOMENT_NS, taken[-1].stamp_ns
+        return (stamp_ns - first) // period_ns > (last - first) // period_ns
+
+    def _snapshot(self, stamp_ns: int) -> None:
+        assert self.fitter is not None
+        grid, thresholds = self.fitter.occupancy_grid(), self.config.occupancy
+        states = grid.states(thresholds.free_below, thresholds.occupied_above)
+        self.writer.snapshot(stamp_ns, self.fitter.splats(), grid, states)
+
+    def _save_if_due(self) -> None:
+        period = self.config.scene.checkpoint_period
+        if period > 0 and time.monotonic() < self._saved_at + max(period, LONGEST_SHARE * self._save_time):
+            return
+        start = time.monotonic()
+        self._save()
+        self._saved_at = time.monotonic()
+        self._save_time = self._saved_at - start
+
+    def _save(self, *, is_last: bool = False) -> None:
+        from splatctrl_cli.scene.checkpoint import fitter_state
+
+        assert self.fitter is not None
+        progress = {
+            "run": self.identity,
+            "num_read": self.num_read,
+            "is_refined": self.is_refined,
+            "stamps": [] if self.source.has_clock else self.stamps,
+        }
+        self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
+
+    def _restore(self, checkpoint: "Checkpoint") -> None:
+        from splatctrl_cli.scene.checkpoint import restore_fitter, workspace_of
+        from splatctrl_cli.scene.fitter import AuditRow
+
+        self.rows = [AuditRow(**{**row, "cameras": tuple(row["cameras"])}) for row in self.writer.audited()]
+        self.num_read = checkpoint.progress["num_read"]
+        self.is_refined = checkpoint.progress["is_refined"]
+        self.stamps = checkpoint.progress["stamps"]
+        self.fitter = self._new_fitter(workspace_of(checkpoint.state))
+        restore_fitter(self.fitter, checkpoint.state)
+
+    def _steps(self) -> "Iterator[TimeStep]":
+        from splatctrl_cli.scene.time_steps import time_steps
+
+        return time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)
+
+    def _new_fitter(self, workspace: "Box") -> "SceneFitter":
+        from splatctrl_cli.scene.fitter import SceneFitter
+
+        return SceneFitter(self.config.scene, self.config.occupancy, workspace, seed=self.seed, threads=self.threads)
+
+    def _needs_depth(self) -> bool:
+        """Whether only depth can say where the workspace is."""
+        return self.box is None and self.robot is None
+
+    def _workspace(self, first: "TimeStep") -> "Box":
+        from splatctrl_cli.records import Box
+        from splatctrl_cli.scene.time_steps import depth_box
+
+        if self.box is not None:
+            return self.box
+        if self.robot is not None:
+            reach, base = self.robot.reach(), self.robot.base_position
+            return Box(lower=base - reach, upper=base + reach)
+        return depth_box(first.frames, self.config.occupancy.max_range)
+
+    def _posture(self, step: "TimeStep") -> "RobotPosture | None":
+        import numpy as np
+
+        from splatctrl_cli.scene.posture import RobotPosture
+
+        if self.robot is None or step.position is None:
+            return None
+        q = step.position[self.robot.joint_order(self.source.joint_names)]
+        spheres = self.robot.sphere_set
+        pose = {link: self.robot.frame_pose(q, link) for link in set(spheres.links)}
+        return RobotPosture(
+            centers=self.robot.sphere_centers(q),
+            radii=spheres.radii,
+            T_world_link=np.array([pose[link] for link in spheres.links]),
+        )

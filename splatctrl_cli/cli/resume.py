@@ -1,0 +1,74 @@
+"""Going on with an interrupted run: what has to be the same, and what differs."""
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.config import Config
+    from splatctrl_cli.io.scene_writer import Checkpoint
+
+DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit
+DECIDING_OPTIONS = (
+    *("cameras", "camera", "camera_pose", "world_frame", "depth_scale", "pairing_tolerance", "joint_topic"),
+    *("holdout", "scan", "box"),
+)
+
+
+def identity(args: argparse.Namespace, config: "Config", inputs: Mapping[str, str]) -> dict[str, Any]:
+    """Everything that decides the bytes of a run, as plain values; not the number of threads, which does not.
+
+    inputs: sha256 of the recording's files, by name.
+    """
+    from splatctrl_cli import __version__
+    from splatctrl_cli.io.output import sha256
+    from splatctrl_cli.kernels import native
+
+    robot = {f"--{name}": sha256(getattr(args, name)) for name in ("urdf", "spheres") if getattr(args, name)}
+    values = {
+        "splatctrl": __version__,
+        "kernels": native.__name__.rpartition(".")[2],
+        **{name: metadata.version(name) for name in DECIDING_PACKAGES},
+        "--seed": args.seed,
+        **{f"--{name.replace('_', '-')}": getattr(args, name) for name in DECIDING_OPTIONS},
+        **robot,
+        "sha256": dict(inputs),
+        **config.as_dict(),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    return plain
+
+
+def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> "Checkpoint":
+    """The checkpoint in a partial folder. Raises UsageError naming what differs `now` from when it was written."""
+    from splatctrl_cli.io.scene_writer import read_checkpoint
+
+    checkpoint = read_checkpoint(folder)
+    before, after = dict(_flat(checkpoint.progress["run"])), dict(_flat(now))
+    differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    if differing:
+        said = ", ".join(f"{n} was {_shown(before.get(n))}, is {_shown(after.get(n))}" for n in differing[:3])
+        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+        raise UsageError(
+            f"{folder}: --resume: the run that was interrupted differs: {said}{more}",
+            remedy="give what it was given, or start over without --resume",
+        )
+    return checkpoint
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}{' of ' if name == 'sha256' else '.'}")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _shown(value: object) -> str:
+    text = "not given" if value is None or value == [] else str(value)
+    return text if len(text) <= 40 else f"{text[:12]}..."

@@ -1,0 +1,101 @@
+"""The whole state of a fitter as arrays, from which another goes on to the same bytes."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.records import Box, Intrinsics, RgbdFrame
+from splatctrl_cli.scene.buffer import Filled
+from splatctrl_cli.scene.fitter import Refined, SceneFitter
+from splatctrl_cli.scene.posture import POSTURE_NAMES, RobotPosture
+from splatctrl_cli.scene.removal import REASONS
+from splatctrl_cli.scene.seeding import SeedDensity
+from splatctrl_cli.scene.window import Window
+
+Arrays = Mapping[str, NDArray[np.generic]]
+
+GRID_NAMES = ("log_odds", "num_updates", "entity")
+DENSITY_NAMES = ("edge", "tolerance", "num_candidates")
+FILLED_NAMES = ("added", "relocated", "unmet")
+FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
+
+
+def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
+    """Splats, Adam's moments, occupancy, window of frames, counters: views of what the fitter holds, not copies.
+
+    There is no state of a random generator: each time step and each block of refining draws from one of its own,
+    seeded by its number.
+    """
+    arrays: dict[str, NDArray[np.generic]] = dict(fitter.buffer.arrays())
+    arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
+    arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
+    arrays["counters"] = np.array([fitter.num_steps, fitter.num_iterations], np.int64)
+    arrays["refined"] = _refined_array(fitter.refined)
+    if fitter.density is not None:
+        arrays["density"] = np.array([getattr(fitter.density, name) for name in DENSITY_NAMES])
+    if fitter.posture is not None:
+        arrays |= {f"posture/{name}": getattr(fitter.posture, name) for name in POSTURE_NAMES}
+    for kind, views in (("newest", fitter.window.newest), ("keyframe", fitter.window.keyframes)):
+        for index, view in enumerate(views):
+            arrays |= {f"{kind}/{index}/{name}": array for name, array in _frame_arrays(view.frame).items()}
+    return arrays
+
+
+def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
+    """Take over the state of a fitter with the same configuration, seed and workspace."""
+    for name, array in fitter.buffer.arrays().items():
+        array[...] = arrays[name]
+    for name in GRID_NAMES:
+        getattr(fitter.occupancy, name)[...] = arrays[name]
+    fitter.num_steps, fitter.num_iterations = (int(n) for n in arrays["counters"])
+    fitter.refined = _refined(arrays["refined"])
+    if "density" in arrays:
+        edge, tolerance, num_candidates = (float(x) for x in arrays["density"])
+        fitter.density = SeedDensity(edge=edge, tolerance=tolerance, num_candidates=int(num_candidates))
+    if "posture/radii" in arrays:
+        fitter.posture = RobotPosture(**{n: np.asarray(arrays[f"posture/{n}"], float) for n in POSTURE_NAMES})
+    fitter.window = Window(fitter.config)
+    fitter.window.newest = [fitter.view(frame) for frame in _frames(arrays, "newest")]
+    fitter.window.keyframes = [fitter.view(frame) for frame in _frames(arrays, "keyframe")]
+
+
+def workspace_of(arrays: Arrays) -> Box:
+    """The workspace of the fitter whose state this is."""
+    lower, upper = np.asarray(arrays["workspace"], np.float64)
+    return Box(lower=lower, upper=upper)
+
+
+def _refined_array(refined: Refined) -> NDArray[np.generic]:
+    filled = [getattr(refined.filled, name) for name in FILLED_NAMES]
+    return np.array([refined.num_blocks, *filled, *(refined.removed[reason] for reason in REASONS)], np.int64)
+
+
+def _refined(array: NDArray[np.generic]) -> Refined:
+    num_blocks, added, relocated, unmet, *removed = (int(n) for n in array)
+    return Refined(
+        num_blocks=num_blocks,
+        filled=Filled(added=added, relocated=relocated, unmet=unmet),
+        removed=dict(zip(REASONS, removed, strict=True)),
+    )
+
+
+def _frame_arrays(frame: RgbdFrame) -> dict[str, NDArray[np.generic]]:
+    values = {name: getattr(frame, name) for name in FRAME_NAMES}
+    k = frame.intrinsics
+    values["intrinsics"] = [k.fx, k.fy, k.cx, k.cy, k.width, k.height]
+    return {name: np.asarray(value) for name, value in values.items() if value is not None}
+
+
+def _frames(arrays: Arrays, kind: str) -> list[RgbdFrame]:
+    frames: list[RgbdFrame] = []
+    while f"{kind}/{len(frames)}/color" in arrays:
+        start = f"{kind}/{len(frames)}/"
+        values: dict[str, Any] = {name: arrays[start + name] for name in FRAME_NAMES if start + name in arrays}
+        fx, fy, cx, cy, width, height = (float(x) for x in values["intrinsics"])
+        values["intrinsics"] = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height))
+        values["stamp_ns"], values["camera"] = int(values["stamp_ns"]), str(values["camera"])
+        frames.append(RgbdFrame(**values))
+    return frames
