@@ -3,7 +3,7 @@
 import argparse
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.io.output import Stopwatch, output_path
     from splatctrl_cli.io.scene_folder import open_scene
 
-    check_gate_names(args.require, (*metric_names(), "num_skipped"))
+    check_gate_names(args.require, (*metric_names(), "free_mass", "num_skipped"))
     console, stopwatch = Console(args), Stopwatch()
     scene = open_scene(args.scene)
     source = _open_reference(args)
@@ -96,12 +96,24 @@ def _result(
         "has_clock": scores.has_clock,
         "snapshots": args.snapshots if scores.has_clock else "final",
         "protocol": PROTOCOL,
-        "metrics": as_json(total_score(scores.views) | {"num_skipped": len(scores.skipped)}),
+        "metrics": as_json(
+            total_score(scores.views)
+            | {"free_mass": _free_mass(args.scene, scene), "num_skipped": len(scores.skipped)}
+        ),
         "skipped_views": scores.skipped,
         "views": [
             {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scores.views
         ],
     }
+
+
+def _free_mass(path: Path, scene: "SceneFolder") -> float:
+    """nan where the scene has no occupancy grid."""
+    from splatctrl_cli.evaluate.free_space import free_mass
+
+    if not (path / "occupancy.npz").is_file():
+        return nan
+    return free_mass(scene.splats(), scene.occupancy(), float(scene.run["config"]["occupancy"]["free_below"]))
 
 
 @dataclass(kw_only=True)
@@ -284,8 +296,9 @@ def _write(
     )
 
 
-COLUMNS = ("psnr_seen", "psnr_all", "ssim_seen", "ssim_all", "depth_median_seen", "depth_median_all", "seen_share")
-HEADER = ("dB seen", "dB all", "SSIM seen", "SSIM all", "depth mm seen", "depth mm all", "seen")
+COLUMNS = ("psnr_seen", "psnr_all", "ssim_seen", "ssim_all", "depth_median_seen", "depth_median_all",
+           "in_front_seen", "seen_share")  # fmt: skip
+HEADER = ("dB seen", "dB all", "SSIM seen", "SSIM all", "depth mm seen", "depth mm all", "in front", "seen")
 
 
 def _lines(result: dict[str, Any]) -> list[str]:
@@ -298,8 +311,11 @@ def _lines(result: dict[str, Any]) -> list[str]:
     lines.append("")
     lines.append(
         f"{_count(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
-        f"depth: median of the absolute error; seen: by {', '.join(result['training_cameras'])} within 2 cm"
+        f"depth: median of the absolute error; in front: of what was measured, by over 3 cm, where seen; "
+        f"seen: by {', '.join(result['training_cameras'])} within 2 cm"
     )
+    if metrics["free_mass"] is not None:
+        lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")
     return lines
 
 
@@ -316,6 +332,6 @@ def _cell(name: str, value: float | None) -> str:
         return "-"
     if name.startswith("depth"):
         return f"{1000 * value:.1f}"
-    if name == "seen_share":
+    if name in {"seen_share", "in_front_seen"}:
         return f"{100 * value:.1f}%"
     return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.evaluate.free_space import in_front
 from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, psnr, ssim_map
 from splatctrl_cli.records import Bool, Float32, RgbdFrame
 
@@ -23,18 +24,25 @@ PROTOCOL = {
     "depth": "absolute difference of the normalised depth (blended depth / accumulated opacity, where that opacity "
     "is at least 0.5) and the reference depth, over pixels of the region that have both [m]; depth_coverage is their "
     "share of the region's pixels that have a reference depth",
+    "in_front": "share of those pixels whose normalised depth is nearer than the reference by more than 3 cm",
+    "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
+    "centre lies in a voxel that was observed free; null where the scene has no occupancy grid",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegionScore:
-    """Figures over one region of a view: `share` of the view's pixels; psnr [dB]; nan where the region is empty."""
+    """Figures over one region of a view: `share` of the view's pixels; psnr [dB]; nan where the region is empty.
+
+    in_front: share of the pixels with both depths where the render stands before the measured surface.
+    """
 
     share: float
     psnr: float
     ssim: float
     depth: DepthErrors
     depth_coverage: float
+    in_front: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +65,7 @@ class ViewScore:
             figures[f"depth_pixels_{name}"] = depth.pop("num_pixels")
             figures |= {f"depth_{key}_{name}": value for key, value in depth.items()}
             figures[f"depth_coverage_{name}"] = region.depth_coverage
+            figures[f"in_front_{name}"] = region.in_front
         return figures
 
 
@@ -79,6 +88,7 @@ def score_view(*, view: str, color: Float32, depth: Float32, frame: RgbdFrame, s
             ssim=float(similarity[mask].mean()) if mask.any() else math.nan,
             depth=errors,
             depth_coverage=errors.num_pixels / num_reference if num_reference else math.nan,
+            in_front=in_front(depth, frame.depth, mask),
         )
 
     return ViewScore(
@@ -97,6 +107,7 @@ def metric_names() -> tuple[str, ...]:
     names = ["num_views", "valid_share", "seen_share"]
     for region in ("seen", "all"):
         names += [f"psnr_{region}", f"ssim_{region}", *(f"depth_{name}_{region}" for name in depth)]
+        names.append(f"in_front_{region}")
     return tuple(names)
 
 

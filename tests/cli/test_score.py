@@ -15,7 +15,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.io import scene_folder, source
 from splatctrl_cli.io.dtu import DtuView, write_dtu
 from splatctrl_cli.io.splats import write_ply
-from splatctrl_cli.records import Float64, Intrinsics, LossReport, Record, RgbdFrame, SplatSet
+from splatctrl_cli.records import Float64, Intrinsics, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
 
 INTRINSICS = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -91,6 +91,18 @@ class FakeScene:
     cameras: tuple[str, ...] = ("cam0",)
     snapshots: tuple[FakeSnapshot, ...] = (FakeSnapshot(stamp_ns=SECOND), FakeSnapshot(stamp_ns=2 * SECOND))
     training_stamps_ns: frozenset[int] = frozenset()
+    is_anisotropic: bool = False
+    run: dict[str, Any] = field(default_factory=lambda: {"config": {"occupancy": {"free_below": 0.3}}})
+
+    def occupancy(self) -> OccupancyGrid:
+        """One voxel of free space that holds the left half of the wall."""
+        return OccupancyGrid(
+            origin=np.array([1.0, 5.0, 0.0]),
+            voxel=10.0,
+            log_odds=np.full((1, 1, 1), -2.0, np.float32),
+            num_updates=np.ones((1, 1, 1), np.uint16),
+            entity=np.zeros((1, 1, 1), np.uint8),
+        )
 
     def splats(self) -> SplatSet:
         return wall()
@@ -336,3 +348,31 @@ def test_a_dtu_scan_without_views_held_out_is_refused(
 def test_a_folder_that_is_no_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["score", str(tmp_path), "--reference", "fake.mcap"]) == 4
     assert "expected a scene folder with splats.ply and run.json" in capsys.readouterr().err
+
+
+def test_what_stands_in_front_and_in_free_space_is_scored_and_gated(
+    scored: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(scored, "--json") == 0
+    metrics = result_of(capsys)["metrics"]
+    assert metrics["in_front_seen"] == metrics["in_front_all"] == 0.0
+    assert metrics["free_mass"] is None  # no occupancy.npz
+    (scored / "scene" / "occupancy.npz").touch()
+    assert run(scored, "--json") == 0
+    assert result_of(capsys)["metrics"]["free_mass"] == pytest.approx(0.5, abs=0.05)
+    assert run(scored, "--require", "free_mass<=0.1") == 1
+    out = capsys.readouterr().out
+    assert "of the splats' mass is in space observed free" in out
+    assert "in front" in out
+
+
+def test_a_render_before_the_recorded_surface_is_in_front(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = frame(3 * SECOND, "cam3", SIDE)
+    late.depth[late.depth > 0] += 0.05
+    seen = frame(3 * SECOND, "cam0", FRONT)
+    set_up(monkeypatch, FakeScene(), FakeSource(frames=[seen, frame(2 * SECOND, "cam3", SIDE), late]))
+    assert run(scored, "--json") == 0
+    views = result_of(capsys)["views"]
+    assert [view["in_front_all"] for view in views] == [0.0, 1.0]
