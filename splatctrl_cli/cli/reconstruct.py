@@ -41,6 +41,13 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("--scan", metavar="NAME", help="which scan of --dtu (default: the only one)")
     add_output(parser, default="scene", what="scene folder")
     add_source(parser)
+    parser.add_argument(
+        "--method",
+        choices=("budget", "3dgs"),
+        default="budget",
+        help="a fixed budget of isotropic splats, or 3D Gaussian splatting: a baseline for views of a scene that "
+        "stands still, which grows as it likes and has no distances (default: budget)",
+    )
     parser.add_argument("--max-splats", type=int, metavar="N", help="budget of splats (default: 5000)")
     parser.add_argument("--urdf", type=Path, metavar="FILE", help="the robot: labels its splats, sets the workspace")
     parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its collision spheres")
@@ -64,6 +71,10 @@ def run(args: argparse.Namespace) -> int:
 
     if args.device == "cuda":
         raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
+    if args.method == "3dgs":
+        from splatctrl_cli.cli.reconstruct_gaussians import run as run_gaussians
+
+        return run_gaussians(args, _config(args), _open(args), _box(args))
     check_gate_names(args.require, GATED)
     console, stopwatch, config = Console(args), Stopwatch(), _config(args)
     source, box = _open(args), _box(args)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.evaluate.views import View
     from splatctrl_cli.io.output import Stopwatch
     from splatctrl_cli.io.scene_folder import SceneFolder
-    from splatctrl_cli.records import RecordSource, SplatSet
+    from splatctrl_cli.records import GaussianSet, RecordSource, SplatSet
 
 DAMAGED = 3
 
@@ -213,14 +213,19 @@ def _score_views(
     return scores
 
 
-def _score_one(scores: _Scores, view: "View", splats: "SplatSet", threads: int) -> None:
+def _score_one(scores: _Scores, view: "View", splats: "SplatSet | GaussianSet", threads: int) -> None:
     from splatctrl_cli.evaluate.pictures import ComparisonRow
     from splatctrl_cli.evaluate.score import score_view
     from splatctrl_cli.evaluate.visibility import seen_pixels
+    from splatctrl_cli.records import GaussianSet
+    from splatctrl_cli.scene.gaussians import render_gaussians
     from splatctrl_cli.scene.render import render
 
     frame = view.frame
-    rendering = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
+    if isinstance(splats, GaussianSet):
+        rendering = render_gaussians(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
+    else:
+        rendering = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
     depth = rendering.normalised_depth()
     seen = seen_pixels(frame, view.training)
     score = score_view(view=view.name, color=rendering.color, depth=depth, frame=frame, seen=seen)
@@ -245,22 +250,26 @@ class _SplatsAt:
 
     def __init__(self, scene: "SceneFolder", *, use_snapshots: bool) -> None:
         self._scene = scene
-        self._stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots)
+        self._stamps = [] if scene.is_anisotropic else sorted(snapshot.stamp_ns for snapshot in scene.snapshots)
         self._use_snapshots = use_snapshots
-        self._loaded: tuple[int, SplatSet] | None = None
+        self._loaded: tuple[int, SplatSet | GaussianSet] | None = None
 
     def is_known(self, stamp_ns: int) -> bool:
         """Whether the scene had a snapshot at that time."""
         return bool(self._stamps) and self._stamps[0] <= stamp_ns
 
-    def __call__(self, stamp_ns: int) -> "SplatSet":
+    def __call__(self, stamp_ns: int) -> "SplatSet | GaussianSet":
         from bisect import bisect_right
 
         number = bisect_right(self._stamps, stamp_ns) if self._use_snapshots else -1
         if self._loaded is None or self._loaded[0] != number:
-            splats = self._scene.splats_at(stamp_ns) if self._use_snapshots else self._scene.splats()
-            self._loaded = (number, splats)
+            self._loaded = (number, self._read(stamp_ns))
         return self._loaded[1]
+
+    def _read(self, stamp_ns: int) -> "SplatSet | GaussianSet":
+        if self._scene.is_anisotropic:
+            return self._scene.gaussians()
+        return self._scene.splats_at(stamp_ns) if self._use_snapshots else self._scene.splats()
 
 
 def _write(

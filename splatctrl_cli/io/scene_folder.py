@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.io.arrays import savez
+from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.io.output import PARTIAL
 from splatctrl_cli.io.splats import read_ply
-from splatctrl_cli.records import OccupancyGrid, SplatSet, UInt8, VoxelState
+from splatctrl_cli.records import GaussianSet, OccupancyGrid, SplatSet, UInt8, VoxelState
 
 FORMAT = "splatctrl-scene 1"
 
@@ -138,12 +139,30 @@ class SceneFolder:
         """Of the last frame."""
         return int(self.run["metrics"]["stamp_ns"])
 
+    @property
+    def is_anisotropic(self) -> bool:
+        """True for what `reconstruct --method 3dgs` made: `gaussians` instead of splats and occupancy."""
+        return bool(self.run["metrics"].get("method") == "3dgs")
+
+    def gaussians(self) -> GaussianSet:
+        """The Gaussians of a scene that is anisotropic."""
+        return read_gaussian_ply(self.path / "splats.ply")[0]
+
     def splats(self) -> SplatSet:
         """The final splats."""
+        self._expect_isotropic()
         return read_ply(self.path / "splats.ply")[0]
+
+    def _expect_isotropic(self) -> None:
+        if self.is_anisotropic:
+            raise InputError(
+                f"{self.path}: made by --method 3dgs; distances are defined on isotropic splats",
+                remedy="reconstruct without --method, or 'splatctrl score' it",
+            )
 
     def occupancy(self) -> OccupancyGrid:
         """The final occupancy grid."""
+        self._expect_isotropic()
         return read_occupancy(self.path / "occupancy.npz")
 
     @cached_property

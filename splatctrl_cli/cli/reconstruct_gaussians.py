@@ -1,0 +1,140 @@
+"""``splatctrl reconstruct --method 3dgs``: 3D Gaussian splatting on views of a scene that stands still."""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.cli.common import Console, check_gate_names, check_gates, table
+from splatctrl_cli.cli.reconstruction import training_cameras
+from splatctrl_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.config import Config
+    from splatctrl_cli.records import Box, RecordSource, RgbdFrame
+    from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow
+
+DAMAGED = 3
+GATED = ("iterations", "splats", "cloned", "split", "pruned", "unmet", "loss", "psnr")  # what --require can name
+ROUTES = "leave out --method, or give a folder of views (a TOML file or --dtu)"
+
+
+def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box: "Box | None") -> int:
+    """Fit, write the scene folder and return the exit code."""
+    from splatctrl_cli.io.gaussian_ply import write_gaussian_ply
+    from splatctrl_cli.io.output import Stopwatch, output_path, write_run
+    from splatctrl_cli.io.scene_folder import FORMAT
+    from splatctrl_cli.scene.gaussian_fitter import GaussianFitter
+
+    check_gate_names(args.require, GATED)
+    _refuse_what_needs_time(args, source)
+    console, stopwatch = Console(args), Stopwatch()
+    out = args.out or Path("scene")
+    with output_path(out, force=args.force, is_folder=True) as partial:
+        rows: list[GaussianAuditRow] = []
+        with stopwatch.stage("read"):
+            frames = _frames(source)
+            workspace = _workspace(frames, box, config)
+        with stopwatch.stage("fit"):
+            fitter = GaussianFitter(config, workspace, frames, seed=args.seed, threads=args.threads)
+            console.log(f"{len(fitter.arrays)} Gaussians seeded, extent of the scene {fitter.extent:.3f} m")
+            fitter.fit(_audit(partial / "audit.jsonl", rows, console))
+        with stopwatch.stage("write"):
+            comments = {"format": FORMAT, "source": source.name}
+            write_gaussian_ply(partial / "splats.ply", fitter.gaussians(), comments)
+        metrics = _metrics(rows, frames) | {"workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()]}
+        write_run(
+            partial,
+            command="reconstruct",
+            config=config.as_dict(),
+            inputs=source.digests(),
+            metrics=metrics,
+            stopwatch=stopwatch,
+            seed=args.seed,
+        )
+    console.result(
+        {"scene": str(out), "metrics": metrics}, [*_lines(metrics, stopwatch.seconds["fit"], source), f"wrote {out}"]
+    )
+    check_gates(args.require, {name: _number(metrics[name]) for name in GATED})
+    return DAMAGED if source.loss.damaged else 0
+
+
+def _refuse_what_needs_time(args: argparse.Namespace, source: "RecordSource") -> None:
+    training_cameras(source)
+    if source.has_clock:
+        raise UsageError(
+            f"--method 3dgs: {source.name} has a clock, and this method's scene stands still", remedy=ROUTES
+        )
+    for name in ("urdf", "resume"):
+        if getattr(args, name):
+            raise UsageError(f"--{name}: does not apply to --method 3dgs", remedy="leave out one of them")
+
+
+def _frames(source: "RecordSource") -> "list[RgbdFrame]":
+    from splatctrl_cli.records import RgbdFrame
+
+    cameras = training_cameras(source)
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame) and r.camera in cameras]
+    if not frames:
+        raise InputError(
+            f"{source.name}: no frame with colour, depth and pose from camera {', '.join(cameras)}",
+            remedy="'splatctrl info' says what the input lacks",
+        )
+    return frames
+
+
+def _workspace(frames: "list[RgbdFrame]", box: "Box | None", config: "Config") -> "Box":
+    from splatctrl_cli.scene.time_steps import depth_box
+
+    return depth_box(frames, config.occupancy.max_range) if box is None else box
+
+
+def _audit(path: Path, rows: "list[GaussianAuditRow]", console: Console) -> "Callable[[GaussianAuditRow], None]":
+    """Keeps every row, writes it to `path`, and says how far it is."""
+
+    def audit(row: "GaussianAuditRow") -> None:
+        rows.append(row)
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(asdict(row)) + "\n")
+        quality = "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB"
+        full = f", {row.unmet} more had no room (gaussians.max_gaussians)" if row.unmet else ""
+        console.log(f"iteration {row.iteration}: {row.gaussians} Gaussians, {quality}{full}")
+
+    return audit
+
+
+def _metrics(rows: "list[GaussianAuditRow]", frames: "list[RgbdFrame]") -> dict[str, object]:
+    """For ``run.json`` and gates."""
+    last = rows[-1]
+    return {
+        "method": "3dgs",
+        "cameras": list(dict.fromkeys(frame.camera for frame in frames)),
+        "has_clock": False,
+        "stamp_ns": max(frame.stamp_ns for frame in frames),
+        "training_stamps_ns": [frame.stamp_ns for frame in frames],
+        "iterations": last.iteration,
+        "splats": last.gaussians,
+        "degree": last.degree,
+        "cloned": sum(row.cloned for row in rows),
+        "split": sum(row.split for row in rows),
+        "pruned": sum(sum(row.pruned.values()) for row in rows),
+        "unmet": sum(row.unmet for row in rows),
+        "loss": last.loss,
+        "psnr": last.psnr,
+    }
+
+
+def _lines(metrics: dict[str, object], seconds: float, source: "RecordSource") -> list[str]:
+    psnr = _number(metrics["psnr"])
+    names = ("iterations", "splats", "cloned", "split", "pruned", "unmet")
+    lines = table(
+        [*names, "training dB", "seconds"],
+        [[*(metrics[name] for name in names), "-" if psnr is None else f"{psnr:.2f}", f"{seconds:.1f}"]],
+    )
+    return lines + [f"note: {note}" for note in source.loss.notes]
+
+
+def _number(value: object) -> float | None:
+    return None if value is None else float(str(value))
