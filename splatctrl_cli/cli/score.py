@@ -320,9 +320,9 @@ def _lines(result: dict[str, Any]) -> list[str]:
     lines.append("")
     lines.append(
         f"{_count(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
-        f"depth: median of the absolute error; in front: of what was measured, by over 3 cm, where seen; "
-        f"seen: by {', '.join(result['training_cameras'])} within 2 cm"
+        f"depth: median of the absolute error; seen: by {', '.join(result['training_cameras'])} within 2 cm"
     )
+    lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
     if metrics["free_mass"] is not None:
         lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")
     return lines

@@ -1,17 +1,21 @@
 """What a file or folder is and holds, for every kind that the tool reads or writes."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.io.capture import is_capture, read_capture_header
 from splatctrl_cli.io.describe_file import describe_file
 from splatctrl_cli.io.image_folder import ImageFolderSource
+from splatctrl_cli.io.known_space import known_space
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig import camera_topics, missing
+from splatctrl_cli.io.scene_folder import read_occupancy
 from splatctrl_cli.io.shot import Shot
 from splatctrl_cli.io.summary import Grid, Summary
 from splatctrl_cli.io.survey import Survey, TopicSurvey, survey
@@ -126,12 +130,27 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     facts: dict[str, object] = {"files": len(files), "bytes": sum(p.stat().st_size for p in files)}
     if "splats.ply" in names:
         facts["splats"] = describe_file(path / "splats.ply").facts
+    if "occupancy.npz" in names:
+        facts["space"] = _known_space(path, has_run="run.json" in names)
     facts |= field
     if "run.json" in names and not field:
         run = describe_file(path / "run.json").facts
         facts["run"] = {key: value for key, value in run.items() if key != "config"}  # `info run.json` shows it
     grid = Grid(name="files", header=("name", "files", "bytes"), rows=rows)
     return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,))
+
+
+def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
+    """What is known at the end of a scene, by the thresholds it was made with."""
+    run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
+    thresholds = OccupancyConfig()
+    used = run.get("config", {}).get("occupancy", {})
+    thresholds = replace(
+        thresholds,
+        free_below=used.get("free_below", thresholds.free_below),
+        occupied_above=used.get("occupied_above", thresholds.occupied_above),
+    )
+    return known_space(read_occupancy(path / "occupancy.npz"), thresholds)
 
 
 FIELD_FORMAT = "splatctrl distance grid"  # as the header of a baked field says

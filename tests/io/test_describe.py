@@ -14,10 +14,11 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.io.capture import write_capture
 from splatctrl_cli.io.describe import describe
+from splatctrl_cli.io.scene_folder import write_occupancy
 from splatctrl_cli.io.source import SourceOptions, open_source
 from splatctrl_cli.io.splat_formats import FORMATS
 from splatctrl_cli.io.splats import write_ply
-from splatctrl_cli.records import SplatSet
+from splatctrl_cli.records import SWEPT, Label, OccupancyGrid, SplatSet
 from tests.io.make_log import LogRecipe, make_log
 from tests.io.test_gaussian_ply import gaussian_set
 
@@ -308,3 +309,24 @@ def test_a_real_image_folder_is_described(real_data: Path) -> None:
     summary = describe(EXAMPLES / "apc_shelf.toml", options)
     assert summary.kind == "image folder"
     assert summary.grids[0].rows == [["camera", 10], ["holdout", 2]]
+
+
+def test_a_scene_says_how_much_of_its_space_is_known_by_its_own_thresholds(tmp_path: Path) -> None:
+    grid = OccupancyGrid(
+        origin=np.zeros(3),
+        voxel=0.1,
+        log_odds=np.float32([-2.0, -2.0, -0.9, 2.0, 0.0, 0.0, 0.0, 0.0]).reshape(2, 2, 2),
+        num_updates=np.uint16([1, 1, 1, 1, 1, 0, 0, 0]).reshape(2, 2, 2),
+        entity=np.uint8([0, 0, 0, Label.HUMAN, Label.ROBOT | SWEPT, SWEPT, 0, 0]).reshape(2, 2, 2),
+    )
+    write_occupancy(tmp_path / "occupancy.npz", grid)
+    (tmp_path / "splats.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n")
+    expected = {"never_seen": 0.25, "free": 0.375, "occupied": 0.125, "uncertain": 0.125, "swept_by_robot": 0.125}
+    space = describe(tmp_path).facts["space"]
+    assert isinstance(space, dict)
+    assert space["share"] == expected
+    assert (space["extent_m"], space["robot_voxels"], space["human_voxels"]) == ([0.2, 0.2, 0.2], 1, 1)
+    (tmp_path / "run.json").write_text(json.dumps({"config": {"occupancy": {"free_below": 0.2}}}))
+    space = describe(tmp_path).facts["space"]
+    assert isinstance(space, dict)
+    assert space["share"] == expected | {"free": 0.25, "uncertain": 0.25}
