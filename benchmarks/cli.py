@@ -14,7 +14,7 @@ SPLATCTRL = str(Path(sys.executable).with_name("splatctrl"))
 
 def run(options: Options) -> Result:
     """--help beside a bare interpreter, `reconstruct` on the sample log, and `demo` where asked for."""
-    starts = [(_process([SPLATCTRL, "--help"]), _process([sys.executable, "-c", "pass"])) for _ in range(10)]
+    starts = [(process([SPLATCTRL, "--help"]), process([sys.executable, "-c", "pass"])) for _ in range(10)]
     helping, bare = (statistics.median(start[i][0] for start in starts) for i in (0, 1))
     rows = [
         ["splatctrl --help (median of 10)", f"{helping:.3f}", f"{starts[0][0][1]:.0f}", "under 0.2 s"],
@@ -24,12 +24,12 @@ def run(options: Options) -> Result:
     limits = [Limit(figure="help_s", bound=0.2)]
     with tempfile.TemporaryDirectory() as folder:
         if not options.is_quick:
-            elapsed, peak = _process(_reconstruct(Path(folder) / "scene"))
+            elapsed, peak = process(_reconstruct(Path(folder) / "scene"))
             rows.append(["splatctrl reconstruct, sample log", f"{elapsed:.1f}", f"{peak:.0f}", "under 1536 MiB"])
             figures |= {"reconstruct_s": elapsed, "reconstruct_peak_mib": peak}
             limits.append(Limit(figure="reconstruct_peak_mib", bound=1536.0))
         if options.with_demo:
-            elapsed, peak = _process([SPLATCTRL, "demo", "-q", "-o", str(Path(folder) / "demo")])
+            elapsed, peak = process([SPLATCTRL, "demo", "-q", "-o", str(Path(folder) / "demo")])
             rows.append(["splatctrl demo", f"{elapsed:.1f}", f"{peak:.0f}", "under 180 s"])
             figures |= {"demo_s": elapsed, "demo_peak_mib": peak}
             limits.append(Limit(figure="demo_s", bound=180.0))
@@ -49,7 +49,7 @@ def _reconstruct(out: Path) -> list[str]:
             str(out)]  # fmt: skip
 
 
-def _process(command: Sequence[str]) -> tuple[float, float]:
+def process(command: Sequence[str]) -> tuple[float, float]:
     """Wall time [s] and peak resident memory [MiB] of a process. Raises where it does not end well."""
     launcher = [sys.executable, "-S", str(ROOT / "benchmarks" / "launch.py")]
     done = subprocess.run([*launcher, *command], cwd=ROOT, capture_output=True, text=True, check=True)
