@@ -109,9 +109,7 @@ class SceneFitter:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
         views = [self.view(frame) for frame in frames]
-        for frame in frames:
-            self.occupancy.integrate(frame)
-        self.occupancy.mark_humans(frames)
+        self.occupancy.take_in(frames)
         self._carry(robot)
         is_trail = relabel(self.buffer, self.occupancy, robot)
         removed = self._remove(is_trail, self._floating(frames))

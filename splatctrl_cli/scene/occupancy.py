@@ -34,6 +34,24 @@ class OccupancyMap:
         self._hits: NDArray[np.uint8] = np.zeros(shape, np.uint8)
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
+    def take_in(self, frames: Sequence[RgbdFrame]) -> None:
+        """Add the depth images of one time step, and set the human bit where human pixels of theirs hit.
+
+        A voxel loses the bit when rays pass it, or when masked images hit it with other pixels alone. What nothing
+        passes and no masked image hits keeps it: who stands behind something is still there.
+        """
+        masked = [(frame, frame.human) for frame in frames if frame.human is not None]
+        entity, log_odds = self.entity.reshape(-1), self.log_odds.reshape(-1)
+        human = np.flatnonzero(entity & Label.HUMAN) if masked else np.zeros(0, np.int64)
+        before = log_odds[human]
+        for frame in frames:
+            self.integrate(frame)
+        entity[human[log_odds[human] < before]] &= np.uint8(~Label.HUMAN & 0xFF)
+        for frame, mask in masked:
+            self._label_hits(frame, mask == 0, clear_bits=Label.HUMAN)
+        for frame, mask in masked:
+            self._label_hits(frame, mask != 0, set_bits=Label.HUMAN)
+
     def integrate(self, frame: RgbdFrame) -> None:
         """Add one depth image: what its rays pass is free, where they end are hits."""
         integrate_depth(
@@ -62,20 +80,6 @@ class OccupancyMap:
         """Set the robot bit in the voxels that spheres (S, 3), (S,) [m] meet, and in no other; mark them swept."""
         self.entity &= np.uint8(~Label.ROBOT & 0xFF)
         mark_spheres(self._packed, self.entity, centers, radii, Label.ROBOT | SWEPT, self.num_threads)
-
-    def mark_humans(self, frames: Sequence[RgbdFrame]) -> None:
-        """Set the human bit in the voxels that human pixels of `frames`, one time step's, hit.
-
-        A voxel loses it when the masked images of a time step hit it with other pixels alone, or when it is rather
-        free than full. What no masked image hits keeps it: who stands behind something is still there.
-        """
-        masked = [(frame, frame.human) for frame in frames if frame.human is not None]
-        for frame, human in masked:
-            self._label_hits(frame, human == 0, clear_bits=Label.HUMAN)
-        for frame, human in masked:
-            self._label_hits(frame, human != 0, set_bits=Label.HUMAN)
-        if masked:
-            self.entity[self.log_odds < 0] &= np.uint8(~Label.HUMAN & 0xFF)
 
     def _label_hits(self, frame: RgbdFrame, chosen: Bool, *, set_bits: int = 0, clear_bits: int = 0) -> None:
         label_hits(

@@ -30,8 +30,7 @@ def blind(view: RgbdFrame) -> RgbdFrame:
 def grid_of(*views: RgbdFrame) -> OccupancyMap:
     grid = OccupancyMap(WORKSPACE, OccupancyConfig(), 1)
     for view in views:
-        grid.integrate(view)
-        grid.mark_humans([view])
+        grid.take_in([view])
     return grid
 
 
@@ -57,14 +56,17 @@ def test_a_voxel_is_human_no_longer_when_other_pixels_hit_it() -> None:
     assert humans(grid_of(masked(view), blind(view))) == 0
 
 
-def test_a_voxel_is_human_no_longer_when_it_is_free() -> None:
+def test_a_voxel_is_human_no_longer_when_a_ray_passes_it() -> None:
     grid = grid_of(*[masked(frame(block=VISITOR))] * 5)
     num_before = humans(grid)
-    for _ in range(6):
-        grid.integrate(frame())
-        grid.mark_humans([blind(frame())])
     assert num_before > 50
+    grid.take_in([blind(frame())])
     assert humans(grid) == 0
+
+
+def test_a_person_who_enters_long_free_space_is_human_at_once() -> None:
+    view = masked(frame(block=VISITOR))
+    assert humans(grid_of(*[blind(frame())] * 8, view)) == humans(grid_of(view)) > 50
 
 
 def test_a_voxel_that_no_masked_image_sees_stays_human() -> None:
@@ -78,9 +80,7 @@ def test_of_one_time_step_any_camera_that_sees_a_person_counts_whatever_the_orde
     view = frame(block=VISITOR)
     for views in ([masked(view), blind(view)], [blind(view), masked(view)]):
         grid = OccupancyMap(WORKSPACE, OccupancyConfig(), 1)
-        for one in views:
-            grid.integrate(one)
-        grid.mark_humans(views)
+        grid.take_in(views)
         assert humans(grid) == humans(grid_of(masked(view)))
 
 
@@ -88,8 +88,7 @@ def test_thread_count_does_not_change_a_bit() -> None:
     grids = [OccupancyMap(WORKSPACE, OccupancyConfig(), threads) for threads in (1, 3)]
     for grid in grids:
         for view in (masked(frame(block=VISITOR)), masked(frame(block=VISITOR, x=0.15))):
-            grid.integrate(view)
-            grid.mark_humans([view])
+            grid.take_in([view])
     assert grids[0].entity.tobytes() == grids[1].entity.tobytes()
 
 
@@ -181,3 +180,18 @@ def test_a_person_whom_the_mask_loses_stays_in_the_map_as_an_object() -> None:
     splats = steps(target, [(here, np.zeros_like(here.color[..., 0]))] * 2)
     assert (splats.centers[:, 2] > 0.1).sum() > 30
     assert not splats.labels.any()
+
+
+def test_a_person_who_walks_leaves_no_trail() -> None:
+    target = SceneFitter(
+        SceneConfig(max_splats=1200, first_iterations=60, iterations_per_step=10), OccupancyConfig(), WORKSPACE
+    )
+    steps(target, [(frame(), np.zeros((60, 80), np.uint8))])
+    for place in (-0.2, -0.14, -0.08, -0.02, 0.04):
+        here = masked(frame(block=VISITOR, block_x=place))
+        splats = steps(target, [(here, here.human)])
+        is_up = splats.centers[:, 2] > 0.1
+        assert is_up.sum() > 20
+        assert (splats.labels[is_up] == Label.HUMAN).all()
+        assert np.abs(splats.centers[is_up, 0] - place).max() < 0.13
+    assert not (steps(target, [(frame(), np.zeros((60, 80), np.uint8))]).centers[:, 2] > 0.1).any()

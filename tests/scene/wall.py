@@ -17,9 +17,15 @@ def looking_down(x: float = 0.0, y: float = 0.0) -> Float64:
 
 
 def frame(
-    stamp_ns: int = 0, *, block: float = 0.0, x: float = 0.0, y: float = 0.0, camera: str = "cam0"
+    stamp_ns: int = 0,
+    *,
+    block: float = 0.0,
+    block_x: float = 0.0,
+    x: float = 0.0,
+    y: float = 0.0,
+    camera: str = "cam0",
 ) -> RgbdFrame:
-    """A smooth texture on the floor; with block > 0 a red block of that height over |x|, |y| < 0.1 m."""
+    """A smooth texture on the floor; with block > 0 a red block of that height over |x - block_x|, |y| < 0.1 m."""
     v, u = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
 
     def ground(depth: float) -> tuple[Float64, Float64]:
@@ -30,7 +36,7 @@ def frame(
     color = np.stack([0.5 + 0.4 * np.sin(20 * X), 0.5 + 0.4 * np.cos(17 * Y), 0.5 + 0.3 * np.sin(9 * (X + Y))], 2)
     if block > 0:
         top_x, top_y = ground(HEIGHT - block)
-        is_block = (np.abs(top_x) < 0.1) & (np.abs(top_y) < 0.1)
+        is_block = (np.abs(top_x - block_x) < 0.1) & (np.abs(top_y) < 0.1)
         depth[is_block] = HEIGHT - block
         color[is_block] = [0.9, 0.1, 0.1]
     return RgbdFrame(
