@@ -112,14 +112,14 @@ class SceneFitter:
         self.occupancy.take_in(frames)
         self._carry(robot)
         is_trail = relabel(self.buffer, self.occupancy, robot)
-        removed = self._remove(is_trail, self._floating(frames))
+        removed = self._remove(is_trail, self._floating(views))
         is_first = self.density is None
         filled = self._seed(views)
         is_first = is_first and self.density is not None
         self.window.advance(views)
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         self._optimise(num_iterations, rng, self._settings())
-        self._prune(robot, frames, removed)
+        self._prune(robot, views, removed)
         filled += self._fill_gaps(views)
         relabel(self.buffer, self.occupancy, robot)
         self.num_steps += 1
@@ -144,7 +144,7 @@ class SceneFitter:
         rate = self.config.final_rate ** (block / (NUM_BLOCKS - 1))
         count = num_iterations * (block + 1) // NUM_BLOCKS - num_iterations * block // NUM_BLOCKS
         self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
-        removed = self._remove(nowhere, self._floating([view.frame for view in views]), counts_time=False)
+        removed = self._remove(nowhere, self._floating(views), counts_time=False)
         filled = self.refined.filled
         if block < NUM_BLOCKS - 2:
             filled += self._seed(views)
@@ -175,19 +175,19 @@ class SceneFitter:
         slots = np.flatnonzero(self.buffer.is_alive & (self.buffer.labels == Label.ROBOT))
         self.buffer.centers[slots] = carried(self.buffer.centers[slots], before, robot)
 
-    def _floating(self, frames: Sequence[RgbdFrame]) -> Bool:
-        """Slots (M,) of splats that some frame sees through."""
+    def _floating(self, views: Sequence[View]) -> Bool:
+        """Slots (M,) of splats that some view sees through."""
         tolerance = self.occupancy.config.see_through
         is_floating = np.zeros(self.config.max_splats, bool)
-        for frame in frames:
-            is_floating |= seen_through(self.buffer.centers, frame, tolerance)
+        for view in views:
+            is_floating |= seen_through(self.buffer.centers, view.frame, tolerance, view.nearest)
         return is_floating & self.buffer.is_alive
 
-    def _prune(self, robot: RobotPosture | None, frames: Sequence[RgbdFrame], removed: dict[str, int]) -> None:
+    def _prune(self, robot: RobotPosture | None, views: Sequence[View], removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into the air or out; adds to the counts in `removed`."""
         drifted = relabel(self.buffer, self.occupancy, robot)
         self.buffer.kill(drifted)
-        floating = self._floating(frames)
+        floating = self._floating(views)
         self.buffer.kill(floating)
         outside = self.buffer.is_alive & ~self.workspace.contains(self.buffer.centers)
         self.buffer.kill(outside)
@@ -213,7 +213,7 @@ class SceneFitter:
         sources = []
         for view in views:
             mask = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
-            found = candidates(view.frame, world_points(view.frame), mask)
+            found = candidates(view.frame, mask)
             sources.append(found.select(self._is_grounded(found.points, views)))
         if not any(len(source) for source in sources):
             return Filled(added=0, relocated=0, unmet=0)
@@ -243,7 +243,7 @@ class SceneFitter:
         """Points (K,) that no view sees through: what one sensor measured and another looks past was noise."""
         is_grounded = np.ones(len(points), bool)
         for view in views:
-            is_grounded &= ~seen_through(points, view.frame, self.occupancy.config.see_through)
+            is_grounded &= ~seen_through(points, view.frame, self.occupancy.config.see_through, view.nearest)
         return is_grounded
 
     def _optimise(self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings) -> None:

@@ -178,10 +178,10 @@ def first_seeds(views: Sequence[View], config: Config) -> Seeds:
     """The seeds that the fixed-budget method takes for an empty map, at most `scene.max_splats`."""
     sources = []
     for view in views:
-        found = candidates(view.frame, world_points(view.frame), view.mappable)
+        found = candidates(view.frame, view.mappable)
         keep = np.ones(len(found), bool)
         for other in views:
-            keep &= ~seen_through(found.points, other.frame, config.occupancy.see_through)
+            keep &= ~seen_through(found.points, other.frame, config.occupancy.see_through, other.nearest)
         sources.append(found.select(keep))
     no_splats: Float32 = np.zeros((0, 3), np.float32)
     if not any(len(source) for source in sources):

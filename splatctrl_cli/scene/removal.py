@@ -12,26 +12,32 @@ from splatctrl_cli.scene.occupancy import OccupancyMap
 REASONS = ("broken", "workspace", "opacity", "free", "uncertain", "trail")
 
 
-def seen_through(centers: Float32, frame: RgbdFrame, tolerance: float) -> Bool:
+def nearest_depth(frame: RgbdFrame) -> Float32:
+    """The least valid depth (H, W) [m] within 1 cm of each pixel, as far as that reaches at the frame's median depth;
+    infinite where there is none.
+    """
+    valid = frame.depth[frame.depth > 0]
+    if not len(valid):
+        return np.full(frame.depth.shape, np.inf, np.float32)
+    half = max(1, round(0.01 * frame.intrinsics.fx / float(np.median(valid))))
+    depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
+    return np.asarray(minimum_filter(depth, size=2 * half + 1, mode="nearest"), np.float32)
+
+
+def seen_through(centers: Float32, frame: RgbdFrame, tolerance: float, nearest: Float32 | None = None) -> Bool:
     """Splats (N,) that float before what a frame measured: nearer than every valid depth around their pixel.
 
-    "Around" is within 1 cm at the splat's depth and "nearer" by more than `tolerance` [m], so that neither a
-    silhouette nor the sensor's noise takes a splat off its surface. Finer than the voxels: a voxel that holds both a
-    surface and the air before it stays occupied.
+    "Around" is what `nearest_depth` says, given where it is known, and "nearer" by more than `tolerance` [m], so that
+    neither a silhouette nor the sensor's noise takes a splat off its surface. Finer than the voxels: a voxel that
+    holds both a surface and the air before it stays occupied.
     """
     k = frame.intrinsics
     points = transform_points(invert_transform(frame.T_world_camera), centers)
     is_ahead = points[:, 2] > 0
     pixels = np.floor(project(k, np.where(is_ahead[:, None], points, 1.0)) + 0.5)
     is_inside = is_ahead & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
-    depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
-    valid = frame.depth[frame.depth > 0]
-    if not len(valid):
-        return np.zeros(len(centers), bool)
-    half = max(1, round(0.01 * k.fx / float(np.median(valid))))
-    nearest = minimum_filter(depth, size=2 * half + 1, mode="nearest")
     u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
-    measured = nearest[v, u]
+    measured = (nearest_depth(frame) if nearest is None else nearest)[v, u]
     return np.asarray(is_inside & np.isfinite(measured) & (points[:, 2] < measured - tolerance))
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.geometry import back_project, back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Box, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.cubes import CubeLevel, cube_levels, leaves, tolerance_for
@@ -24,6 +24,13 @@ CROWDED = 0.7  # of the edge: nearer than this to a live splat nothing is seeded
 def world_points(frame: RgbdFrame) -> Float64:
     """Back-projected points (H, W, 3) [m], world; meaningless where the depth is 0."""
     return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth))
+
+
+def world_points_at(frame: RgbdFrame, mask: Bool) -> Float64:
+    """Back-projected points (K, 3) [m], world, of the pixels of a mask (H, W): the same as all, then those."""
+    v, u = np.nonzero(mask)
+    points = back_project_pixels(frame.intrinsics, u, v, frame.depth[mask])
+    return transform_points(frame.T_world_camera, points)
 
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
@@ -63,12 +70,12 @@ class Candidates:
         return Candidates(points=self.points[keep], colors=self.colors[keep], pixels=self.pixels[keep])
 
 
-def candidates(frame: RgbdFrame, points_world: Float64, mask: Bool) -> Candidates:
+def candidates(frame: RgbdFrame, mask: Bool) -> Candidates:
     """What the pixels of a mask (H, W) offer."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
     colors = frame.color[mask].astype(np.float32) / 255.0
     return Candidates(
-        points=points_world[mask].astype(np.float32),
+        points=world_points_at(frame, mask).astype(np.float32),
         colors=colors,
         pixels=(frame.depth[mask] / focal).astype(np.float32),
     )
@@ -139,13 +146,13 @@ def gap_seeds(
     """
     sources = []
     for frame, mappable in views:
-        points, mask = world_points(frame), mappable.copy()
+        mask = mappable.copy()
         mask[np.arange(len(mask)) % 3 != 0] = False
         mask[:, np.arange(mask.shape[1]) % 3 != 0] = False
-        mask[mask] = _gap(points[mask], splats) > config.max_gap
+        mask[mask] = _is_further(world_points_at(frame, mask), splats, config.max_gap)
         if mask.any():
-            sources.append(candidates(frame, points, mask))
-    forgotten = occupied[_gap(occupied, splats) > config.max_gap + 0.5 * voxel]
+            sources.append(candidates(frame, mask))
+    forgotten = occupied[_is_further(occupied, splats, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
         sources.append(_of_voxels(forgotten, splats))
     if not sources:
@@ -156,13 +163,20 @@ def gap_seeds(
     return _seeds_of(level, everything, pixel, no_splats, config)
 
 
-def _gap(points: NDArray[np.floating], splats: SplatSet) -> Float64:
-    """Distance (K,) [m] of points (K, 3) to the nearest sphere among the eight splats with the nearest centres."""
+def _is_further(points: NDArray[np.floating], splats: SplatSet, gap: float) -> Bool:
+    """Points (K, 3) that lie further than `gap` [m] from the spheres of the eight splats with the nearest centres.
+
+    The nearest settles most of them, at a third of the cost of eight.
+    """
     if not len(splats) or not len(points):
-        return np.full(len(points), np.inf)
+        return np.ones(len(points), bool)
+    tree = cKDTree(splats.centers)
+    distance, nearest = tree.query(points)
+    is_further: Bool = distance - splats.radii[nearest] > gap
     count = min(8, len(splats))
-    distance, nearest = cKDTree(splats.centers).query(points, k=np.arange(1, count + 1))
-    return np.asarray((distance - splats.radii[nearest]).min(axis=1), np.float64)
+    distance, nearest = tree.query(points[is_further], k=np.arange(1, count + 1))
+    is_further[is_further] = (distance - splats.radii[nearest]).min(axis=1) > gap
+    return is_further
 
 
 def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:

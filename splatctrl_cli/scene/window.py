@@ -2,13 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.kernels.raster import TargetView
-from splatctrl_cli.records import Bool, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.scene.removal import nearest_depth
 from splatctrl_cli.scene.render import camera_array
 
 
@@ -20,6 +22,11 @@ class View:
     camera: Float64
     target: TargetView
     mappable: Bool
+
+    @cached_property
+    def nearest(self) -> Float32:
+        """`nearest_depth` of the frame."""
+        return nearest_depth(self.frame)
 
 
 def make_view(frame: RgbdFrame, mappable: Bool) -> View:

@@ -124,7 +124,7 @@ def test_the_tolerance_uses_the_budget() -> None:
 
 def test_nothing_is_seeded_beside_a_live_splat() -> None:
     seen = frame()
-    source = candidates(seen, world_points(seen), np.ones(seen.depth.shape, bool))
+    source = candidates(seen, np.ones(seen.depth.shape, bool))
     density = SeedDensity(edge=0.05, tolerance=1e9)
     nothing = np.zeros((0, 3), np.float32)
     first = seeds_at([source], nothing, density, CONFIG).centers
@@ -138,7 +138,7 @@ def test_nothing_is_seeded_beside_a_live_splat() -> None:
 
 def test_the_radius_is_that_of_the_cube_within_its_limits() -> None:
     seen = frame()
-    source = candidates(seen, world_points(seen), np.ones(seen.depth.shape, bool))
+    source = candidates(seen, np.ones(seen.depth.shape, bool))
     nothing = np.zeros((0, 3), np.float32)
     wide = replace(CONFIG, max_radius=0.5)
     fine = seeds_at([source], nothing, SeedDensity(edge=0.004, tolerance=1e9), wide)
