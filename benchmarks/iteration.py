@@ -23,7 +23,9 @@ from splatctrl_cli.kernels.raster import (
 from splatctrl_cli.records import Float32
 
 STAGES = ("unpack", "bin", "forward", "loss", "backward", "adam")
-LARGEST_DIFFERENCE = 1e-3  # between the planes of kernels and reference, or they did not do the same work
+# Between the planes of kernels and reference, or they did not do the same work. An alpha within rounding of 1 / 255
+# may fall on either side of the cut, so that a few values may differ by as much.
+DIFFERENCE, LARGEST_DIFFERENCE, LARGEST_SHARE = 1e-4, 1.2 / 255, 1e-4
 ROUNDS, TORCH_ROUNDS = 40, 5
 
 
@@ -42,6 +44,7 @@ class KernelIteration:
         self.raster, self.loss = Rasteriser(threads), ImageLoss(threads)
         self.gradients = np.empty((count, 10), np.float32)
         self.planes: Float32 = np.empty((5, *problem.target.depth.shape), np.float32)
+        self.plane_gradients = np.empty_like(self.planes)
 
     def run(self) -> dict[str, float]:
         """Seconds by stage."""
@@ -51,12 +54,11 @@ class KernelIteration:
         marks.append(time.perf_counter())
         self.raster.prepare(self.problem.camera, centers, radii, opacities, colors)
         marks.append(time.perf_counter())
-        self.planes = self.raster.forward()
+        self.raster.forward(self.planes)
         marks.append(time.perf_counter())
-        plane_gradients = np.empty_like(self.planes)
-        self.loss.evaluate(self.planes, self.problem.target, weights(), plane_gradients)
+        self.loss.evaluate(self.planes, self.problem.target, weights(), self.plane_gradients)
         marks.append(time.perf_counter())
-        self.raster.backward(self.planes, plane_gradients, self.gradients)
+        self.raster.backward(self.planes, self.plane_gradients, self.gradients)
         marks.append(time.perf_counter())
         optimiser_step(self.raster, self.gradients, self.parameters, self.moments, settings(len(radii)), 1)
         marks.append(time.perf_counter())
@@ -92,11 +94,12 @@ def settings(num_splats: int) -> OptimiserSettings:
 
 
 def run(options: Options) -> Result:
-    """5,000 and 10,000 splats at 640x480 and the sample log's own map; plain torch on one thread beside them."""
-    walls = [wall_problem(count) for count in ((5000,) if options.is_quick else (5000, 10000))]
-    problems = {f"wall_{len(wall.parameters)}": wall for wall in walls} | {"sample": sample_problem()}
+    """5,000 and 10,000 splats at 640x480, random and the sample log's own; plain torch on one thread beside them."""
+    counts = (5000,) if options.is_quick else (5000, 10000)
+    problems = {f"wall_{count}": wall_problem(count) for count in counts}
+    problems |= {f"sample_{count}": sample_problem(count) for count in counts}
     cases = {(key, threads): KernelIteration(p, threads) for key, p in problems.items() for threads in (1, 2)}
-    times, torch_times = _measured(cases, {f"wall_{len(wall.parameters)}": wall for wall in walls}, options)
+    times, torch_times = _measured(cases, problems, options)
     rows: list[list[str]] = []
     figures: dict[str, float] = {}
     ratios: dict[str, float] = {}
@@ -125,11 +128,16 @@ def run(options: Options) -> Result:
         figures=figures,
         ratios=ratios,
         limits=[
-            Limit(figure="wall_5000_threads_2_per_s", bound=10.0, is_least=True),
-            *(Limit(figure=f"wall_{len(wall.parameters)}_opacity", bound=0.95, is_least=True) for wall in walls),
+            *(Limit(figure=f"{key}_threads_2_per_s", bound=_least_rate(key), is_least=True) for key in problems),
+            *(Limit(figure=f"{key}_opacity", bound=0.95, is_least=True) for key in problems),
         ],
         notes=["torch: the whole iteration in plain torch operations on one thread (autograd, padded tile lists)"],
     )
+
+
+def _least_rate(key: str) -> float:
+    """[1/s] on two threads."""
+    return 30.0 if key.endswith("_5000") else 20.0
 
 
 Times = dict[tuple[str, int], list[dict[str, float]]]
@@ -137,11 +145,11 @@ TorchTimes = dict[tuple[str, int], list[float]]
 
 
 def _measured(
-    cases: dict[tuple[str, int], KernelIteration], walls: dict[str, FitProblem], options: Options
+    cases: dict[tuple[str, int], KernelIteration], problems: dict[str, FitProblem], options: Options
 ) -> tuple[Times, TorchTimes]:
     """Every case in turn, round by round, with the reference in between."""
     torch.set_num_threads(1)  # on two, its barriers take seconds whenever another process has one of the cores
-    references = {key: TorchIteration(wall, weights(), settings(len(wall.parameters))) for key, wall in walls.items()}
+    references = {key: TorchIteration(p, weights(), settings(len(p.parameters))) for key, p in problems.items()}
     times: Times = defaultdict(list)
     torch_times: TorchTimes = defaultdict(list)
     for case in cases.values():
@@ -160,6 +168,10 @@ def _measured(
 
 def _check_same(case: KernelIteration, reference: TorchIteration) -> None:
     """Raise where kernels and reference do not render the same image: their times would say nothing."""
-    difference = float(np.abs(case.planes - reference.run()[0].numpy()).max())
-    if difference > LARGEST_DIFFERENCE:
-        raise AssertionError(f"plain torch renders another image: largest difference {difference:.2g}")
+    difference = np.abs(case.planes - reference.run()[0].numpy())
+    share = float(np.mean(difference > DIFFERENCE))
+    if difference.max() > LARGEST_DIFFERENCE or share > LARGEST_SHARE:
+        raise AssertionError(
+            f"plain torch renders another image: {share:.2g} of the values differ by more than {DIFFERENCE:g}, "
+            f"at most by {difference.max():.2g}"
+        )

@@ -1,6 +1,6 @@
 """What is measured on: maps made here, and the map of the sample log's beginning."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
 
@@ -10,11 +10,13 @@ from benchmarks.measure import SAMPLE
 from splatctrl_cli.config import Config
 from splatctrl_cli.io.source import open_source
 from splatctrl_cli.kernels.raster import TargetView
-from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, JointState, Label, SplatSet
+from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, JointState, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.render import camera_array
+from splatctrl_cli.scene.seeding import inside_workspace, world_points
 from splatctrl_cli.scene.time_steps import time_steps
+from splatctrl_cli.scene.window import make_view
 
 TRAINING = ("cam0", "cam1", "cam2")
 VGA = Intrinsics(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
@@ -62,9 +64,9 @@ def wall_problem(num_splats: int) -> FitProblem:
 
 
 @cache
-def sample_fitter() -> SceneFitter:
+def sample_fitter(config: Config | None = None) -> SceneFitter:
     """The fitter after the first three time steps of the sample log, with the robot's reach as workspace."""
-    robot, config = sample_robot(), Config()
+    robot, config = sample_robot(), config or Config()
     reach, base = robot.reach(), robot.base_position
     fitter = SceneFitter(config.scene, config.occupancy, Box(lower=base - reach, upper=base + reach))
     source = open_source(SAMPLE / "log.mcap")
@@ -73,16 +75,40 @@ def sample_fitter() -> SceneFitter:
     return fitter
 
 
-def sample_problem() -> FitProblem:
-    """The sample log's own map and the newest view of its first camera, at the size it was recorded in."""
-    fitter = sample_fitter()
-    view = fitter.window.newest[0]
+def sample_problem(num_splats: int) -> FitProblem:
+    """The sample log's own map with a budget of `num_splats`, nearly all of it in use, and the newest view of its
+    first camera, enlarged to 640x480.
+    """
+    config = Config()
+    scene = replace(config.scene, max_splats=num_splats, fill=1.0, gap_reserve=0.0)
+    fitter = sample_fitter(replace(config, scene=scene))
+    frame = enlarged(fitter.window.newest[0].frame)
+    mappable = inside_workspace(frame, world_points(frame), fitter.workspace, config.occupancy.min_range)
+    view = make_view(frame, mappable)
     height, width = view.target.depth.shape
     return FitProblem(
         name=f"sample log, {len(fitter.splats())} splats, {width}x{height}",
         parameters=fitter.buffer.parameters.copy(),
         camera=view.camera,
         target=view.target,
+    )
+
+
+def enlarged(frame: RgbdFrame) -> RgbdFrame:
+    """A frame with four pixels for each of its own; a ray through a pixel's centre meets where its four meet."""
+    k = frame.intrinsics
+    return replace(
+        frame,
+        color=np.repeat(np.repeat(frame.color, 2, axis=0), 2, axis=1),
+        depth=np.repeat(np.repeat(frame.depth, 2, axis=0), 2, axis=1),
+        intrinsics=Intrinsics(
+            fx=2 * k.fx,
+            fy=2 * k.fy,
+            cx=2 * k.cx + 0.5,
+            cy=2 * k.cy + 0.5,
+            width=2 * k.width,
+            height=2 * k.height,
+        ),
     )
 
 
