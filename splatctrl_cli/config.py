@@ -25,6 +25,7 @@ class SceneConfig:
     lambda_color: float = 1.0
     lambda_depth: float = 1.0
     lambda_reg: float = 0.02
+    background: str = "median"  # behind the splats: the colour of what has no depth; or "black"
     lambda_opacity: float = 0.3  # of the mean transmittance where there is depth; 0 in the paper
     depth_loss: str = "normalised"  # by accumulated opacity; "printed" (eq. 3) sets surfaces 12 mm too deep
     lambda_mde: float = 50.0  # III-C eq. 5 gives none; its source (SplaTAM) uses 50
@@ -35,9 +36,12 @@ class SceneConfig:
     radius_per_edge: float = 0.45  # of a seed, in edges of its cube
     max_gap: float = 0.018  # [m] from a measured point to the nearest splat's sphere; beyond, one is added
     gap_reserve: float = 0.02  # share of the budget that only such gaps may use
+    when_idle: str = "detail"  # refining with nothing to add: seed where colours are wrong; or "clone", "leave"
+    weak_share: float = 0.03  # of the splats, those that show least, given up for such detail after each block
     fill: float = 0.85  # share of the budget that the first time step may use; the rest is for what comes later
     iterations_per_step: int = 30  # K optimiser steps per time step
     first_iterations: int = 300  # optimiser steps on the first time step
+    coarse_share: float = 0.0  # of them, on images of half the size
     refine_iterations: int = 1500  # more of them, with annealed rates, where nothing moves (an image folder)
     lr_center: float = 2e-4  # [m]
     lr_log_radius: float = 3e-3
@@ -195,7 +199,7 @@ _AT_LEAST_ZERO = (
     *("gaussians.iterations", "gaussians.max_degree", "gaussians.degree_every", "gaussians.lr_log_scale"),
     *("gaussians.lr_quat", "gaussians.lr_color", "gaussians.lr_harmonics", "gaussians.lr_logit_opacity"),
     *("gaussians.densify_from", "gaussians.densify_until", "gaussians.densify_gradient", "gaussians.dense_share"),
-    *("gaussians.reset_every",),
+    *("gaussians.reset_every", "scene.weak_share", "scene.coarse_share"),
     *("scene.lambda_dssim", "scene.lambda_color", "scene.lambda_depth", "scene.lambda_reg", "scene.lambda_opacity"),
     *("scene.lambda_mde", "scene.min_depth_error", "scene.max_gap", "scene.gap_reserve", "scene.hole_opacity"),
     *("scene.iterations_per_step", "scene.first_iterations", "scene.refine_iterations", "scene.refine_geometry"),
@@ -216,7 +220,15 @@ _SHARES = (
     *("gaussians.initial_opacity", "gaussians.min_opacity", "gaussians.reset_opacity"),
     *("occupancy.free_below", "occupancy.occupied_above"),
 )
-_AT_MOST_ONE = ("scene.lambda_dssim", "scene.hole_opacity", "scene.gap_reserve", "scene.fill", "scene.final_rate")
+_CHOICES = {
+    "scene.depth_loss": ("normalised", "printed"),
+    "scene.background": ("median", "black"),
+    "scene.when_idle": ("detail", "clone", "leave"),
+}
+_AT_MOST_ONE = (
+    *("scene.lambda_dssim", "scene.hole_opacity", "scene.gap_reserve", "scene.fill", "scene.final_rate"),
+    *("scene.weak_share", "scene.coarse_share"),
+)
 _ORDERED = (
     ("scene.min_radius", "scene.max_radius"),
     ("scene.min_depth_error", "scene.max_depth_error"),
@@ -230,6 +242,9 @@ def _check_ranges(config: Config) -> None:
     What a controller can run with is checked where it is made.
     """
     values = {f"{section}.{key}": value for section, keys in config.as_dict().items() for key, value in keys.items()}
+    for name, choices in _CHOICES.items():
+        if values[name] not in choices:
+            raise UsageError(f"{name}: expected {' or '.join(choices)}, got {values[name]!r}")
     for name in _POSITIVE:
         _check(values[name] > 0, name, "above 0", values[name])
     for name in _AT_LEAST_ZERO:

@@ -158,6 +158,8 @@ class Reconstruction:
             "unmet": sum(row.unmet for row in self.rows),
             "loss": last.loss,
             "psnr": last.psnr,
+            "background": list(self.fitter.background or (0.0, 0.0, 0.0)),
+            "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }
 

@@ -194,7 +194,7 @@ def _score_views(
             scores.skipped.append(view.name)
             continue
         with stopwatch.stage("score"):
-            _score_one(scores, view, splats_at(view.frame.stamp_ns), args.threads)
+            _score_one(scores, view, splats_at(view.frame.stamp_ns), scene.background, args.threads)
         if len(scores.views) % 20 == 0:
             console.log(f"scored {len(scores.views)} views")
     if not scores.views:
@@ -213,7 +213,13 @@ def _score_views(
     return scores
 
 
-def _score_one(scores: _Scores, view: "View", splats: "SplatSet | GaussianSet", threads: int) -> None:
+def _score_one(
+    scores: _Scores,
+    view: "View",
+    splats: "SplatSet | GaussianSet",
+    background: tuple[float, float, float],
+    threads: int,
+) -> None:
     from splatctrl_cli.evaluate.pictures import ComparisonRow
     from splatctrl_cli.evaluate.score import score_view
     from splatctrl_cli.evaluate.visibility import seen_pixels
@@ -226,6 +232,7 @@ def _score_one(scores: _Scores, view: "View", splats: "SplatSet | GaussianSet", 
         rendering = render_gaussians(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
     else:
         rendering = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
+    rendering = rendering.before(background)
     depth = rendering.normalised_depth()
     seen = seen_pixels(frame, view.training)
     score = score_view(view=view.name, color=rendering.color, depth=depth, frame=frame, seen=seen)

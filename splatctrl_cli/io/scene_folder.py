@@ -140,6 +140,12 @@ class SceneFolder:
         return int(self.run["metrics"]["stamp_ns"])
 
     @property
+    def background(self) -> tuple[float, float, float]:
+        """What is seen where no splat is: a colour in [0, 1]; black in a scene of an older version."""
+        red, green, blue = (float(value) for value in self.run["metrics"].get("background", (0.0, 0.0, 0.0)))
+        return red, green, blue
+
+    @property
     def is_anisotropic(self) -> bool:
         """True for what `reconstruct --method 3dgs` made: `gaussians` instead of splats and occupancy."""
         return bool(self.run["metrics"].get("method") == "3dgs")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.kernels.raster import Moments, unpack_parameters
-from splatctrl_cli.records import Bool, Float32, Label, SplatSet
+from splatctrl_cli.records import Bool, Float32, Float64, Label, SplatSet
 
 DEAD_LOGIT = -6.9  # opacity 0.001, below what the rasteriser blends
 CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
@@ -70,6 +70,11 @@ class SplatBuffer:
         """(M,) in (0, 1)."""
         return np.asarray(1.0 / (1.0 + np.exp(-self.parameters[:, LOGIT])), np.float32)
 
+    @property
+    def radii(self) -> Float32:
+        """(M,) [m]."""
+        return np.asarray(np.exp(self.parameters[:, LOG_RADIUS]), np.float32)
+
     def kill(self, slots: Bool) -> None:
         """Make the slots of a mask (M,) dead: transparent, without moments, free for reuse."""
         self.is_alive[slots] = False
@@ -95,6 +100,24 @@ class SplatBuffer:
         self.labels[slots] = Label.OBJECT
         self._reset(slots)
         return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
+
+    def copy(self, sources: NDArray[np.intp], opacities: Float64, radii: Float64) -> int:
+        """Make the first dead slots copies of slots `sources` (K,), with repetitions; returns how many there were.
+
+        At most as many as are dead. opacities (M,) and radii (M,) [m] are what each source and its copies have from
+        now on. Labels go with the copies; moments of sources and copies start anew.
+        """
+        slots = np.flatnonzero(~self.is_alive)[: len(sources)]
+        sources = sources[: len(slots)]
+        changed = np.unique(sources)
+        self.parameters[changed, LOG_RADIUS] = np.log(radii[changed])
+        self.parameters[changed, LOGIT] = np.log(opacities[changed] / (1.0 - opacities[changed]))
+        self.parameters[slots] = self.parameters[sources]
+        self.labels[slots] = self.labels[sources]
+        self.is_alive[slots] = True
+        self.was_used[slots] = True
+        self._reset(np.concatenate([changed, slots]))
+        return len(slots)
 
     def _reset(self, slots: NDArray[np.intp]) -> None:
         self.moments.first[slots] = 0.0

@@ -34,6 +34,9 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
     arrays["counters"] = np.array([fitter.num_steps, fitter.num_iterations], np.int64)
     arrays["refined"] = _refined_array(fitter.refined)
+    arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
+    if fitter.background is not None:
+        arrays["background"] = np.array(fitter.background)
     if fitter.density is not None:
         arrays["density"] = np.array([getattr(fitter.density, name) for name in DENSITY_NAMES])
     if fitter.posture is not None:
@@ -52,6 +55,11 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
         getattr(fitter.occupancy, name)[...] = arrays[name]
     fitter.num_steps, fitter.num_iterations = (int(n) for n in arrays["counters"])
     fitter.refined = _refined(arrays["refined"])
+    masks = {name.removeprefix("mounted/"): array for name, array in arrays.items() if name.startswith("mounted/")}
+    fitter.mounted = {camera: np.asarray(mask, bool) for camera, mask in masks.items()}
+    if "background" in arrays:
+        red, green, blue = (float(value) for value in arrays["background"])
+        fitter.background = (red, green, blue)
     if "density" in arrays:
         edge, tolerance, num_candidates = (float(x) for x in arrays["density"])
         fitter.density = SeedDensity(edge=edge, tolerance=tolerance, num_candidates=int(num_candidates))

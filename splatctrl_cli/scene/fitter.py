@@ -17,11 +17,14 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
     unpack_parameters,
 )
-from splatctrl_cli.records import Bool, Box, Float32, Label, OccupancyGrid, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.labels import relabel
+from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
+from splatctrl_cli.scene.objective import loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture, carried
+from splatctrl_cli.scene.relocation import Misfit, clone_shape, clone_sources, detail_seeds
 from splatctrl_cli.scene.removal import REASONS, removals, seen_through
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seeding import (
@@ -34,7 +37,7 @@ from splatctrl_cli.scene.seeding import (
     seeds_at,
     world_points,
 )
-from splatctrl_cli.scene.window import View, Window, make_view
+from splatctrl_cli.scene.window import View, Window, halved, make_view
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
@@ -80,8 +83,6 @@ class SceneFitter:
     def __init__(
         self, config: SceneConfig, occupancy: OccupancyConfig, workspace: Box, *, seed: int = 0, threads: int = 0
     ) -> None:
-        if config.depth_loss not in ("printed", "normalised"):
-            raise UsageError(f"scene.depth_loss: expected printed or normalised, got {config.depth_loss!r}")
         if occupancy.voxel < config.max_radius:
             raise UsageError(
                 f"occupancy.voxel: {occupancy.voxel} m is smaller than scene.max_radius, {config.max_radius} m",
@@ -98,6 +99,8 @@ class SceneFitter:
         self.num_iterations = 0
         self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
         self.posture: RobotPosture | None = None
+        self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) that show what it carries
+        self.background: tuple[float, float, float] | None = None  # chosen by the first time step
         self.refined = Refined(
             num_blocks=0, filled=Filled(added=0, relocated=0, unmet=0), removed=dict.fromkeys(REASONS, 0)
         )
@@ -108,7 +111,10 @@ class SceneFitter:
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
+        self._find_mounted(frames)
         views = [self.view(frame) for frame in frames]
+        if self.background is None:
+            self.background = self._background(views)
         self.occupancy.take_in(frames)
         self._carry(robot)
         is_trail = relabel(self.buffer, self.occupancy, robot)
@@ -118,7 +124,9 @@ class SceneFitter:
         is_first = is_first and self.density is not None
         self.window.advance(views)
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
-        self._optimise(num_iterations, rng, self._settings())
+        num_coarse = round(self.config.coarse_share * num_iterations) if is_first else 0
+        self._optimise(num_coarse, rng, self._settings(), is_coarse=True)
+        self._optimise(num_iterations - num_coarse, rng, self._settings())
         self._prune(robot, views, removed)
         filled += self._fill_gaps(views)
         relabel(self.buffer, self.occupancy, robot)
@@ -148,6 +156,7 @@ class SceneFitter:
         filled = self.refined.filled
         if block < NUM_BLOCKS - 2:
             filled += self._seed(views)
+            filled += self._use_idle(views, rng, removed)
         self.refined = Refined(
             num_blocks=block + 1,
             filled=filled,
@@ -165,7 +174,24 @@ class SceneFitter:
     def view(self, frame: RgbdFrame) -> View:
         """A frame as the optimiser takes it."""
         min_range = self.occupancy.config.min_range
-        return make_view(frame, inside_workspace(frame, world_points(frame), self.workspace, min_range))
+        mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
+        return make_view(frame, mappable, self.mounted.get(frame.camera))
+
+    def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
+        """Tell apart what a camera carries, once it has been in enough places."""
+        for camera in sorted({frame.camera for frame in frames} - set(self.mounted)):
+            known = [view.frame for view in self.window.keyframes]
+            seen = spread_views([frame for frame in [*known, *frames] if frame.camera == camera])
+            found = mounted_pixels(seen, self.occupancy.config.min_range)
+            if found is not None:
+                self.mounted[camera] = found
+                self.window.keyframes = [self.view(view.frame) for view in self.window.keyframes]
+                self.window.newest = [self.view(view.frame) for view in self.window.newest]
+
+    def _background(self, views: Sequence[View]) -> tuple[float, float, float]:
+        if self.config.background == "black":
+            return (0.0, 0.0, 0.0)
+        return background_color([view.frame for view in views], [view.target.counted > 0 for view in views])
 
     def _carry(self, robot: RobotPosture | None) -> None:
         """Move the robot's splats with the link of the sphere they are nearest to."""
@@ -239,6 +265,48 @@ class SceneFitter:
         seeds = seeds.select(self._is_grounded(seeds.centers, views))
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
+    def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
+        """Put dead slots, beyond the reserve for gaps, to use where nothing asks for them; counts in `removed`."""
+        is_alive, reserve = self.buffer.is_alive, int(self.config.gap_reserve * self.config.max_splats)
+        if self.config.when_idle == "leave" or not is_alive.any():
+            return Filled(added=0, relocated=0, unmet=0)
+        if self.config.when_idle == "clone":
+            return self._clone(int((~is_alive).sum()) - reserve, rng)
+        misfits, shown = self._misfits(views)
+        weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
+        is_weak = np.zeros(len(is_alive), bool)
+        is_weak[weakest[: int(self.config.weak_share * is_alive.sum())]] = True
+        self.buffer.kill(is_weak)
+        removed["weak"] += int(is_weak.sum())
+        seeds = detail_seeds(misfits, int((~is_alive).sum()) - reserve, self.config, rng)
+        return self.buffer.fill(seeds, self.config.initial_opacity)
+
+    def _clone(self, num_clones: int, rng: np.random.Generator) -> Filled:
+        """Copy splats drawn by their opacity, as 3DGS-MCMC does."""
+        opacities = np.where(self.buffer.is_alive, self.buffer.opacities, 0.0).astype(np.float64)
+        sources = clone_sources(opacities, num_clones, rng)
+        count = 1 + np.bincount(sources, minlength=len(opacities))
+        shapes = clone_shape(opacities, self.buffer.radii.astype(np.float64), count)
+        return Filled(added=0, relocated=self.buffer.copy(sources, *shapes), unmet=0)
+
+    def _misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
+        """Each view's colour error where it is mappable, and how much each slot shows (M,): blended opacity, summed.
+
+        The derivative of the sum of a colour plane with respect to a splat's colour is the sum of its weights.
+        """
+        background = np.array(self.background, np.float32)[:, None, None]
+        misfits, shown = [], np.zeros(self.config.max_splats)
+        for view in views:
+            planes = self._planes(view)
+            color = planes[:3] + (1.0 - planes[4]) * background
+            error = np.abs(color - view.target.color).mean(axis=0)
+            misfits.append(Misfit(frame=view.frame, error=np.where(view.mappable, error, np.float32(0.0))))
+            ones = np.zeros_like(planes)
+            ones[0] = view.target.counted
+            self._raster.backward(planes, ones, self._gradients)
+            shown += self._gradients[:, 7]
+        return misfits, shown
+
     def _is_grounded(self, points: Float32, views: Sequence[View]) -> Bool:
         """Points (K,) that no view sees through: what one sensor measured and another looks past was noise."""
         is_grounded = np.ones(len(points), bool)
@@ -246,8 +314,14 @@ class SceneFitter:
             is_grounded &= ~seen_through(points, view.frame, self.occupancy.config.see_through, view.nearest)
         return is_grounded
 
-    def _optimise(self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings) -> None:
-        for view in self.window.schedule(num_iterations, rng):
+    def _optimise(
+        self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings, *, is_coarse: bool = False
+    ) -> None:
+        views = self.window.schedule(num_iterations, rng)
+        if is_coarse:
+            small = {id(view): halved(view) for view in views}
+            views = [small[id(view)] for view in views]
+        for view in views:
             planes = self._planes(view)
             plane_gradients = np.empty_like(planes)
             self._loss.evaluate(planes, view.target, self._weights(), plane_gradients)
@@ -271,14 +345,7 @@ class SceneFitter:
         return self._loss.evaluate(planes, view.target, self._weights(), np.empty_like(planes))
 
     def _weights(self) -> LossWeights:
-        c = self.config
-        return LossWeights(
-            dssim=c.lambda_dssim,
-            color=c.lambda_color,
-            depth=c.lambda_depth,
-            opacity=c.lambda_opacity,
-            normalised=c.depth_loss == "normalised",
-        )
+        return loss_weights(self.config, self.background or (0.0, 0.0, 0.0))
 
     def _settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
         """Learning rates times `rate`, those of centre and radius times `geometry`."""
@@ -300,13 +367,7 @@ class SceneFitter:
         counted = [view for view in views if view.target.counted.any()]
         terms = [self._evaluate(view, self._planes(view)) for view in counted]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
-        image = [
-            c.lambda_color * ((1 - c.lambda_dssim) * t.l1 + c.lambda_dssim * t.dssim)
-            + c.lambda_depth * t.depth
-            + c.lambda_opacity * t.transmittance
-            for t in terms
-        ]
-        squared = float(np.mean([t.squared for t in terms])) if terms else None
+        loss, psnr = mean_loss(terms, c), psnr_of(terms)
         return AuditRow(
             stamp_ns=max(view.frame.stamp_ns for view in views),
             cameras=tuple(view.frame.camera for view in views),
@@ -318,6 +379,6 @@ class SceneFitter:
             removed=removed,
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
             human=int((buffer.labels[buffer.is_alive] == Label.HUMAN).sum()),
-            loss=round(float(np.mean(image)) + c.lambda_reg * opacity, 6) if image else None,
-            psnr=None if squared is None else round(-10.0 * float(np.log10(max(squared, 1e-12))), 4),
+            loss=None if loss is None else round(loss + c.lambda_reg * opacity, 6),
+            psnr=None if psnr is None else round(psnr, 4),
         )

@@ -6,15 +6,18 @@ from collections.abc import Sequence
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.kernels.raster import LossTerms, LossWeights
 
+Color = tuple[float, float, float]
 
-def loss_weights(config: SceneConfig) -> LossWeights:
-    """The weights that the image loss takes."""
+
+def loss_weights(config: SceneConfig, background: Color = (0.0, 0.0, 0.0)) -> LossWeights:
+    """The weights that the image loss takes, and the colour behind the splats."""
     return LossWeights(
         dssim=config.lambda_dssim,
         color=config.lambda_color,
         depth=config.lambda_depth,
         opacity=config.lambda_opacity,
         normalised=config.depth_loss == "normalised",
+        background=background,
     )
 
 

@@ -9,7 +9,7 @@ from splatctrl_cli.records import Bool, Box, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 
-REASONS = ("broken", "workspace", "opacity", "free", "uncertain", "trail")
+REASONS = ("broken", "workspace", "opacity", "free", "uncertain", "trail", "weak")
 
 
 def nearest_depth(frame: RgbdFrame) -> Float32:
@@ -56,6 +56,7 @@ def removals(
     broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free, or
     a camera sees through it.
     uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot or human, is no longer.
+    weak: none here; those that show least and are given up for detail elsewhere are counted under it by refining.
     Updates the buffer's count of uncertain time steps,
     where this is one. Splats whose surroundings were never seen stay, unless the
     rule is "literal".
@@ -77,6 +78,7 @@ def removals(
         "free": is_free | is_floating,
         "uncertain": has_lost_patience,
         "trail": is_trail,
+        "weak": np.zeros(len(centers), bool),
     }
     remaining = buffer.is_alive.copy()
     reasons = {}

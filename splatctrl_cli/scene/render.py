@@ -1,6 +1,6 @@
 """Renders a splat set from a camera: eq. 1 to 3 of the paper."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,11 @@ class Rendering:
     def normalised_depth(self) -> Float32:
         """Depth divided by accumulated opacity (H, W) [m]; 0 where the opacity is below one half."""
         return normalised_depth(self.depth, self.opacity)
+
+    def before(self, background: tuple[float, float, float]) -> "Rendering":
+        """The same view with one colour behind it: color + (1 - opacity) background."""
+        behind = (1.0 - self.opacity)[..., None] * np.array(background, np.float32)
+        return replace(self, color=self.color + behind)
 
 
 def normalised_depth(depth: Float32, opacity: Float32) -> Float32:

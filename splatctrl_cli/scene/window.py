@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.geometry import invert_transform
@@ -29,19 +30,48 @@ class View:
         return nearest_depth(self.frame)
 
 
-def make_view(frame: RgbdFrame, mappable: Bool) -> View:
+def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None) -> View:
     """A view of `frame`; `mappable` (H, W) are its pixels with a depth inside the workspace.
 
-    Pixels without depth count in the colour loss; pixels whose depth lies outside the workspace do not count at all.
+    Pixels without depth count in the colour loss; pixels whose depth lies outside the workspace, or that show what is
+    `mounted` on the camera, do not count at all.
     """
+    counted = mappable | (frame.depth <= 0)
+    if mounted is not None:
+        mappable, counted = mappable & ~mounted, counted & ~mounted
     color = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0).astype(np.float32) / np.float32(255.0))
     target = TargetView(
         color=color,
         depth=np.where(mappable, frame.depth, np.float32(0.0)).astype(np.float32),
-        counted=(mappable | (frame.depth <= 0)).astype(np.uint8),
+        counted=counted.astype(np.uint8),
     )
     camera = camera_array(frame.intrinsics, frame.T_world_camera)
     return View(frame=frame, camera=camera, target=target, mappable=mappable)
+
+
+def halved(view: View) -> View:
+    """The view at half its width and height: mean colours, the nearest of four depths, counted where all four are.
+
+    Pixel (0, 0) is then centred between four: u' = (u - 1/2) / 2. An odd last row or column is left out.
+    """
+    k, target = view.frame.intrinsics, view.target
+    height, width = k.height // 2, k.width // 2
+    camera = view.camera.copy()
+    camera[:6] = [k.fx / 2, k.fy / 2, (k.cx - 0.5) / 2, (k.cy - 0.5) / 2, width, height]
+    nearest = _quads(np.where(target.depth > 0, target.depth, np.float32(np.inf))).min(axis=(-3, -1))
+    halved_target = TargetView(
+        color=np.ascontiguousarray(_quads(target.color).mean(axis=(-3, -1))),
+        depth=np.where(np.isfinite(nearest), nearest, np.float32(0.0)),
+        counted=_quads(target.counted).min(axis=(-3, -1)).astype(np.uint8),
+    )
+    return View(frame=view.frame, camera=camera, target=halved_target, mappable=view.mappable)
+
+
+def _quads(image: NDArray[np.generic]) -> Float32:
+    """(..., H, W) -> (..., H / 2, 2, W / 2, 2) float32."""
+    height, width = image.shape[-2] // 2, image.shape[-1] // 2
+    cut = image[..., : 2 * height, : 2 * width].astype(np.float32)
+    return cut.reshape(*image.shape[:-2], height, 2, width, 2)
 
 
 class Window:

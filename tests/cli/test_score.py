@@ -92,6 +92,7 @@ class FakeScene:
     snapshots: tuple[FakeSnapshot, ...] = (FakeSnapshot(stamp_ns=SECOND), FakeSnapshot(stamp_ns=2 * SECOND))
     training_stamps_ns: frozenset[int] = frozenset()
     is_anisotropic: bool = False
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     run: dict[str, Any] = field(default_factory=lambda: {"config": {"occupancy": {"free_below": 0.3}}})
 
     def occupancy(self) -> OccupancyGrid:
@@ -376,3 +377,12 @@ def test_a_render_before_the_recorded_surface_is_in_front(
     assert run(scored, "--json") == 0
     views = result_of(capsys)["views"]
     assert [view["in_front_all"] for view in views] == [0.0, 1.0]
+
+
+def test_what_no_splat_covers_shows_the_background_of_the_scene(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up(monkeypatch, FakeScene(background=(0.0, 1.0, 0.0)), FakeSource(frames=FRAMES))
+    assert run(scored, "--json") == 0
+    away = result_of(capsys)["views"][2]
+    assert away["psnr_all"] == pytest.approx(10 * np.log10(3), abs=0.01), "green before a black view of nothing"

@@ -92,7 +92,7 @@ def test_the_budget_is_never_exceeded_and_the_audit_adds_up() -> None:
         row = target.step([frame(k, block=block)])
         alive += row.added + row.relocated - sum(row.removed.values())
         assert row.alive == alive == len(target.splats()) <= 300
-        assert set(asdict(row)["removed"]) == {"broken", "workspace", "opacity", "free", "uncertain", "trail"}
+        assert set(asdict(row)["removed"]) == {"broken", "workspace", "opacity", "free", "uncertain", "trail", "weak"}
 
 
 def test_splats_inside_the_robot_are_its_own_and_the_table_under_it_is_not() -> None:

@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.scene.window import View, Window, make_view
+from splatctrl_cli.scene.window import View, Window, halved, make_view
 from tests.scene.wall import frame
 
 CONFIG = SceneConfig(window=3)
@@ -63,3 +64,19 @@ def test_pixels_without_depth_count_and_pixels_outside_the_workspace_do_not() ->
     assert target.counted[:50].all()
     assert not target.counted[50:].any()
     assert not target.depth[50:].any()
+
+
+def test_a_halved_view_looks_along_the_same_rays_with_mean_colours_and_nearest_depths() -> None:
+    seen = frame(0, block=0.2)
+    seen.depth[10, 10] = 0.0
+    whole = make_view(seen, seen.depth > 0)
+    half = halved(whole)
+    fx, _, cx, _, width, height = half.camera[:6]
+    assert (width, height) == (40, 30)
+    assert half.target.color.shape == (3, 30, 40)
+    assert half.target.color[:, 3, 4] == pytest.approx(whole.target.color[:, 6:8, 8:10].mean(axis=(1, 2)))
+    quads = np.where(whole.target.depth > 0, whole.target.depth, np.inf).reshape(30, 2, 40, 2)
+    assert np.array_equal(half.target.depth, quads.min(axis=(1, 3)))
+    k = seen.intrinsics
+    assert (7 - cx) / fx == pytest.approx((14.5 - k.cx) / k.fx)  # pixel 7 is centred between 14 and 15
+    assert half.target.counted[5, 5] == whole.target.counted[10:12, 10:12].min()

@@ -1,0 +1,86 @@
+"""What to do with splats that nothing needs: clones of opaque ones (3DGS-MCMC), or detail where colours are wrong."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
+
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.records import Float32, Float64, RgbdFrame
+from splatctrl_cli.scene.buffer import Seeds
+from splatctrl_cli.scene.seeding import NO_SEEDS, world_points
+
+OVERSAMPLING = 4  # pixels drawn per splat, before those too near to each other go
+
+
+def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
+    """Opacity (N,) and radius (N,) [m] of each of `count` (N,) coinciding copies that stand for one isotropic splat.
+
+    The peak is conserved, `a = 1 - (1 - alpha)^(1/N)`, and the blended opacity summed over the screen,
+    `r' = r sqrt(alpha / sum_{i=1..N} (1 - (1 - a)^i) / i)`: the 2-D rule. The 1-D rule of 3DGS-MCMC (Kheradmand et
+    al. 2024, eq. 9) loses a few percent of it.
+    """
+    a = 1.0 - (1.0 - opacity) ** (1.0 / count)
+    mass = np.zeros_like(opacity)
+    for i in range(1, int(count.max(initial=1)) + 1):
+        mass += np.where(i <= count, (1.0 - (1.0 - a) ** i) / i, 0.0)
+    return a, radius * np.sqrt(opacity / mass)
+
+
+def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Indices (num_clones,) drawn in proportion to opacity, with replacement: the splats to be copied."""
+    total = float(opacities.sum())
+    if num_clones < 1 or total <= 0.0:
+        return np.zeros(0, np.intp)
+    return np.asarray(rng.choice(len(opacities), size=num_clones, p=opacities / total), np.intp)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misfit:
+    """One view's mean absolute colour error (H, W) against its frame, 0 where the map need not explain a pixel."""
+
+    frame: RgbdFrame
+    error: Float32
+
+
+def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig, rng: np.random.Generator) -> Seeds:
+    """At most `num_seeds` seeds of a pixel's size on measured surfaces, drawn by the squared colour error there.
+
+    The error is a mean over 3 x 3 pixels; a pixel stands for the area of surface that it sees. No two are nearer to
+    each other than their diameters, so that several views do not seed the same spot.
+    """
+    points, colors, sizes, weights = [], [], [], []
+    for misfit in misfits:
+        frame, mask = misfit.frame, misfit.error > 0
+        focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
+        points.append(world_points(frame)[mask].astype(np.float32))
+        colors.append(frame.color[mask].astype(np.float32) / 255.0)
+        sizes.append((frame.depth[mask] / focal).astype(np.float32))
+        weights.append(np.square(uniform_filter(misfit.error, 3)[mask] * frame.depth[mask], dtype=np.float64))
+    weight = np.concatenate(weights)
+    count = min(OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
+    if count == 0:
+        return NO_SEEDS
+    drawn = rng.choice(len(weight), size=count, replace=False, p=weight / weight.sum())
+    all_points, size = np.concatenate(points)[drawn], np.concatenate(sizes)[drawn]
+    kept = _apart(all_points, 2.0 * size)[:num_seeds]
+    return Seeds(
+        centers=all_points[kept],
+        radii=np.clip(size[kept], config.min_radius, config.max_radius),
+        colors=np.concatenate(colors)[drawn][kept],
+    )
+
+
+def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:
+    """Indices of points (K, 3), in order, that no kept one before them has within its distance (K,)."""
+    is_taken = np.zeros(len(points), bool)
+    neighbours = cKDTree(points).query_ball_point(points, distances)
+    kept = []
+    for index, near in enumerate(neighbours):
+        if not is_taken[index]:
+            kept.append(index)
+            is_taken[near] = True
+    return np.array(kept, np.intp)
