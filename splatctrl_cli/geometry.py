@@ -90,14 +90,14 @@ def project(intrinsics: Intrinsics, points_camera: NDArray[np.floating]) -> Floa
 
 def back_project(intrinsics: Intrinsics, depth: NDArray[np.floating]) -> Float64:
     """Camera-frame points (H, W, 3) of a depth image (H, W) [m]."""
-    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     return back_project_pixels(intrinsics, u, v, depth)
 
 
 def back_project_pixels(
     intrinsics: Intrinsics, u: NDArray[np.intp], v: NDArray[np.intp], depth: NDArray[np.floating]
 ) -> Float64:
-    """Camera-frame points (..., 3) of pixels in columns u and rows v with a depth [m], all of one shape."""
+    """Camera-frame points (..., 3) of pixels with a depth (...) [m]; columns u and rows v broadcast to its shape."""
     x = (u - intrinsics.cx) / intrinsics.fx * depth
     y = (v - intrinsics.cy) / intrinsics.fy * depth
     return np.stack([x, y, depth], axis=-1).astype(np.float64)

@@ -59,7 +59,8 @@ def _level(points: Float32, colors: Float32, cube: Index, parent: Index, edge: f
     center, color = mean(points), mean(colors)
     color_variance = (mean(colors.astype(np.float64) ** 2) - color**2).sum(axis=1)
     offset = points - center[cube]
-    covariance = mean(offset[:, :, None] * offset[:, None, :]).reshape(-1, 3, 3)
+    upper = mean(offset[:, [0, 0, 0, 1, 1, 2]] * offset[:, [0, 1, 2, 1, 2, 2]])
+    covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     thickness = np.maximum(np.linalg.eigvalsh(covariance)[:, 0], 0.0)
     detail = count * (np.maximum(color_variance, 0.0) + BEND * thickness / edge**2)
     order = np.lexsort((np.sum(offset**2, axis=1), cube))

@@ -1,6 +1,7 @@
 """`SceneFitter.step`: one time step of the paper's Fig. 2, from RGB-D frames to an up-to-date splat set."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,7 +113,8 @@ class SceneFitter:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
         self._find_mounted(frames)
-        views = [self.view(frame) for frame in frames]
+        with ThreadPoolExecutor(self.num_threads) as pool:
+            views = list(pool.map(self.view, frames))
         if self.background is None:
             self.background = self._background(views)
         self.occupancy.take_in(frames)
@@ -261,6 +263,7 @@ class SceneFitter:
             self.occupancy.config.voxel,
             self.splats(),
             self.config,
+            num_threads=self.num_threads,
         )
         seeds = seeds.select(self._is_grounded(seeds.centers, views))
         return self.buffer.fill(seeds, self.config.initial_opacity)

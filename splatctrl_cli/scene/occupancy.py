@@ -131,8 +131,10 @@ class OccupancyMap:
         """
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
-        is_occupied = (self.log_odds > max(threshold, 1.5 * config.log_odds_hit)) & (self.entity & SWEPT == 0)
-        return (self.origin + config.voxel * np.argwhere(is_occupied)).astype(np.float32)
+        voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
+        voxels = voxels[self.entity.ravel()[voxels] & SWEPT == 0]
+        cells = np.stack(np.unravel_index(voxels, self.log_odds.shape), axis=1)
+        return (self.origin + config.voxel * cells).astype(np.float32)
 
     def grid(self) -> OccupancyGrid:
         """A copy of the grid as it is now."""

@@ -137,6 +137,8 @@ def gap_seeds(
     voxel: float,
     splats: SplatSet,
     config: SceneConfig,
+    *,
+    num_threads: int = 1,
 ) -> Seeds:
     """Seeds where a measured surface lies further than `max_gap` [m] from every splat's sphere.
 
@@ -144,15 +146,15 @@ def gap_seeds(
     third pixel and row of the views (a frame and its mappable pixels (H, W)), and the centres (K, 3) of occupied
     voxels, which remember surfaces that nothing shows now; a centre may be half a voxel off its surface.
     """
-    sources = []
+    sources, spheres = [], _Spheres(splats, num_threads)
     for frame, mappable in views:
         mask = mappable.copy()
         mask[np.arange(len(mask)) % 3 != 0] = False
         mask[:, np.arange(mask.shape[1]) % 3 != 0] = False
-        mask[mask] = _is_further(world_points_at(frame, mask), splats, config.max_gap)
+        mask[mask] = spheres.are_further(world_points_at(frame, mask), config.max_gap)
         if mask.any():
             sources.append(candidates(frame, mask))
-    forgotten = occupied[_is_further(occupied, splats, config.max_gap + 0.5 * voxel)]
+    forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
         sources.append(_of_voxels(forgotten, splats))
     if not sources:
@@ -163,20 +165,26 @@ def gap_seeds(
     return _seeds_of(level, everything, pixel, no_splats, config)
 
 
-def _is_further(points: NDArray[np.floating], splats: SplatSet, gap: float) -> Bool:
-    """Points (K, 3) that lie further than `gap` [m] from the spheres of the eight splats with the nearest centres.
+class _Spheres:
+    """Splats to look for from many points."""
 
-    The nearest settles most of them, at a third of the cost of eight.
-    """
-    if not len(splats) or not len(points):
-        return np.ones(len(points), bool)
-    tree = cKDTree(splats.centers)
-    distance, nearest = tree.query(points)
-    is_further: Bool = distance - splats.radii[nearest] > gap
-    count = min(8, len(splats))
-    distance, nearest = tree.query(points[is_further], k=np.arange(1, count + 1))
-    is_further[is_further] = (distance - splats.radii[nearest]).min(axis=1) > gap
-    return is_further
+    def __init__(self, splats: SplatSet, num_threads: int) -> None:
+        self._radii, self._num_threads = splats.radii, num_threads
+        self._tree = cKDTree(splats.centers)
+
+    def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
+        """Points (K, 3) further than `gap` [m] from the spheres of the eight splats with the nearest centres.
+
+        The nearest settles most of them, at a third of the cost of eight.
+        """
+        if not len(self._radii) or not len(points):
+            return np.ones(len(points), bool)
+        distance, nearest = self._tree.query(points, workers=self._num_threads)
+        is_further: Bool = distance - self._radii[nearest] > gap
+        order = np.arange(1, min(8, len(self._radii)) + 1)
+        distance, nearest = self._tree.query(points[is_further], k=order, workers=self._num_threads)
+        is_further[is_further] = (distance - self._radii[nearest]).min(axis=1) > gap
+        return is_further
 
 
 def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:
