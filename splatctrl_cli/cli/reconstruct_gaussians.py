@@ -44,7 +44,10 @@ def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box:
         with stopwatch.stage("write"):
             comments = {"format": FORMAT, "source": source.name}
             write_gaussian_ply(partial / "splats.ply", fitter.gaussians(), comments)
-        metrics = _metrics(rows, frames) | {"workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()]}
+        metrics = _metrics(rows, frames) | {
+            "background": list(fitter.background),
+            "workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()],
+        }
         write_run(
             partial,
             command="reconstruct",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import Config, GaussianConfig
+from splatctrl_cli.config import Config, GaussianConfig, SceneConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.gaussians import GaussianArrays, GaussianRasteriser, GaussianRates, gaussian_step
@@ -17,6 +17,7 @@ from splatctrl_cli.records import Box, Float32, GaussianSet, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.densify import Densified, densify, fresh, reset_opacity
 from splatctrl_cli.scene.gaussians import gaussians_of, seeded
+from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.objective import loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.removal import seen_through
 from splatctrl_cli.scene.seeding import candidates, density_for, inside_workspace, seeds_at, world_points
@@ -58,6 +59,7 @@ class GaussianFitter:
         self.seed = seed
         self.num_threads = num_threads(threads)
         self.views = _views(frames, workspace, config.occupancy.min_range)
+        self.background = _background(self.views, config.scene)
         self.extent = scene_extent(frames)
         seeds = first_seeds(self.views, config)
         if not len(seeds):
@@ -100,7 +102,7 @@ class GaussianFitter:
         self._raster.prepare(view.camera, self.arrays.parameters, self.degree)
         planes = self._raster.forward()
         plane_gradients = np.empty_like(planes)
-        weights = loss_weights(self.config.scene)
+        weights = loss_weights(self.config.scene, self.background)
         self._terms.append(self._loss.evaluate(planes, view.target, weights, plane_gradients))
         gradients = self._raster.backward(planes, plane_gradients)
         gaussian_step(self._raster, gradients, self.arrays, self._rates())
@@ -138,7 +140,8 @@ class GaussianFitter:
     def _evaluate(self, view: View) -> LossTerms:
         self._raster.prepare(view.camera, self.arrays.parameters, self.degree)
         planes = self._raster.forward()
-        return self._loss.evaluate(planes, view.target, loss_weights(self.config.scene), np.empty_like(planes))
+        weights = loss_weights(self.config.scene, self.background)
+        return self._loss.evaluate(planes, view.target, weights, np.empty_like(planes))
 
     def _row(self, what: Densified, *, opacity_reset: bool) -> GaussianAuditRow:
         loss, psnr = mean_loss(self._terms, self.config.scene), psnr_of(self._terms)
@@ -191,7 +194,19 @@ def first_seeds(views: Sequence[View], config: Config) -> Seeds:
 
 
 def _views(frames: Sequence[RgbdFrame], workspace: Box, min_range: float) -> list[View]:
-    return [make_view(frame, inside_workspace(frame, world_points(frame), workspace, min_range)) for frame in frames]
+    """The frames as the fixed-budget method takes them: without what is mounted on the camera."""
+    by_camera = {name: [f for f in frames if f.camera == name] for name in sorted({f.camera for f in frames})}
+    mounted = {name: mounted_pixels(spread_views(own), min_range) for name, own in by_camera.items()}
+    return [
+        make_view(frame, inside_workspace(frame, world_points(frame), workspace, min_range), mounted[frame.camera])
+        for frame in frames
+    ]
+
+
+def _background(views: Sequence[View], config: SceneConfig) -> tuple[float, float, float]:
+    if config.background == "black":
+        return (0.0, 0.0, 0.0)
+    return background_color([view.frame for view in views], [view.target.counted > 0 for view in views])
 
 
 def _schedule(views: Sequence[View], num_iterations: int, rng: np.random.Generator) -> Iterator[View]:
