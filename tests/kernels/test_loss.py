@@ -30,31 +30,53 @@ def evaluated(planes: Float32, view: TargetView, weights: LossWeights, threads: 
 BACKGROUND = (0.9, 0.2, 0.5)
 
 
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), BACKGROUND])
-@pytest.mark.parametrize("normalised", [False, True])
-def test_value_and_gradient_equal_the_reference(normalised: bool, background: tuple[float, float, float]) -> None:
-    planes, view = images()
-    weights = LossWeights(dssim=0.2, color=1.0, depth=0.7, opacity=0.1, normalised=normalised, background=background)
-    terms, gradient = evaluated(planes, view, weights)
+def expected(planes: Float32, view: TargetView, weights: LossWeights) -> tuple[float, Float32]:
+    """Value and gradient of the reference."""
     leaf = torch.tensor(planes.astype(np.float64), requires_grad=True)
-    expected = reference.loss(
+    value = reference.loss(
         leaf,
         torch.tensor(view.color.astype(np.float64)),
         torch.tensor(view.depth.astype(np.float64)),
         torch.tensor(view.counted > 0),
-        dssim=0.2,
-        color_weight=1.0,
-        depth_weight=0.7,
-        opacity_weight=0.1,
-        normalised=normalised,
-        background=background,
+        dssim=weights.dssim,
+        color_weight=weights.color,
+        depth_weight=weights.depth,
+        opacity_weight=weights.opacity,
+        normalised=weights.normalised,
+        background=weights.background,
     )
-    expected.backward()  # type: ignore[no-untyped-call]
-    value = 0.8 * terms.l1 + 0.2 * terms.dssim + 0.7 * terms.depth + 0.1 * terms.transmittance
-    assert value == pytest.approx(expected.item(), rel=1e-5)
+    value.backward()  # type: ignore[no-untyped-call]
     assert leaf.grad is not None
-    want = leaf.grad.numpy()
+    return value.item(), leaf.grad.numpy()
+
+
+def assert_equals_the_reference(planes: Float32, view: TargetView, weights: LossWeights) -> None:
+    terms, gradient = evaluated(planes, view, weights)
+    value = 0.8 * terms.l1 + 0.2 * terms.dssim + 0.7 * terms.depth + 0.1 * terms.transmittance
+    want_value, want = expected(planes, view, weights)
+    assert value == pytest.approx(want_value, rel=1e-5)
     assert np.abs(gradient - want).max() < 1e-5 * np.abs(want).max()
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), BACKGROUND])
+@pytest.mark.parametrize("normalised", [False, True])
+def test_value_and_gradient_equal_the_reference(normalised: bool, background: tuple[float, float, float]) -> None:
+    weights = replace(WEIGHTS, normalised=normalised, background=background)
+    assert_equals_the_reference(*images(), weights)
+
+
+@pytest.mark.parametrize(("height", "width"), [(3, 70), (40, 8), (41, 7), (97, 21), (120, 33)])
+def test_an_image_of_any_size_equals_the_reference(height: int, width: int) -> None:
+    assert_equals_the_reference(*images(height, width), WEIGHTS)
+
+
+def test_one_object_compares_images_of_different_sizes() -> None:
+    loss = ImageLoss(2)
+    for height, width in ((60, 50), (29, 43), (90, 10)):
+        planes, view = images(height, width)
+        gradient = np.full_like(planes, np.nan)
+        assert loss.evaluate(planes, view, WEIGHTS, gradient) == evaluated(planes, view, WEIGHTS)[0]
+        assert np.array_equal(gradient, evaluated(planes, view, WEIGHTS)[1])
 
 
 def test_identical_images_have_no_colour_loss() -> None:

@@ -60,6 +60,35 @@ def test_gradients_equal_autograd_of_the_reference() -> None:
         assert np.median(np.abs(got - want)) < 1e-5 * np.abs(want).max()
 
 
+def test_opaque_layers_that_use_up_the_light_equal_the_reference() -> None:
+    """Most pixels are finished long before their tile's list; some opacities are above the clamp at 0.99."""
+    rng = np.random.default_rng(7)
+    count = 120
+    arrays = (
+        rng.uniform([-0.3, -0.3, 0.0], [0.3, 0.3, 0.3], (count, 3)).astype(np.float32),
+        rng.uniform(0.1, 0.3, count).astype(np.float32),
+        rng.choice(np.float32([0.5, 0.9, 0.995, 0.999]), count),
+        rng.uniform(0, 1, (count, 3)).astype(np.float32),
+    )
+    view = camera()
+    raster, planes = rendered(arrays, view)
+    assert np.mean(planes[4] > 1 - 1e-3) > 0.5
+    upstream = rng.normal(size=planes.shape).astype(np.float32)
+    gradients = raster.backward(planes, upstream)
+    leaves = tensors(arrays)
+    expected = reference.render(torch.tensor(view), *leaves)
+    expected.backward(torch.tensor(upstream.astype(np.float64)))
+    difference = np.abs(planes - expected.detach().numpy())
+    assert difference.max() < 1.2 / 255
+    assert np.mean(difference > 1e-5) < 1e-3
+    for got, leaf in zip(
+        [*raster.project_backward(gradients), gradients[:, 6], gradients[:, 7:]], leaves, strict=True
+    ):
+        assert leaf.grad is not None
+        want = leaf.grad.numpy()
+        assert np.abs(got - want).max() < 2e-3 * np.abs(want).max()
+
+
 def test_thread_count_does_not_change_a_bit() -> None:
     arrays, view = splats(500), camera(200, 150)
     upstream = np.random.default_rng(1).normal(size=(5, 150, 200)).astype(np.float32)
