@@ -111,6 +111,15 @@ def test_seeds_are_those_that_an_empty_map_asks_for() -> None:
     assert np.abs(seeds.centers[:, 2]).max() < 1e-3
 
 
+def test_the_colour_of_what_has_no_depth_is_the_background() -> None:
+    sky = frame()
+    sky.color[:, :30], sky.depth[:, :30] = (51, 102, 204), 0.0
+    fitter = GaussianFitter(CONFIG, WORKSPACE, [sky], threads=1)
+    assert fitter.background == pytest.approx((0.2, 0.4, 0.8))
+    black = replace(CONFIG, scene=replace(CONFIG.scene, background="black"))
+    assert GaussianFitter(black, WORKSPACE, [sky], threads=1).background == (0.0, 0.0, 0.0)
+
+
 def test_a_scene_without_depth_is_refused() -> None:
     away = Box(lower=np.array([5.0, 5.0, 5.0]), upper=np.array([6.0, 6.0, 6.0]))
     with pytest.raises(InputError, match="no pixel of any view has a depth inside the workspace"):
