@@ -63,9 +63,18 @@ def _level(points: Float32, colors: Float32, cube: Index, parent: Index, edge: f
     covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     thickness = np.maximum(np.linalg.eigvalsh(covariance)[:, 0], 0.0)
     detail = count * (np.maximum(color_variance, 0.0) + BEND * thickness / edge**2)
-    order = np.lexsort((np.sum(offset**2, axis=1), cube))
-    nearest = order[np.searchsorted(cube[order], np.arange(len(count)))]
+    nearest = _least(np.sum(offset**2, axis=1), cube, len(count))
     return CubeLevel(edge=edge, points=points[nearest], colors=color, detail=detail, parent=parent)
+
+
+def _least(values: NDArray[np.floating], cube: Index, num_cubes: int) -> NDArray[np.intp]:
+    """Index (num_cubes,) of the least of each cube's values (K,), the first of equals."""
+    least = np.full(num_cubes, np.inf, values.dtype)
+    np.minimum.at(least, cube, values)
+    found = np.flatnonzero(values == least[cube])[::-1]
+    first = np.empty(num_cubes, np.intp)
+    first[cube[found]] = found  # the last to be written stays
+    return first
 
 
 def leaves(levels: Sequence[CubeLevel], tolerance: float) -> list[Bool]:
