@@ -26,6 +26,9 @@ def register(subparsers: Subparsers) -> None:
         "--noise", choices=("none", "realsense"), default="realsense", help="depth noise (default: realsense)"
     )
     parser.add_argument(
+        "--person", action="store_true", help="a person with masks walks by, instead of the visitor that stands still"
+    )
+    parser.add_argument(
         "--dtu", action="store_true", help="write PATH/dtu too: a DTU scan of a scene that stands still"
     )
 
@@ -44,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
         height=args.height,
         noise=args.noise,
         seed=args.seed,
+        with_person=args.person,
     )
     stopwatch = Stopwatch()
     out = args.out or Path("simulated")

@@ -1,7 +1,8 @@
 """Writes a recorded log as one ROS 2 MCAP of standard messages (CDR, zstd chunks, CRCs on).
 
 Topics: /CAM/color/image_raw/compressed (JPEG), /CAM/color/camera_info, /CAM/depth/image_raw (16UC1 millimetres,
-REP 118, 0 = none, registered to colour), /joint_states, /tf and /tf_static. The bytes hold no wall-clock time.
+REP 118, 0 = none, registered to colour), /CAM/people/mask (mono8, 255 = a person; only of frames with a mask),
+/joint_states, /tf and /tf_static. The bytes hold no wall-clock time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.geometry import quat_from_rotation
@@ -76,24 +78,29 @@ class McapLog:
         self._add("/tf_static" if is_static else "/tf", message, stamp_ns)
 
     def add_frame(self, frame: RgbdFrame) -> None:
-        """Colour as JPEG, its CameraInfo and the depth, all of one stamp and one optical frame."""
+        """Colour as JPEG, its CameraInfo, the depth and a mask if any, all of one stamp and one optical frame."""
         header = self._header(frame.stamp_ns, f"{frame.camera}_optical_frame")
         jpeg = cv2.imencode(".jpg", frame.color[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         color = self._new("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=jpeg.reshape(-1))
         millimetres = np.rint(frame.depth.astype(np.float64) * MILLIMETRES).astype("<u2")
-        depth = self._new(
-            "sensor_msgs/msg/Image",
-            header=header,
-            height=frame.depth.shape[0],
-            width=frame.depth.shape[1],
-            encoding="16UC1",
-            is_bigendian=0,
-            step=2 * frame.depth.shape[1],
-            data=millimetres.reshape(-1).view(np.uint8),
-        )
         self._add(f"/{frame.camera}/color/camera_info", self._camera_info(header, frame.intrinsics), frame.stamp_ns)
         self._add(f"/{frame.camera}/color/image_raw/compressed", color, frame.stamp_ns)
-        self._add(f"/{frame.camera}/depth/image_raw", depth, frame.stamp_ns)
+        self._add(f"/{frame.camera}/depth/image_raw", self._image(header, "16UC1", millimetres), frame.stamp_ns)
+        if frame.human is not None:
+            mask = np.where(frame.human > 0, np.uint8(255), np.uint8(0))
+            self._add(f"/{frame.camera}/people/mask", self._image(header, "mono8", mask), frame.stamp_ns)
+
+    def _image(self, header: Any, encoding: str, pixels: NDArray[np.unsignedinteger]) -> Any:
+        return self._new(
+            "sensor_msgs/msg/Image",
+            header=header,
+            height=pixels.shape[0],
+            width=pixels.shape[1],
+            encoding=encoding,
+            is_bigendian=0,
+            step=pixels.itemsize * pixels.shape[1],
+            data=pixels.reshape(-1).view(np.uint8),
+        )
 
     def _camera_info(self, header: Any, k: Intrinsics) -> Any:
         region = self._new(

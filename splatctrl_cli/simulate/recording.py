@@ -7,7 +7,7 @@ import numpy as np
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame
+from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import tabletop
 from splatctrl_cli.simulate.noise import DepthNoise
@@ -25,7 +25,10 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions:
-    """What to record: duration [s], frames per second of each camera, image size [px], depth noise, its seed."""
+    """What to record: duration [s], frames per second of each camera, image size [px], depth noise, its seed.
+
+    with_person: a person with masks walks by, instead of the visitor that stands still.
+    """
 
     duration_s: float = 7.0
     fps: float = 5.0
@@ -33,6 +36,7 @@ class RecordingOptions:
     height: int = 240
     noise: str = "realsense"
     seed: int = 0
+    with_person: bool = False
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.duration_s <= 600:
@@ -57,9 +61,10 @@ class Recording:
         span = round(options.duration_s * 1e9)
         self.start_ns, self.end_ns = START_NS, START_NS + span
         self.cameras = tabletop.cameras(options.width, options.height)
-        visitor = tabletop.visitor(START_NS + span // 3, START_NS + 2 * span // 3)
-        self.primitives: tuple[Primitive, ...] = (*tabletop.furniture(), *tabletop.things(), visitor)
-        self._temporary = (visitor,)
+        third = (START_NS + span // 3, START_NS + 2 * span // 3)
+        num_steps = max(round(options.duration_s * options.fps / 3), 1)
+        self._temporary = tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third)]
+        self.primitives: tuple[Primitive, ...] = (*tabletop.furniture(), *tabletop.things(), *self._temporary)
         self._motion = tabletop.arm_motion(options.duration_s)
 
     def joint_states(self) -> Iterator[JointState]:
@@ -75,9 +80,10 @@ class Recording:
         noise = NOISES[self.options.noise]
         for index in range(int(np.ceil(self.options.duration_s * self.options.fps - 1e-9))):
             offset_ns = round(index * 1e9 / self.options.fps)
-            moving = self._moving(offset_ns)
+            arm, passing = self._moving(offset_ns)
             for number, renderer in enumerate(renderers):
-                color, depth = renderer.image(moving)
+                color, depth = renderer.image([*arm, *passing])
+                human = _shown(depth, renderer.image(arm)[1]) if self.options.with_person else None
                 if noise is not None:
                     depth = noise.applied(depth, np.random.default_rng([self.options.seed, number, index]))
                 yield RgbdFrame(
@@ -87,6 +93,7 @@ class Recording:
                     depth=depth,
                     intrinsics=renderer.camera.intrinsics,
                     T_world_camera=renderer.camera.T_world_camera,
+                    human=human,
                 )
 
     def records(self) -> Iterator[Record]:
@@ -143,7 +150,13 @@ class Recording:
         ]
         return np.array([state.stamp_ns for state in states], dtype=np.int64), np.array(clearance)
 
-    def _moving(self, offset_ns: int) -> list[Primitive]:
+    def _moving(self, offset_ns: int) -> tuple[list[Primitive], list[Primitive]]:
+        """The arm's solids, and what is there for a while only."""
         q, _ = self._motion.at(offset_ns / 1e9)
         arm = tabletop.arm_solids(self.robot.urdf.shapes, self.link_poses(q))
-        return arm + [p for p in self._temporary if p.is_present(self.start_ns + offset_ns)]
+        return arm, [p for p in self._temporary if p.is_present(self.start_ns + offset_ns)]
+
+
+def _shown(depth: Float32, without: Float32) -> UInt8:
+    """(H, W) 1 where `depth` [m] shows what is not there in `without`, else 0."""
+    return np.asarray((depth > 0) & ((without == 0) | (depth < without)), np.uint8)

@@ -63,6 +63,23 @@ def visitor(from_ns: int, to_ns: int) -> Primitive:
     )
 
 
+def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:
+    """Who walks along the table's near side instead of the visitor: a place for each of the steps."""
+    stamps = [from_ns + (to_ns - from_ns) * step // num_steps for step in range(num_steps + 1)]
+    return [
+        _cylinder(
+            f"person.{step:03d}",
+            0.06,
+            0.40,
+            (0.75 - 0.40 * step / max(num_steps - 1, 1), -0.50, 0.20),
+            _texture("noise", 0.05, "grape", 2),
+            from_ns=stamps[step],
+            to_ns=stamps[step + 1],
+        )
+        for step in range(num_steps)
+    ]
+
+
 def cameras(width: int, height: int) -> tuple[Camera, ...]:
     """Three training cameras and a fourth for scoring between the first two; focal length 0.92 image widths."""
     scale = width / 320

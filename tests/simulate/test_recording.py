@@ -259,3 +259,26 @@ def test_the_sample_truth_keeps_its_promises(sample_data: Path) -> None:
     assert all(truth.luminance_std[camera.name] >= 0.15 for camera in truth.cameras if camera.is_training)
     assert 0.03 < truth.clearance.min() < 0.10
     assert sum(path.stat().st_size for path in sample_data.rglob("*") if path.is_file()) < 9e6
+
+
+def test_a_person_walks_by_and_the_masks_show_where(robot: RobotModel) -> None:
+    recording = Recording(RecordingOptions(noise="none", with_person=True, **SMALL | {"fps": 3.0}), robot)
+    people = [p for p in recording.primitives if p.name.startswith("person")]
+    places = []
+    for frame in recording.frames():
+        assert frame.human is not None
+        here = [p for p in people if p.is_present(frame.stamp_ns)]
+        is_shown = frame.human > 0
+        assert is_shown.any() == bool(here)
+        points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth))
+        if here:
+            distance = distance_to(here, points.reshape(-1, 3), frame.stamp_ns).reshape(is_shown.shape)
+            assert ((np.abs(distance) < 1e-5) >= is_shown).all()
+            assert is_shown[distance < -1e-5].all()
+            places.append(float(here[0].T_world_shape[0, 3]))
+    assert len(set(places)) == 3
+    assert places == sorted(places, reverse=True)
+
+
+def test_nobody_looks_for_people_unless_asked(frames: list[RgbdFrame]) -> None:
+    assert all(frame.human is None for frame in frames)
