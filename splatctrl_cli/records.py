@@ -87,13 +87,17 @@ Record = RgbdFrame | JointState
 
 @dataclass(kw_only=True)
 class LossReport:
-    """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted."""
+    """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted.
+
+    invalid_depth: pixels whose depth is NaN, infinite or negative, which count as having none.
+    """
 
     unpaired_color: int = 0
     unpaired_depth: int = 0
     without_pose: int = 0
     without_intrinsics: int = 0
     damaged: int = 0
+    invalid_depth: int = 0
     notes: list[str] = field(default_factory=list)
 
 

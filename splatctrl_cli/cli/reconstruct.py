@@ -1,7 +1,7 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,11 +19,12 @@ from splatctrl_cli.cli.common import (
     table,
 )
 from splatctrl_cli.cli.source_options import add_source, source_options
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
-    from splatctrl_cli.records import Box, RecordSource
+    from splatctrl_cli.io.shot import ShotSource
+    from splatctrl_cli.records import Box, LossReport, RecordSource
     from splatctrl_cli.robot.model import RobotModel
 
 DAMAGED = 3
@@ -55,6 +56,16 @@ def register(subparsers: Subparsers) -> None:
         "--box", metavar="X0,Y0,Z0,X1,Y1,Z1", help="workspace [m] (default: the robot's reach, else the valid depth)"
     )
     parser.add_argument(
+        "--max-pose-jump",
+        type=float,
+        default=1.0,
+        metavar="M",
+        help="how far a camera may move between frames less than a second apart, in metres (default: 1)",
+    )
+    parser.add_argument(
+        "--allow-disagreement", action="store_true", help="go on where cameras disagree on where the surfaces are"
+    )
+    parser.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted, to the same bytes"
     )
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
@@ -64,10 +75,7 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.cli.reconstruction import Reconstruction, training_cameras
-    from splatctrl_cli.cli.resume import checkpoint_to_go_on_from, identity
-    from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
-    from splatctrl_cli.io.scene_writer import CHECKPOINT
+    from splatctrl_cli.cli.reconstruction import training_cameras
 
     if args.device == "cuda":
         raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
@@ -76,21 +84,35 @@ def run(args: argparse.Namespace) -> int:
 
         return run_gaussians(args, _config(args), _open(args), _box(args))
     check_gate_names(args.require, GATED)
-    console, stopwatch, config = Console(args), Stopwatch(), _config(args)
-    source, box = _open(args), _box(args)
+    console, config = Console(args), _config(args)
+    source = _open(args)
     training_cameras(source)
     robot = _robot(args, source)
     for doubt in () if robot is None else robot.doubts:
         console.log(f"warning: {doubt}")
-    out = args.out or Path("scene")
+    metrics = _fit(args, config, source, robot, console)
+    check_gates(args.require, {name: _number(metrics[name]) for name in GATED})
+    return DAMAGED if source.loss.damaged else 0
+
+
+def _fit(
+    args: argparse.Namespace, config: "Config", source: "RecordSource", robot: "RobotModel | None", console: Console
+) -> dict[str, object]:
+    """Reconstruct into the output folder, or go on with what an interrupted run left of it; returns the metrics."""
+    from splatctrl_cli.cli.reconstruction import Reconstruction
+    from splatctrl_cli.cli.resume import checkpoint_to_go_on_from, identity
+    from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
+    from splatctrl_cli.io.scene_writer import CHECKPOINT
+
+    stopwatch, box, out = Stopwatch(), _box(args), args.out or Path("scene")
     checkpoint_file = partial_path(out) / CHECKPOINT
-    can_go_on = checkpoint_file.is_file()
-    if can_go_on and not args.resume:
+    goes_on = args.resume and checkpoint_file.is_file()
+    if args.resume and not goes_on:
+        console.log(f"{partial_path(out)}: has no checkpoint to go on from; starts at the beginning")
+    elif checkpoint_file.is_file() and not args.resume:
         console.log(
             f"warning: {partial_path(out)}: an interrupted run is replaced; --resume would have gone on with it"
         )
-    if args.resume and not can_go_on:
-        console.log(f"{partial_path(out)}: has no checkpoint to go on from; starts at the beginning")
     with (
         _told_how_to_go_on(checkpoint_file),
         output_path(out, force=args.force, is_folder=True, checkpoint=CHECKPOINT, resume=args.resume) as partial,
@@ -106,12 +128,12 @@ def run(args: argparse.Namespace) -> int:
             seed=args.seed,
             threads=args.threads,
             identity=run_identity,
-            checkpoint=checkpoint_to_go_on_from(partial, run_identity) if args.resume and can_go_on else None,
+            allow_disagreement=args.allow_disagreement,
+            checkpoint=checkpoint_to_go_on_from(partial, run_identity) if goes_on else None,
         )
-        is_resumed = fitted.num_read > 0
-        if is_resumed:
+        if goes_on:
             console.log(f"{partial}: goes on after {fitted.num_read} time steps")
-        with stopwatch.stage("fit_since_resume" if is_resumed else "fit"):
+        with stopwatch.stage("fit_since_resume" if goes_on else "fit"):
             fitted.run(console)
         with stopwatch.stage("write"):
             fitted.finish()
@@ -125,23 +147,33 @@ def run(args: argparse.Namespace) -> int:
             stopwatch=stopwatch,
             seed=args.seed,
         )
-    last = fitted.rows[-1]
-    removed = {name: sum(row.removed[name] for row in fitted.rows) for name in last.removed}
-    seconds = f"{sum(stopwatch.seconds.values()):.1f}"
-    lines = table(
-        ["time steps", "splats", "robot", "added", "relocated", "unmet", "training dB", "seconds"],
-        [
-            [
-                metrics["time_steps"], last.alive, last.robot, metrics["added"], metrics["relocated"],
-                metrics["unmet"], "-" if last.psnr is None else f"{last.psnr:.2f}", seconds,
-            ]
-        ],
-    )  # fmt: skip
-    lines.append("removed: " + (", ".join(f"{n} {reason}" for reason, n in removed.items() if n) or "none"))
-    lines += [f"note: {note}" for note in source.loss.notes]
+    removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
+    lines = _lines(metrics, removed, source.loss, sum(stopwatch.seconds.values()))
     console.result({"scene": str(out), "metrics": metrics, "removed": removed}, [*lines, f"wrote {out}"])
-    check_gates(args.require, {name: _number(metrics[name]) for name in GATED})
-    return DAMAGED if source.loss.damaged else 0
+    return metrics
+
+
+def _lines(
+    metrics: Mapping[str, object], removed: Mapping[str, int], loss: "LossReport", seconds: float
+) -> list[str]:
+    psnr = metrics["psnr"]
+    columns = {
+        **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
+        "robot": metrics["robot_splats"],
+        **{name: metrics[name] for name in ("added", "relocated", "unmet")},
+        "training dB": "-" if psnr is None else f"{psnr:.2f}",
+        "seconds": f"{seconds:.1f}",
+    }
+    lines = table(list(columns), [list(columns.values())])
+    reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
+    lines.append("removed: " + (", ".join(reasons) or "none"))
+    if metrics["frames_without_depth"]:
+        lines.append(
+            f"note: {metrics['frames_without_depth']} frames without any valid depth: nothing seeded from them"
+        )
+    if loss.invalid_depth:
+        lines.append(f"note: {loss.invalid_depth} pixels of depth NaN, infinite or negative: taken as none")
+    return lines + [f"note: {note}" for note in loss.notes]
 
 
 @contextmanager
@@ -184,10 +216,29 @@ def _open(args: argparse.Namespace) -> "RecordSource":
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
     if args.dtu is None:
-        return open_source(args.source, source_options(args))
+        source = open_source(args.source, source_options(args))
+        _check_pose_jumps(source, args.max_pose_jump)
+        return source
     from splatctrl_cli.io.dtu_source import DtuSource, view_numbers
 
     return DtuSource(args.dtu, args.scan, view_numbers([word for word in (args.holdout or "").split(",") if word]))
+
+
+def _check_pose_jumps(source: "ShotSource", limit: float) -> None:
+    """Raise InputError for a camera that is suddenly elsewhere; where nobody knows when, views may lie anywhere."""
+    from splatctrl_cli.scene.consistency import largest_jump
+
+    if not limit > 0:
+        raise UsageError(f"--max-pose-jump: expected metres, got {limit}")
+    jump = largest_jump(source.poses()) if source.has_clock else None
+    if jump is not None and jump.distance > limit:
+        later = (jump.after_ns - jump.before_ns) * 1e-9
+        raise InputError(
+            f"{source.name}: camera {jump.camera} jumps by {jump.distance:.2f} m from stamp {jump.before_ns} to"
+            f" {jump.after_ns} ns, {later:.3g} s later (expected at most {limit:g} m)",
+            remedy=f"correct the poses, leave the camera out with --cameras, or give --max-pose-jump"
+            f" {jump.distance + 0.01:.2f}",
+        )
 
 
 def _robot(args: argparse.Namespace, source: "RecordSource") -> "RobotModel | None":

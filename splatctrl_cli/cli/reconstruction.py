@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +47,7 @@ class Reconstruction:
         seed: int,
         threads: int,
         identity: Mapping[str, Any],
+        allow_disagreement: bool = False,
         checkpoint: "Checkpoint | None" = None,
     ) -> None:
         from splatctrl_cli.io.scene_folder import FORMAT
@@ -58,6 +60,7 @@ class Reconstruction:
         self.seed = seed
         self.threads = threads
         self.identity = identity
+        self.allow_disagreement = allow_disagreement
         self.cameras = training_cameras(source)
         comments = {"format": FORMAT, "frame": "world", "units": "m", "source": source.name}
         self.writer = SceneWriter(folder, comments, checkpoint)
@@ -66,6 +69,7 @@ class Reconstruction:
         self.stamps: list[int] = []
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
+        self.disagreement: dict[str, float] = {}  # [m] of each pair of cameras that see enough of the same
         self._saved_at, self._save_time = -float("inf"), 0.0
         if checkpoint is not None:
             self._restore(checkpoint)
@@ -108,9 +112,12 @@ class Reconstruction:
                 console.log(
                     "warning: more views than fit in one time step; the last ones are refined on, the rest seed"
                 )
+            self._check_cameras(step, console)
             row = self.fitter.step(step.frames, self._posture(step))
             self.stamps.extend(frame.stamp_ns for frame in step.frames)
             self._record(row)
+            if self.fitter.num_steps == 1:
+                self._warn_of_small_budget(row, console)
             if index % 10 == 0 and not steps.disable:
                 steps.set_postfix(splats=row.alive, dB=row.psnr)
             if steps.disable and index % 10 == 0:
@@ -122,6 +129,43 @@ class Reconstruction:
                 self._snapshot(step.stamp_ns)
             self._save_if_due()
         return early
+
+    def _check_cameras(self, step: "TimeStep", console: Console) -> None:
+        """Measure once a pair how far cameras disagree on what both see. Raises InputError where that is too far."""
+        from splatctrl_cli.scene.consistency import agreements
+
+        limits = self.config.occupancy
+        if not self._has_new_pairs(step):
+            return
+        for pair in agreements(step.frames, limits.min_range, limits.max_range):
+            name = " and ".join(dict.fromkeys(pair.cameras))
+            if name in self.disagreement:
+                continue
+            self.disagreement[name] = round(pair.median, 5)
+            if pair.holds:
+                continue
+            line = (
+                f"{self.source.name}: camera {name}: depths disagree by {1e3 * pair.median:.0f} mm (median of"
+                f" {pair.num_pixels} pixels that two views see; expected at most {1e3 * pair.limit:.0f} mm)"
+            )
+            if not self.allow_disagreement:
+                others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
+                raise InputError(line, remedy=f"correct the poses,{others} or give --allow-disagreement")
+            console.log(f"warning: {line}")
+
+    def _has_new_pairs(self, step: "TimeStep") -> bool:
+        """Whether two views of this time step are from cameras that have not been compared yet."""
+        names = sorted(frame.camera for frame in step.frames)
+        pairs = {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)}
+        return not pairs <= self.disagreement.keys()
+
+    def _warn_of_small_budget(self, row: "AuditRow", console: Console) -> None:
+        if row.unmet:
+            budget = self.config.scene.max_splats
+            console.log(
+                f"warning: a budget of {budget} splats is too small for the first frames: {row.unmet} seeds found no"
+                f" slot; --max-splats {budget + row.unmet} would hold them"
+            )
 
     def _refine(self, fitter: "SceneFitter", console: Console) -> None:
         total = self.config.scene.refine_iterations
@@ -160,6 +204,8 @@ class Reconstruction:
             "psnr": last.psnr,
             "background": list(self.fitter.background or (0.0, 0.0, 0.0)),
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
+            "frames_without_depth": sum(row.without_depth for row in self.rows),
+            "disagreement": self.disagreement,
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }
 
@@ -201,6 +247,7 @@ class Reconstruction:
             "run": self.identity,
             "num_read": self.num_read,
             "is_refined": self.is_refined,
+            "disagreement": self.disagreement,
             "stamps": [] if self.source.has_clock else self.stamps,
         }
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
@@ -213,6 +260,7 @@ class Reconstruction:
         self.num_read = checkpoint.progress["num_read"]
         self.is_refined = checkpoint.progress["is_refined"]
         self.stamps = checkpoint.progress["stamps"]
+        self.disagreement = checkpoint.progress["disagreement"]
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 

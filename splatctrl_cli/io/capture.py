@@ -21,7 +21,7 @@ from splatctrl_cli.io.messages import decode_file, metres
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256, write_json
 from splatctrl_cli.io.shot import Shot, ShotSource, merged
-from splatctrl_cli.records import Float32, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
+from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
 FORMAT, VERSION = "splatctrl-capture", 1
 INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
@@ -141,6 +141,10 @@ class CaptureSource:
         self._damaged = []
         return merged(self._joints, self._shots())
 
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every row of frames.csv."""
+        return ((int(row["stamp_ns"]), row["camera"], _pose(row)) for row in self._rows)
+
     def digests(self) -> dict[str, str]:
         """sha256 of SHA256SUMS, which covers every file."""
         return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS")}
@@ -156,7 +160,6 @@ class CaptureSource:
             if bgr is None or depth is None:
                 self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
                 continue
-            pose = [float(row[key]) for key in COLUMNS[4:11]]
             intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
             yield Shot(
                 frame=RgbdFrame(
@@ -165,7 +168,7 @@ class CaptureSource:
                     color=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8),
                     depth=depth,
                     intrinsics=intrinsics,
-                    T_world_camera=transform_from(pose[:3], pose[3:]),
+                    T_world_camera=_pose(row),
                     human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
                 ),
                 color_file=color_bytes,
@@ -190,6 +193,11 @@ class CaptureSource:
             self._damaged.append(f"{name}: its checksum differs from SHA256SUMS")
             return None
         return data
+
+
+def _pose(row: dict[str, str]) -> Float64:
+    values = [float(row[key]) for key in COLUMNS[4:11]]
+    return transform_from(values[:3], values[3:])
 
 
 def is_capture(path: Path) -> bool:

@@ -10,11 +10,11 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.io.capture import is_capture, read_capture_header
 from splatctrl_cli.io.describe_file import describe_file
-from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.known_space import known_space
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig import camera_topics, missing
+from splatctrl_cli.io.rig_folder import open_image_folder
 from splatctrl_cli.io.scene_folder import read_occupancy
 from splatctrl_cli.io.shot import Shot
 from splatctrl_cli.io.summary import Grid, Summary
@@ -192,7 +192,7 @@ def _describe_capture(path: Path) -> Summary:
 
 
 def _describe_images(path: Path, options: SourceOptions) -> Summary:
-    source = ImageFolderSource(path, options)
+    source = open_image_folder(path, options)
     first = next((item for item in source.shots() if isinstance(item, Shot)), None)
     counts = source.count_views()
     facts: dict[str, object] = {"has_clock": source.has_clock}

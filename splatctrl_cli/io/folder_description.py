@@ -122,10 +122,50 @@ T = TypeVar("T")
 
 def read_description(path: Path, root: Path | None = None) -> Description:
     """Parse a description. Raises InputError naming the key that is unknown, missing or wrong."""
+    return _read(_content(path), path, root)
+
+
+def read_rig(path: Path, root: Path | None = None) -> list[Description]:
+    """One description per ``[[cameras]]`` of a file that has them: its keys are those of [camera], and `color`,
+    `depth` and `poses` for its files; all else is common to them. Empty where the file has none.
+
+    Raises InputError as `read_description`, and where two cameras share a name or any is without.
+    """
+    content = _content(path)
+    cameras = content.pop("cameras", [])
+    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
+        raise InputError(f"{path}: cameras: expected tables [[cameras]], got {cameras!r}", remedy="see docs/input.md")
+    names = [camera.get("name") for camera in cameras]
+    if None in names or len(set(names)) < len(names):
+        raise InputError(
+            f"{path}: [[cameras]]: expected a name for each of its own, got {names}", remedy="see docs/input.md"
+        )
+    if cameras and not {"camera", "frames", "split"}.isdisjoint(content):
+        raise InputError(
+            f"{path}: [[cameras]] beside [camera], [frames] or [split]", remedy="leave the single tables out"
+        )
+    return [_read(_of_camera(content, camera, path), path, root) for camera in cameras]
+
+
+def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The description of one of several cameras."""
+    for key in ("color", "depth", "poses"):
+        if not isinstance(camera.get(key), str):
+            raise InputError(f"{path}: [[cameras]]: {key} is missing", remedy="see docs/input.md")
+    lens = {key: value for key, value in camera.items() if key not in ("color", "depth", "poses")}
+    frames = {"color": camera["color"], "depth": camera["depth"]}
+    poses = {"format": "matrix-files", **common.get("poses", {}), "file": camera["poses"]}
+    return {**common, "camera": lens, "frames": frames, "poses": poses}
+
+
+def _content(path: Path) -> dict[str, Any]:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not TOML: {error}", remedy="see docs/input.md") from None
+
+
+def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
     known = {f.name for f in fields(Description)} - {"path"}
     _check_keys(content, known, str(path), "")
     folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()

@@ -20,7 +20,7 @@ from splatctrl_cli.io.folder_description import (
     read_description,
 )
 from splatctrl_cli.io.masks import human_mask
-from splatctrl_cli.io.messages import decode_file, metres
+from splatctrl_cli.io.messages import decode_file, metres, num_invalid
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.poses import (
@@ -59,10 +59,10 @@ class ImageFolderSource:
     joint_names: tuple[str, ...] = ()
     world_frame = "world"
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
+    def __init__(self, path: Path, options: SourceOptions, description: Description | None = None) -> None:
         options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
         self.name = path.name
-        self._description = _completed(read_description(path, options.root))
+        self._description = _completed(description or read_description(path, options.root))
         self._scale = self._description.depth.scale if options.depth_scale is None else options.depth_scale
         camera = self._description.camera
         assert camera is not None
@@ -84,6 +84,7 @@ class ImageFolderSource:
         )
         self._loss = LossReport()
         self._damaged: list[str] = []
+        self._num_invalid = 0
         self._views = _views(self._description, camera.name, options, self._loss)
         names = tuple(sorted({view.camera for view in self._views}))
         if options.cameras is not None:
@@ -103,7 +104,12 @@ class ImageFolderSource:
     def loss(self) -> LossReport:
         """Unpaired and unposed images, and those that did not decode while `records` was read."""
         loss = self._loss
-        return replace(loss, damaged=loss.damaged + len(self._damaged), notes=[*loss.notes, *self._damaged])
+        return replace(
+            loss,
+            damaged=loss.damaged + len(self._damaged),
+            invalid_depth=self._num_invalid,
+            notes=[*loss.notes, *self._damaged],
+        )
 
     def records(self) -> Iterator[Record]:
         """Frames by stamp."""
@@ -112,7 +118,7 @@ class ImageFolderSource:
 
     def shots(self) -> Iterator[Shot | JointState]:
         """Shots by stamp."""
-        self._damaged = []
+        self._damaged, self._num_invalid = [], 0
         checked: set[str] = set()
         for view in self._views:
             shot = self._shot(view)
@@ -121,6 +127,10 @@ class ImageFolderSource:
             if view.camera not in checked and check_depth(shot.frame.depth, str(view.depth), self._scale):
                 checked.add(view.camera)
             yield shot
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every view."""
+        return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
 
     def count_views(self) -> dict[str, int]:
         """Views by camera."""
@@ -190,6 +200,7 @@ class ImageFolderSource:
             pixels = _float_pixels(path)
             if pixels is None:
                 return None
+            self._num_invalid += num_invalid(pixels)
             depth = pixels * np.float32(self._scale)
             return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
         counts = decode_file(path.read_bytes(), color=False)
@@ -328,9 +339,9 @@ def _masks(description: Description, names: list[str], loss: LossReport) -> dict
 
 
 def _glob(root: Path, pattern: str) -> list[tuple[str, Path]]:
-    """Files by the text that the pattern's `*` stands for, sorted; a pattern without `*` is one file."""
+    """Files by the text that the pattern's `*` stands for, sorted; a pattern without `*` is one file, by no text."""
     if "*" not in pattern:
-        return [(pattern, root / pattern)] if (root / pattern).is_file() else []
+        return [("", root / pattern)] if (root / pattern).is_file() else []
     expression = re.compile(".*".join(re.escape(part) for part in pattern.split("*")).replace(".*", "(.*)", 1))
     found = []
     for path in sorted(root.glob(pattern)):
@@ -345,6 +356,8 @@ def _poses(description: Description, colors: dict[str, Path]) -> dict[str, Float
     table, root = description.poses, description.root
     if table.format == "matrix-files":
         files = dict(_glob(root, table.file))
+        if "" in files:  # a camera that does not move
+            return dict.fromkeys(colors, read_matrix_file(files[""]))
         return {name: read_matrix_file(files[name]) for name in colors if name in files}
     if table.format == "matrix-blocks":
         by_key = read_matrix_blocks(root / table.file, table.heading)

@@ -112,6 +112,11 @@ def depth_of(image: ImageMessage, scale: float | None) -> Float32:
     return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
 
 
+def num_invalid(depth: NDArray[Any]) -> int:
+    """Pixels of a depth image (H, W) as recorded that are NaN, infinite or negative: what no camera measured."""
+    return 0 if depth.dtype.kind == "u" else int((~np.isfinite(depth) | (depth < 0)).sum())
+
+
 def metres(counts: NDArray[Any], scale: float) -> Float32:
     """Integer depth counts (H, W) as float32 [m]; the one formula, so that re-reading gives the same bits."""
     return counts.astype(np.float32) * np.float32(scale)

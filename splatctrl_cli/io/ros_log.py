@@ -12,7 +12,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.masks import human_mask, mask_by_color
-from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, read_image
+from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid, read_image
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.pairing import pair_by_stamp
@@ -56,12 +56,18 @@ class RosLogSource:
         self.joint_names, self._joints = joint_records(found, options, self._loss)
         self._plan = self._planned(found)
         self._damage = Damage()
+        self._num_invalid = 0
 
     @property
     def loss(self) -> LossReport:
         """What did not become records; images that do not decode are added while `records` is read."""
         loss = self._loss
-        return replace(loss, damaged=loss.damaged + self._damage.count, notes=[*loss.notes, *self._damage.notes])
+        return replace(
+            loss,
+            damaged=loss.damaged + self._damage.count,
+            invalid_depth=self._num_invalid,
+            notes=[*loss.notes, *self._damage.notes],
+        )
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
@@ -70,8 +76,12 @@ class RosLogSource:
 
     def shots(self) -> Iterator[Shot | JointState]:
         """Joint states and shots by stamp."""
-        self._damage = Damage()
+        self._damage, self._num_invalid = Damage(), 0
         return merged(self._joints, self._shots())
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every planned frame."""
+        return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
 
     def digests(self) -> dict[str, str]:
         """sha256 of the log's files."""
@@ -134,6 +144,7 @@ class RosLogSource:
         checked: set[str] = set()
         for planned, (color, depth, *masks) in images.of_frames(self._damage):
             human = self._human(planned.camera, masks[0]) if masks else None
+            self._num_invalid += num_invalid(depth.pixels)
             shot = _shot(planned, color, depth, human, self._options.depth_scale)
             camera = planned.camera
             if camera.name not in checked:

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Float32, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.records import Float32, Float64, JointState, RecordSource, RgbdFrame
 
 PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
 
@@ -37,6 +37,10 @@ class ShotSource(RecordSource, Protocol):
 
     def shots(self) -> Iterator[Shot | JointState]:
         """As `records`, with the frames as shots."""
+        ...
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp, without its images."""
         ...
 
 

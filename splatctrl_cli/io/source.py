@@ -5,8 +5,8 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.io.capture import CaptureSource, is_capture
-from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
+from splatctrl_cli.io.rig_folder import open_image_folder
 from splatctrl_cli.io.ros_log import RosLogSource
 from splatctrl_cli.io.shot import ShotSource
 
@@ -22,11 +22,9 @@ def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
     if path.suffix == ".toml":
-        return ImageFolderSource(path, options)
+        return open_image_folder(path, options)
     if is_capture(path):
         return CaptureSource(path, options)
-    if path.suffix == ".toml":
-        return ImageFolderSource(path, options)
     if path.is_dir() and not is_bag_folder(path):
         raise InputError(
             f"{path}: a folder that is neither a capture nor a ROS 2 bag",

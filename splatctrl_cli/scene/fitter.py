@@ -48,7 +48,8 @@ NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after 
 class AuditRow:
     """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames.
 
-    dead: slots that wait to be reused. unmet: seeds that found no free slot. loss and psnr are
+    dead: slots that wait to be reused. unmet: seeds that found no free slot. without_depth: frames without
+    any valid depth, which seed nothing. loss and psnr are
     None where no view shows anything of the workspace.
     """
 
@@ -62,6 +63,7 @@ class AuditRow:
     removed: dict[str, int]
     robot: int
     human: int
+    without_depth: int
     loss: float | None
     psnr: float | None
 
@@ -219,7 +221,7 @@ class SceneFitter:
         self.buffer.kill(floating)
         outside = self.buffer.is_alive & ~self.workspace.contains(self.buffer.centers)
         self.buffer.kill(outside)
-        for reason, mask in (("trail", drifted), ("free", floating), ("workspace", outside)):
+        for reason, mask in (("robot", drifted), ("seen_through", floating), ("workspace", outside)):
             removed[reason] += int(mask.sum())
 
     def _remove(self, is_trail: Bool, is_floating: Bool, *, counts_time: bool = True) -> dict[str, int]:
@@ -382,6 +384,7 @@ class SceneFitter:
             removed=removed,
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
             human=int((buffer.labels[buffer.is_alive] == Label.HUMAN).sum()),
+            without_depth=sum(not (view.frame.depth > 0).any() for view in views),
             loss=None if loss is None else round(loss + c.lambda_reg * opacity, 6),
             psnr=None if psnr is None else round(psnr, 4),
         )

@@ -9,7 +9,7 @@ from splatctrl_cli.records import Bool, Box, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 
-REASONS = ("broken", "workspace", "opacity", "free", "uncertain", "trail", "weak")
+REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak")
 
 
 def nearest_depth(frame: RgbdFrame) -> Float32:
@@ -53,9 +53,10 @@ def removals(
 ) -> dict[str, Bool]:
     """Masks (M,) of live splats to remove, by reason; each splat under its first reason in `REASONS`.
 
-    broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free, or
-    a camera sees through it.
+    broken: not finite. workspace: outside it. opacity: below alpha_min. free: every voxel around it observed free.
+    seen_through: it floats before what a camera measured.
     uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot or human, is no longer.
+    robot: none here; those that the optimiser moved off the robot or a person.
     weak: none here; those that show least and are given up for detail elsewhere are counted under it by refining.
     Updates the buffer's count of uncertain time steps,
     where this is one. Splats whose surroundings were never seen stay, unless the
@@ -75,9 +76,11 @@ def removals(
         "broken": is_broken,
         "workspace": ~workspace.contains(centers),
         "opacity": buffer.opacities < min_opacity,
-        "free": is_free | is_floating,
+        "free": is_free,
+        "seen_through": is_floating,
         "uncertain": has_lost_patience,
         "trail": is_trail,
+        "robot": np.zeros(len(centers), bool),
         "weak": np.zeros(len(centers), bool),
     }
     remaining = buffer.is_alive.copy()

@@ -18,6 +18,7 @@ from splatctrl_cli.io import scene_writer
 from splatctrl_cli.io.scene_folder import open_scene
 from splatctrl_cli.scene.fitter import SceneFitter
 
+DTU = Path(__file__).parent.parent.parent / "sample_data" / "dtu"
 FAST = [
     *("--max-splats", "600", "--set", "scene.first_iterations=20", "--set", "scene.iterations_per_step=4"),
     *("--set", "scene.refine_iterations=30", "--set", "scene.checkpoint_period=0", "-q"),
@@ -27,8 +28,8 @@ FAST = [
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "small"
-    size = ["--duration", "1.2", "--width", "128", "--height", "96"]
-    assert main(["simulate", "-o", str(folder), *size, "--dtu", "-q"]) == 0
+    size = ["--duration", "1.2", "--width", "128", "--height", "96", "-q"]
+    assert main(["simulate", "-o", str(folder), *size]) == 0
     return folder
 
 
@@ -47,7 +48,7 @@ def command(recording: Path, kind: str, out: Path) -> list[str]:
     robot = ["--urdf", str(recording / "robot.urdf"), "--spheres", str(recording / "robot_spheres.yaml")]
     given = {
         "log": [str(recording / "log.mcap"), "--cameras", "cam0,cam1", *robot],
-        "dtu": ["--dtu", str(recording / "dtu"), "--holdout", "2,3,4,5,6,7"],
+        "dtu": ["--dtu", str(DTU), "--holdout", "2,3,4,5,6,7"],
     }
     return ["reconstruct", *given[kind], "-o", str(out), *FAST]
 

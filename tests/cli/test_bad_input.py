@@ -1,0 +1,146 @@
+"""``splatctrl reconstruct`` on recordings with something wrong: each said in one line, nothing mended in silence."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.records import RgbdFrame
+from tests.scene.wall import INTRINSICS, frame
+
+FAST = [
+    *("--box=-0.45,-0.35,-0.05,0.45,0.35,0.6", "--set", "scene.first_iterations=5"),
+    *("--set", "scene.iterations_per_step=2", "--set", "scene.refine_iterations=10", "--max-splats", "1500"),
+]
+
+
+def write_folder(folder: Path, frames: Sequence[RgbdFrame], *, has_clock: bool = True) -> Path:
+    """An image folder of the frames, each camera's numbered, and its description."""
+    folder.mkdir()
+    k = INTRINSICS
+    lens = f"width = {k.width}\nheight = {k.height}\nfx = {k.fx}\nfy = {k.fy}\ncx = {k.cx}\ncy = {k.cy}\n"
+    text = '[depth]\nencoding = "float32"\nscale = 1.0\n[poses]\nformat = "matrix-files"\nfile = ""\n'
+    text += "[stamps]\nrate = 5.0\n" if has_clock else ""
+    for camera in sorted({one.camera for one in frames}):
+        own = [one for one in frames if one.camera == camera]
+        for number, one in enumerate(own):
+            name = f"{folder}/{camera}-{number}"
+            cv2.imwrite(f"{name}.png", cv2.cvtColor(one.color, cv2.COLOR_RGB2BGR))
+            np.save(f"{name}.npy", one.depth)
+            np.savetxt(f"{name}.txt", one.T_world_camera)
+        text += f'[[cameras]]\nname = "{camera}"\n{lens}'
+        text += f'color = "{camera}-*.png"\ndepth = "{camera}-*.npy"\nposes = "{camera}-*.txt"\n'
+    (folder / "views.toml").write_text(text)
+    return folder / "views.toml"
+
+
+def reconstruct(description: Path, out: Path, *options: str) -> int:
+    return main(["reconstruct", str(description), "-o", str(out), *FAST, *options])
+
+
+def audit(scene: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (scene / "audit.jsonl").read_text().splitlines()]
+
+
+def test_a_frame_without_depth_is_counted_and_seeds_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = [frame() for _ in range(4)]
+    views[2].depth[:] = 0.0
+    assert reconstruct(write_folder(tmp_path / "in", views), tmp_path / "scene", "-q") == 0
+    assert "note: 1 frames without any valid depth" in capsys.readouterr().out
+    rows = audit(tmp_path / "scene")
+    assert [row["without_depth"] for row in rows] == [0, 0, 1, 0]
+    assert json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]["frames_without_depth"] == 1
+
+
+def test_depth_that_is_not_finite_is_counted_and_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odd, plain = [frame() for _ in range(2)], [frame() for _ in range(2)]
+    for view, values in ((odd[1], [np.nan, np.inf, -np.inf, -1.0]), (plain[1], [0.0] * 4)):
+        view.depth[20, 10:14] = values
+    assert reconstruct(write_folder(tmp_path / "odd", odd), tmp_path / "a", "-q") == 0
+    assert "note: 4 pixels of depth NaN, infinite or negative: taken as none" in capsys.readouterr().out
+    assert reconstruct(write_folder(tmp_path / "plain", plain), tmp_path / "b", "-q") == 0
+    assert "infinite" not in capsys.readouterr().out
+    assert audit(tmp_path / "a") == audit(tmp_path / "b")
+
+
+def test_a_camera_that_jumps_is_refused_by_distance_and_stamps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = [frame(), frame(x=0.1), frame(x=0.1)]
+    views[2].T_world_camera[0, 3] += 3.0
+    description = write_folder(tmp_path / "in", views)
+    assert reconstruct(description, tmp_path / "scene", "-q") == 4
+    err = capsys.readouterr().err
+    assert "camera cam0 jumps by 3.00 m from stamp 200000000 to 400000000 ns, 0.2 s later" in err
+    assert "--max-pose-jump 3.01" in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "scene").exists()
+    assert reconstruct(description, tmp_path / "scene", "-q", "--max-pose-jump", "3.01") == 0
+    still = write_folder(tmp_path / "still", views, has_clock=False)  # views of a still scene may lie anywhere
+    assert reconstruct(still, tmp_path / "other", "-q") == 0
+    assert reconstruct(still, tmp_path / "none", "-q", "--max-pose-jump", "0") == 2
+
+
+def two_cameras(offset: float) -> list[RgbdFrame]:
+    views = [frame(block=0.2), frame(block=0.2, x=0.05, camera="cam1")]
+    views[1].T_world_camera[2, 3] += offset
+    return views
+
+
+@pytest.mark.parametrize("has_clock", [True, False])
+def test_cameras_that_disagree_are_refused_before_anything_is_fitted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], has_clock: bool
+) -> None:
+    description = write_folder(tmp_path / "in", two_cameras(0.09), has_clock=has_clock)
+    assert reconstruct(description, tmp_path / "scene", "-q") == 4
+    err = capsys.readouterr().err
+    assert "camera cam0 and cam1: depths disagree by 90 mm" in err
+    assert "expected at most 30 mm" in err
+    assert "--cameras cam0" in err
+    assert "--allow-disagreement" in err
+    assert err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["in"]
+    assert reconstruct(description, tmp_path / "one", "-q", "--cameras", "cam0") == 0
+    capsys.readouterr()
+    assert reconstruct(description, tmp_path / "both", "--allow-disagreement") == 0
+    assert "warning: views.toml: camera cam0 and cam1: depths disagree by 90 mm" in capsys.readouterr().err
+    metrics = json.loads((tmp_path / "both" / "run.json").read_text())["metrics"]
+    assert metrics["disagreement"] == {"cam0 and cam1": 0.09}
+
+
+def test_cameras_that_differ_by_a_sensors_error_pass(tmp_path: Path) -> None:
+    assert reconstruct(write_folder(tmp_path / "in", two_cameras(0.012)), tmp_path / "scene", "-q") == 0
+
+
+def test_the_two_real_cameras_that_disagree_are_refused(
+    real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example = Path(__file__).parent.parent.parent / "docs" / "examples" / "arc_bin_2cam.toml"
+    given = ["--root", str(real_data / "arc_bin_2cam"), "-o", str(tmp_path / "scene"), "-q"]
+    assert main(["reconstruct", str(example), *given]) == 4
+    assert "disagree by 99 mm" in capsys.readouterr().err
+
+
+def test_a_budget_too_small_for_the_first_frames_is_warned_about_with_one_that_is_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    description = write_folder(tmp_path / "in", [frame()])
+    assert reconstruct(description, tmp_path / "small", "--max-splats", "100") == 0
+    err = capsys.readouterr().err
+    assert "warning: a budget of 100 splats is too small for the first frames" in err
+    enough = err.split("--max-splats ")[1].split()[0]
+    assert reconstruct(description, tmp_path / "enough", "--max-splats", enough) == 0
+    assert "too small" not in capsys.readouterr().err
+
+
+def test_colour_and_depth_of_different_sizes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    description = write_folder(tmp_path / "in", [replace(frame(), depth=np.ones((30, 40), np.float32))])
+    assert reconstruct(description, tmp_path / "scene", "-q") == 4
+    assert "cam0-0.npy: expected 80x60 as described, got 40x30" in capsys.readouterr().err
