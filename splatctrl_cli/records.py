@@ -196,6 +196,17 @@ class GaussianSet:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PointCloud:
+    """Coloured points: points (K, 3) float32 [m], world; colors (K, 3) float32 in [0, 1]."""
+
+    points: Float32
+    colors: Float32
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Box:
     """Axis-aligned box, lower (3,) and upper (3,) float64 [m], world."""
 

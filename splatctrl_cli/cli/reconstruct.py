@@ -24,7 +24,7 @@ from splatctrl_cli.errors import InputError, UsageError
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
     from splatctrl_cli.io.shot import ShotSource
-    from splatctrl_cli.records import Box, LossReport, RecordSource
+    from splatctrl_cli.records import Box, LossReport, PointCloud, RecordSource
     from splatctrl_cli.robot.model import RobotModel
 
 DAMAGED = 3
@@ -54,6 +54,12 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its collision spheres")
     parser.add_argument(
         "--box", metavar="X0,Y0,Z0,X1,Y1,Z1", help="workspace [m] (default: the robot's reach, else the valid depth)"
+    )
+    parser.add_argument(
+        "--points",
+        type=Path,
+        metavar="FILE.ply",
+        help="coloured points to start from; depth is then not looked at (colour cameras alone: no occupancy)",
     )
     parser.add_argument(
         "--max-pose-jump",
@@ -125,6 +131,7 @@ def _fit(
             config,
             partial,
             box=box,
+            cloud=_cloud(args),
             seed=args.seed,
             threads=args.threads,
             identity=run_identity,
@@ -193,6 +200,12 @@ def _box(args: argparse.Namespace) -> "Box | None":
     from splatctrl_cli.records import Box
 
     return None if args.box is None else Box.from_text(args.box)
+
+
+def _cloud(args: argparse.Namespace) -> "PointCloud | None":
+    from splatctrl_cli.io.points import read_points
+
+    return None if args.points is None else read_points(args.points)
 
 
 def _number(value: object) -> float | None:

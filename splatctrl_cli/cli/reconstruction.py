@@ -12,7 +12,7 @@ from splatctrl_cli.errors import InputError, UsageError
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
     from splatctrl_cli.io.scene_writer import Checkpoint
-    from splatctrl_cli.records import Box, RecordSource
+    from splatctrl_cli.records import Box, PointCloud, RecordSource
     from splatctrl_cli.robot.model import RobotModel
     from splatctrl_cli.scene.fitter import AuditRow, SceneFitter
     from splatctrl_cli.scene.posture import RobotPosture
@@ -33,6 +33,7 @@ def training_cameras(source: "RecordSource") -> list[str]:
 class Reconstruction:
     """One run over `source` into `folder`; with `checkpoint` it goes on where that was written.
 
+    cloud: points to start from instead of depth, which is then not looked at.
     identity: plain values that a run which goes on must have in common with this one.
     """
 
@@ -44,6 +45,7 @@ class Reconstruction:
         folder: Path,
         *,
         box: "Box | None",
+        cloud: "PointCloud | None" = None,
         seed: int,
         threads: int,
         identity: Mapping[str, Any],
@@ -57,6 +59,7 @@ class Reconstruction:
         self.robot = robot
         self.config = config
         self.box = box
+        self.cloud = cloud
         self.seed = seed
         self.threads = threads
         self.identity = identity
@@ -108,6 +111,8 @@ class Reconstruction:
                 continue
             if self.fitter is None:
                 self.fitter = self._new_fitter(self._workspace(step))
+                if self.cloud is not None:
+                    self.fitter.plant(self.cloud)
             elif not self.source.has_clock and self.fitter.num_steps == 1:
                 console.log(
                     "warning: more views than fit in one time step; the last ones are refined on, the rest seed"
@@ -267,7 +272,8 @@ class Reconstruction:
     def _steps(self) -> "Iterator[TimeStep]":
         from splatctrl_cli.scene.time_steps import time_steps
 
-        return time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)
+        steps = time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)
+        return steps if self.cloud is None else (step.without_depth() for step in steps)
 
     def _new_fitter(self, workspace: "Box") -> "SceneFitter":
         from splatctrl_cli.scene.fitter import SceneFitter
@@ -276,17 +282,19 @@ class Reconstruction:
 
     def _needs_depth(self) -> bool:
         """Whether only depth can say where the workspace is."""
-        return self.box is None and self.robot is None
+        return self.box is None and self.robot is None and self.cloud is None
 
     def _workspace(self, first: "TimeStep") -> "Box":
         from splatctrl_cli.records import Box
-        from splatctrl_cli.scene.time_steps import depth_box
+        from splatctrl_cli.scene.time_steps import cloud_box, depth_box
 
         if self.box is not None:
             return self.box
         if self.robot is not None:
             reach, base = self.robot.reach(), self.robot.base_position
             return Box(lower=base - reach, upper=base + reach)
+        if self.cloud is not None:
+            return cloud_box(self.cloud)
         return depth_box(first.frames, self.config.occupancy.max_range)
 
     def _posture(self, step: "TimeStep") -> "RobotPosture | None":

@@ -29,14 +29,14 @@ def identity(args: argparse.Namespace, config: "Config", inputs: Mapping[str, st
     from splatctrl_cli.io.output import sha256
     from splatctrl_cli.kernels import native
 
-    robot = {f"--{name}": sha256(getattr(args, name)) for name in ("urdf", "spheres") if getattr(args, name)}
+    files = [name for name in ("urdf", "spheres", "points") if getattr(args, name)]
     values = {
         "splatctrl": __version__,
         "kernels": native.__name__.rpartition(".")[2],
         **{name: metadata.version(name) for name in DECIDING_PACKAGES},
         "--seed": args.seed,
         **{f"--{name.replace('_', '-')}": getattr(args, name) for name in DECIDING_OPTIONS},
-        **robot,
+        **{f"--{name}": sha256(getattr(args, name)) for name in files},
         "sha256": dict(inputs),
         **config.as_dict(),
     }

@@ -18,17 +18,18 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
     unpack_parameters,
 )
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, PointCloud, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.labels import relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
-from splatctrl_cli.scene.objective import loss_weights, mean_loss, psnr_of
+from splatctrl_cli.scene.objective import BLACK, Color, loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture, carried
 from splatctrl_cli.scene.relocation import Misfit, clone_shape, clone_sources, detail_seeds
 from splatctrl_cli.scene.removal import REASONS, removals, seen_through
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seeding import (
+    Candidates,
     SeedDensity,
     add_mask,
     candidates,
@@ -41,6 +42,7 @@ from splatctrl_cli.scene.seeding import (
 from splatctrl_cli.scene.window import View, Window, halved, make_view
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
+NOT_COVERED = 0.05  # accumulated opacity below which the background shows
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
 
@@ -103,7 +105,7 @@ class SceneFitter:
         self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
         self.posture: RobotPosture | None = None
         self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) that show what it carries
-        self.background: tuple[float, float, float] | None = None  # chosen by the first time step
+        self.background: Color | None = None  # chosen by the first time step
         self.refined = Refined(
             num_blocks=0, filled=Filled(added=0, relocated=0, unmet=0), removed=dict.fromkeys(REASONS, 0)
         )
@@ -118,14 +120,13 @@ class SceneFitter:
         with ThreadPoolExecutor(self.num_threads) as pool:
             views = list(pool.map(self.view, frames))
         if self.background is None:
-            self.background = self._background(views)
+            self.background = self._behind(views)
         self.occupancy.take_in(frames)
         self._carry(robot)
         is_trail = relabel(self.buffer, self.occupancy, robot)
         removed = self._remove(is_trail, self._floating(views))
-        is_first = self.density is None
         filled = self._seed(views)
-        is_first = is_first and self.density is not None
+        is_first = self.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         num_coarse = round(self.config.coarse_share * num_iterations) if is_first else 0
@@ -136,6 +137,14 @@ class SceneFitter:
         relabel(self.buffer, self.occupancy, robot)
         self.num_steps += 1
         return self._audit(views, filled, removed)
+
+    def plant(self, cloud: PointCloud) -> Filled:
+        """Start from coloured points instead of depth: seeds as dense as uses `fill` of the budget."""
+        source = Candidates(points=cloud.points, colors=cloud.colors, pixels=np.zeros(len(cloud), np.float32))
+        count = max(int(self.config.fill * self.config.max_splats), 1)
+        self.density = density_for([source], count, self.config)
+        seeds = seeds_at([source], self.buffer.centers[self.buffer.is_alive], self.density, self.config)
+        return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def refine(self, num_iterations: int, progress: Callable[[int], None] = lambda _: None) -> AuditRow:
         """Optimise over the window with learning rates that fall to `final_rate`; for scenes that do not move.
@@ -192,10 +201,15 @@ class SceneFitter:
                 self.window.keyframes = [self.view(view.frame) for view in self.window.keyframes]
                 self.window.newest = [self.view(view.frame) for view in self.window.newest]
 
-    def _background(self, views: Sequence[View]) -> tuple[float, float, float]:
+    def _behind(self, views: Sequence[View]) -> Color:
+        """The background: what has no depth, or where no view has any, what no planted splat covers."""
         if self.config.background == "black":
-            return (0.0, 0.0, 0.0)
-        return background_color([view.frame for view in views], [view.target.counted > 0 for view in views])
+            return BLACK
+        counted = [view.target.counted > 0 for view in views]
+        if not any(view.mappable.any() for view in views):
+            shown = [self._rendering(view).opacity for view in views]
+            counted = [mask & (opacity < NOT_COVERED) for mask, opacity in zip(counted, shown, strict=True)]
+        return background_color([view.frame for view in views], counted)
 
     def _carry(self, robot: RobotPosture | None) -> None:
         """Move the robot's splats with the link of the sphere they are nearest to."""
@@ -278,6 +292,8 @@ class SceneFitter:
         if self.config.when_idle == "clone":
             return self._clone(int((~is_alive).sum()) - reserve, rng)
         misfits, shown = self._misfits(views)
+        if not any(misfit.error.any() for misfit in misfits):
+            return self._clone(int((~is_alive).sum()) - reserve, rng)  # no depth says where detail would be
         weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
         is_weak = np.zeros(len(is_alive), bool)
         is_weak[weakest[: int(self.config.weak_share * is_alive.sum())]] = True
@@ -350,7 +366,7 @@ class SceneFitter:
         return self._loss.evaluate(planes, view.target, self._weights(), np.empty_like(planes))
 
     def _weights(self) -> LossWeights:
-        return loss_weights(self.config, self.background or (0.0, 0.0, 0.0))
+        return loss_weights(self.config, self.background or BLACK)
 
     def _settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
         """Learning rates times `rate`, those of centre and radius times `geometry`."""

@@ -7,9 +7,10 @@ from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.kernels.raster import LossTerms, LossWeights
 
 Color = tuple[float, float, float]
+BLACK: Color = (0.0, 0.0, 0.0)
 
 
-def loss_weights(config: SceneConfig, background: Color = (0.0, 0.0, 0.0)) -> LossWeights:
+def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
     """The weights that the image loss takes, and the colour behind the splats."""
     return LossWeights(
         dssim=config.lambda_dssim,

@@ -27,7 +27,7 @@ def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> t
     mass = np.zeros_like(opacity)
     for i in range(1, int(count.max(initial=1)) + 1):
         mass += np.where(i <= count, (1.0 - (1.0 - a) ** i) / i, 0.0)
-    return a, radius * np.sqrt(opacity / mass)
+    return a, radius * np.sqrt(np.divide(opacity, mass, out=np.ones_like(mass), where=mass > 0))
 
 
 def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator) -> NDArray[np.intp]:

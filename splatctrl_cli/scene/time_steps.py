@@ -1,12 +1,12 @@
 """Groups a stream of records into time steps, and finds the workspace."""
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Box, Float64, JointState, Record, RgbdFrame
+from splatctrl_cli.records import Box, Float64, JointState, PointCloud, Record, RgbdFrame
 from splatctrl_cli.scene.seeding import world_points
 
 LARGEST_STEP = 128  # frames of a scene without a clock that are taken in together; 640x480: 9 MiB each
@@ -22,6 +22,11 @@ class TimeStep:
 
     frames: tuple[RgbdFrame, ...]
     position: Float64 | None
+
+    def without_depth(self) -> "TimeStep":
+        """The same step as colour cameras would have seen it."""
+        frames = tuple(replace(frame, depth=np.zeros_like(frame.depth)) for frame in self.frames)
+        return replace(self, frames=frames)
 
     @property
     def stamp_ns(self) -> int:
@@ -70,6 +75,13 @@ def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeSt
         elapsed = (frames[-1].stamp_ns - joints.stamp_ns) * 1e-9
         position = joints.position + elapsed * np.nan_to_num(joints.velocity)
     return TimeStep(frames=tuple(frames), position=position)
+
+
+def cloud_box(cloud: PointCloud) -> Box:
+    """The box of a point cloud, with a margin of 5 % and 5 cm on each side."""
+    lower, upper = cloud.points.min(axis=0).astype(np.float64), cloud.points.max(axis=0).astype(np.float64)
+    margin = 0.05 * (upper - lower) + 0.05
+    return Box(lower=lower - margin, upper=upper + margin)
 
 
 def depth_box(frames: Sequence[RgbdFrame], max_range: float) -> Box:

@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Label, SplatSet
+from splatctrl_cli.records import Label, PointCloud, SplatSet
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, carried
@@ -223,3 +223,20 @@ def test_a_splat_that_drifts_into_the_air_is_gone_after_the_next_step() -> None:
     row = target.step([frame(1)])
     assert row.removed["seen_through"] >= 10
     assert target.splats().centers[:, 2].max() < 0.019
+
+
+def test_colour_cameras_alone_fit_planted_points() -> None:
+    seen = [frame(k, x=x, camera="camera") for k, x in enumerate((-0.1, 0.0, 0.1))]
+    y, x = np.mgrid[-0.3:0.3:40j, -0.4:0.4:50j].reshape(2, -1)
+    points = np.stack([x, y, np.zeros_like(x)], 1).astype(np.float32)
+    target = fitter()
+    planted = target.plant(PointCloud(points=points, colors=np.full((len(points), 3), 0.5, np.float32)))
+    assert planted.added == len(target.splats()) > 100
+    row = target.step([replace(view, depth=np.zeros_like(view.depth)) for view in seen])
+    assert row.added == 0
+    assert row.psnr is not None and row.psnr > 15.0
+    assert np.abs(target.splats().centers[:, 2]).max() < 0.05
+    before = row.alive
+    row = target.refine(40)
+    assert row.relocated > 0, "without depth, what is idle becomes clones"
+    assert row.alive > before
