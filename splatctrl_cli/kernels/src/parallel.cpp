@@ -9,7 +9,9 @@
 namespace splatctrl {
 namespace {
 
-// Workers sleep between jobs. One job at a time; a second caller waits its turn.
+// Workers sleep between jobs. One job at a time; a second caller waits its turn. A caller waits for the workers that
+// have begun, not for those that have not woken up by the time all chunks are handed out: on a busy machine, and for
+// short jobs, that is most of the time.
 class Pool {
  public:
   void run(int num_chunks, int num_threads, const std::function<void(int)>& fn) {
@@ -21,12 +23,13 @@ class Pool {
       fn_ = &fn;
       num_chunks_ = num_chunks;
       num_wanted_ = num_threads - 1;
-      num_running_ = num_threads - 1;
+      is_open_ = true;
       ++generation_;
     }
     wake_.notify_all();
     work(fn, num_chunks);
     std::unique_lock<std::mutex> lock(mutex_);
+    is_open_ = false;
     done_.wait(lock, [this] { return num_running_ == 0; });
   }
 
@@ -49,6 +52,8 @@ class Pool {
       std::unique_lock<std::mutex> lock(mutex_);
       wake_.wait(lock, [&] { return generation_ != seen && index < num_wanted_; });
       seen = generation_;
+      if (!is_open_) continue;
+      ++num_running_;
       const auto* fn = fn_;
       const int num_chunks = num_chunks_;
       lock.unlock();
@@ -64,6 +69,7 @@ class Pool {
   std::atomic<int> next_{0};
   const std::function<void(int)>* fn_ = nullptr;
   int num_chunks_ = 0, num_wanted_ = 0, num_running_ = 0;
+  bool is_open_ = false;
   long generation_ = 0;
 };
 
