@@ -70,7 +70,7 @@ def _refuse_what_needs_time(args: argparse.Namespace, source: "RecordSource") ->
         raise UsageError(
             f"--method 3dgs: {source.name} has a clock, and this method's scene stands still", remedy=ROUTES
         )
-    for name in ("urdf", "resume"):
+    for name in ("urdf", "spheres", "points", "resume"):
         if getattr(args, name):
             raise UsageError(f"--{name}: does not apply to --method 3dgs", remedy="leave out one of them")
 

@@ -68,6 +68,7 @@ def test_what_needs_distances_is_refused_in_one_line(
         ([str(SAMPLES / "tabletop" / "log.mcap")], 2, "has a clock"),
         ([*DTU, "--urdf", str(SAMPLES / "tabletop" / "robot.urdf")], 2, "--urdf: does not apply"),
         ([*DTU, "--resume"], 2, "--resume: does not apply"),
+        ([*DTU, "--points", "cloud.ply"], 2, "--points: does not apply"),
         ([*DTU, "--box=50,50,50,51,51,51"], 4, "no pixel of any view"),
         ([*DTU, "--require", "relocated>=1"], 2, "unknown metric"),
         ([*DTU, "--set", "gaussians.max_degree=4"], 2, "gaussians.max_degree"),
