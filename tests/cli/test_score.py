@@ -191,7 +191,8 @@ def test_the_table_shows_each_view_and_the_mean(scored: Path, capsys: pytest.Cap
     assert lines[0].split("  ")[0] == "view"
     assert [line.split()[0] for line in lines[2:5]] == ["cam3-0001", "cam3-0002", "cam3-0003"]
     assert lines[6].startswith("mean of 3")
-    assert "3 views scored, 1 before the first snapshot" in lines[-1]
+    assert "3 views scored, 1 before the first snapshot" in lines[-2]
+    assert lines[-1].startswith("in front: ")
 
 
 def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) -> None:
