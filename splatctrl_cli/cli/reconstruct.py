@@ -189,11 +189,11 @@ def _told_how_to_go_on(checkpoint: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        if checkpoint.is_file():
-            raise KeyboardInterrupt(
-                f"interrupted: {checkpoint.parent.parent} is kept; go on with the same command and --resume"
-            ) from None
-        raise KeyboardInterrupt("interrupted before the first checkpoint: nothing to go on from") from None
+        if not checkpoint.is_file():
+            raise
+        raise KeyboardInterrupt(
+            f"interrupted: {checkpoint.parent.parent} is kept; go on with the same command and --resume"
+        ) from None
 
 
 def _box(args: argparse.Namespace) -> "Box | None":
