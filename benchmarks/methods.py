@@ -58,7 +58,7 @@ def row(recording: list[str], method: str, options: Options) -> list[str]:
         scene = Path(folder) / "scene"
         _, peak = process([SPLATCTRL, "reconstruct", *recording, "-o", str(scene), "-q", *_settings(method, options)])
         run = json.loads((scene / "run.json").read_text(encoding="utf-8"))
-        score = [SPLATCTRL, "score", str(scene), *_reference(recording), "-q", "--json"]
+        score = [SPLATCTRL, "score", str(scene), *reference(recording), "-q", "--json"]
         scores = json.loads(subprocess.run(score, check=True, capture_output=True, cwd=ROOT).stdout)["metrics"]
     fitted = run["metrics"]
     return [
@@ -68,19 +68,20 @@ def row(recording: list[str], method: str, options: Options) -> list[str]:
         str(fitted["iterations"]),
         f"{run['seconds']['fit']:.0f}",
         f"{peak:.0f}",
-        _figure(fitted["psnr"], 2),
-        _pair(scores, "psnr", 2),
-        _pair(scores, "ssim", 3),
-        _pair(scores, "depth_median", 1, 1e3),
+        figure(fitted["psnr"], 2),
+        pair(scores, "psnr", 2),
+        pair(scores, "ssim", 3),
+        pair(scores, "depth_median", 1, 1e3),
     ]
 
 
-def _pair(scores: dict[str, float | None], name: str, digits: int, factor: float = 1.0) -> str:
+def pair(scores: dict[str, float | None], name: str, digits: int, factor: float = 1.0) -> str:
     """Over the pixels that a training view saw, and over all."""
-    return " / ".join(_figure(scores[f"{name}_{region}"], digits, factor) for region in ("seen", "all"))
+    return " / ".join(figure(scores[f"{name}_{region}"], digits, factor) for region in ("seen", "all"))
 
 
-def _figure(value: float | None, digits: int, factor: float = 1.0) -> str:
+def figure(value: float | None, digits: int, factor: float = 1.0) -> str:
+    """A number as the table shows it."""
     return "-" if value is None else f"{factor * value:.{digits}f}"
 
 
@@ -104,7 +105,7 @@ def _settings(method: str, options: Options) -> list[str]:
     ]
 
 
-def _reference(recording: list[str]) -> list[str]:
+def reference(recording: list[str]) -> list[str]:
     """The same recording as `score` wants it named."""
     return recording if recording[0].startswith("-") else ["--reference", *recording]
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -278,7 +279,8 @@ class Reconstruction:
     def _new_fitter(self, workspace: "Box") -> "SceneFitter":
         from splatctrl_cli.scene.fitter import SceneFitter
 
-        return SceneFitter(self.config.scene, self.config.occupancy, workspace, seed=self.seed, threads=self.threads)
+        scene = self.config.scene if self.source.has_clock else replace(self.config.scene, fill=1.0)
+        return SceneFitter(scene, self.config.occupancy, workspace, seed=self.seed, threads=self.threads)
 
     def _needs_depth(self) -> bool:
         """Whether only depth can say where the workspace is."""

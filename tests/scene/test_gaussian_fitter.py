@@ -55,7 +55,7 @@ def test_a_floor_is_reconstructed_in_colour_and_depth_from_a_view_not_trained_on
 def test_growing_shows_detail_that_the_seeds_cannot() -> None:
     psnr = {}
     for until in (0.0, 1.0):
-        rules = replace(FAST, iterations=200, densify_until=until, reset_every=0.0, lr_color=0.05)
+        rules = replace(FAST, iterations=300, densify_until=until, reset_every=0.0, lr_color=0.05)
         fitter = GaussianFitter(replace(CONFIG, gaussians=rules), WORKSPACE, checked(), threads=1)
         start, psnr[until] = len(fitter.arrays), fitter.fit().psnr or 0.0
         assert (len(fitter.arrays) > 2 * start) == (until > 0)
