@@ -165,7 +165,7 @@ class SceneFitter:
         rate = self.config.final_rate ** (block / (NUM_BLOCKS - 1))
         count = num_iterations * (block + 1) // NUM_BLOCKS - num_iterations * block // NUM_BLOCKS
         self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
-        # A view that sees through a splat does not remove it here: it costs 0.6 dB where poses are off by millimetres.
+        # What one view sees through stays here: its removal costs 0.6 dB where poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
         if block < NUM_BLOCKS - 2:
