@@ -48,7 +48,8 @@ NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after 
 
 @dataclass(frozen=True, kw_only=True)
 class AuditRow:
-    """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames.
+    """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames, each as the last
+    iteration that looked at it found it.
 
     dead: slots that wait to be reused. unmet: seeds that found no free slot. without_depth: frames without
     any valid depth, which seed nothing. loss and psnr are
@@ -131,12 +132,12 @@ class SceneFitter:
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         num_coarse = round(self.config.coarse_share * num_iterations) if is_first else 0
         self._optimise(num_coarse, rng, self._settings(), is_coarse=True)
-        self._optimise(num_iterations - num_coarse, rng, self._settings())
+        terms = self._optimise(num_iterations - num_coarse, rng, self._settings())
         self._prune(robot, views, removed)
-        filled += self._fill_gaps(views)
+        filled += self._fill_gaps(views, half=self.num_steps % 2 if self.num_steps else None)
         relabel(self.buffer, self.occupancy, robot)
         self.num_steps += 1
-        return self._audit(views, filled, removed)
+        return self._audit(views, filled, removed, terms)
 
     def plant(self, cloud: PointCloud) -> Filled:
         """Start from coloured points instead of depth: seeds as dense as uses `fill` of the budget."""
@@ -157,7 +158,7 @@ class SceneFitter:
             self._refine_block(block, num_iterations, views)
             progress(num_iterations * (block + 1) // NUM_BLOCKS)
         filled = self.refined.filled + self._fill_gaps(views)
-        return self._audit(views, filled, self.refined.removed)
+        return self._audit(views, filled, self.refined.removed, {})
 
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
         rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
@@ -271,8 +272,8 @@ class SceneFitter:
         reserve = int(self.config.gap_reserve * self.config.max_splats)
         return self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve)
 
-    def _fill_gaps(self, views: Sequence[View]) -> Filled:
-        """Put splats where a measured surface is far from every sphere."""
+    def _fill_gaps(self, views: Sequence[View], half: int | None = None) -> Filled:
+        """Put splats where a measured surface is far from every sphere; half of it a time step, in turn."""
         occupied = self.occupancy.occupied_centers()
         seeds = gap_seeds(
             [(view.frame, view.mappable) for view in views],
@@ -280,6 +281,7 @@ class SceneFitter:
             self.occupancy.config.voxel,
             self.splats(),
             self.config,
+            half=half,
             num_threads=self.num_threads,
         )
         seeds = seeds.select(self._is_grounded(seeds.centers, views))
@@ -338,7 +340,9 @@ class SceneFitter:
 
     def _optimise(
         self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings, *, is_coarse: bool = False
-    ) -> None:
+    ) -> dict[int, LossTerms]:
+        """Descend; returns the loss of each view, by identity, at the last iteration that looked at it."""
+        terms = {}
         views = self.window.schedule(num_iterations, rng)
         if is_coarse:
             small = {id(view): halved(view) for view in views}
@@ -346,13 +350,14 @@ class SceneFitter:
         for view in views:
             planes = self._planes(view)
             plane_gradients = np.empty_like(planes)
-            self._loss.evaluate(planes, view.target, self._weights(), plane_gradients)
+            terms[id(view)] = self._loss.evaluate(planes, view.target, self._weights(), plane_gradients)
             self._raster.backward(planes, plane_gradients, self._gradients)
             step_seed = (self.seed << 32) + self.num_iterations
             optimiser_step(
                 self._raster, self._gradients, self.buffer.parameters, self.buffer.moments, settings, step_seed
             )
             self.num_iterations += 1
+        return terms
 
     def _planes(self, view: View) -> Float32:
         centers, radii, colors, opacities = unpack_parameters(self.buffer.parameters, self.num_threads)
@@ -384,10 +389,12 @@ class SceneFitter:
             max_radius=c.max_radius,
         )
 
-    def _audit(self, views: Sequence[View], filled: Filled, removed: dict[str, int]) -> AuditRow:
+    def _audit(
+        self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]
+    ) -> AuditRow:
         c, buffer = self.config, self.buffer
         counted = [view for view in views if view.target.counted.any()]
-        terms = [self._evaluate(view, self._planes(view)) for view in counted]
+        terms = [known.get(id(view)) or self._evaluate(view, self._planes(view)) for view in counted]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
         loss, psnr = mean_loss(terms, c), psnr_of(terms)
         return AuditRow(

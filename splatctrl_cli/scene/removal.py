@@ -1,7 +1,7 @@
 """Which splats must go, and why (III-C)."""
 
+import cv2
 import numpy as np
-from scipy.ndimage import minimum_filter
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import invert_transform, project, transform_points
@@ -21,7 +21,7 @@ def nearest_depth(frame: RgbdFrame) -> Float32:
         return np.full(frame.depth.shape, np.inf, np.float32)
     half = max(1, round(0.01 * frame.intrinsics.fx / float(np.median(valid))))
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
-    return np.asarray(minimum_filter(depth, size=2 * half + 1, mode="nearest"), np.float32)
+    return np.asarray(cv2.erode(depth, np.ones((2 * half + 1, 2 * half + 1), np.uint8)), np.float32)
 
 
 def seen_through(centers: Float32, frame: RgbdFrame, tolerance: float, nearest: Float32 | None = None) -> Bool:

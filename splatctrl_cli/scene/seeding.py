@@ -138,22 +138,27 @@ def gap_seeds(
     splats: SplatSet,
     config: SceneConfig,
     *,
+    half: int | None = None,
     num_threads: int = 1,
 ) -> Seeds:
     """Seeds where a measured surface lies further than `max_gap` [m] from every splat's sphere.
 
     Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Looked at are every
-    third pixel and row of the views (a frame and its mappable pixels (H, W)), and the centres (K, 3) of occupied
-    voxels, which remember surfaces that nothing shows now; a centre may be half a voxel off its surface.
+    third pixel and row of the views (a frame and its mappable pixels (H, W)) or fewer, half of `max_gap` apart, and
+    the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows now; a centre may be half a
+    voxel off its surface. With `half` 0 or 1 only every second of the rows and voxels: the other half waits.
     """
     sources, spheres = [], _Spheres(splats, num_threads)
     for frame, mappable in views:
         mask = mappable.copy()
-        mask[np.arange(len(mask)) % 3 != 0] = False
-        mask[:, np.arange(mask.shape[1]) % 3 != 0] = False
+        stride = _gap_stride(frame, config.max_gap)
+        rows = np.arange(len(mask))
+        mask[(rows % stride != 0) | ((rows // stride) % 2 == (2 if half is None else 1 - half))] = False
+        mask[:, np.arange(mask.shape[1]) % stride != 0] = False
         mask[mask] = spheres.are_further(world_points_at(frame, mask), config.max_gap)
         if mask.any():
             sources.append(candidates(frame, mask))
+    occupied = occupied if half is None else occupied[half::2]
     forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
         sources.append(_of_voxels(forgotten, splats))
@@ -163,6 +168,13 @@ def gap_seeds(
     level = cube_levels(all_points, colors, config.max_radius / config.radius_per_edge, 1)[0]
     everything, no_splats = np.ones(len(level.points), bool), np.zeros((0, 3), np.float32)
     return _seeds_of(level, everything, pixel, no_splats, config)
+
+
+def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
+    """Pixels between those looked at: at least 3, and about half of `max_gap` [m] at the frame's median depth."""
+    depth = frame.depth[::8, ::8]
+    typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
 
 
 class _Spheres:
