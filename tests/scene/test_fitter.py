@@ -133,8 +133,8 @@ def test_refining_a_scene_that_stands_still_improves_it_and_is_audited() -> None
     views = [frame(k, block=0.2, x=x, camera="camera") for k, x in enumerate((-0.1, 0.0, 0.1))]
     before = target.step(views)
     done: list[int] = []
-    row = target.refine(55, done.append)
-    assert done == [5, 11, 16, 22, 27, 33, 38, 44, 49, 55]
+    row = target.refine(155, done.append)
+    assert done == [15, 31, 46, 62, 77, 93, 108, 124, 139, 155]
     assert row.psnr > before.psnr
     assert row.alive == len(target.splats())
     assert row.alive == before.alive + row.added + row.relocated - sum(row.removed.values())
