@@ -127,6 +127,7 @@ class SceneFitter:
         is_trail = relabel(self.buffer, self.occupancy, robot)
         removed = self._remove(is_trail, self._floating(views))
         filled = self._seed(views)
+        relabel(self.buffer, self.occupancy, robot)  # a seed on the robot that drifts off it is known by this
         is_first = self.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
@@ -230,14 +231,17 @@ class SceneFitter:
         return is_floating & self.buffer.is_alive
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], removed: dict[str, int]) -> None:
-        """Remove what the optimiser moved off the robot, into the air or out; adds to the counts in `removed`."""
+        """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
         drifted = relabel(self.buffer, self.occupancy, robot)
         self.buffer.kill(drifted)
         floating = self._floating(views)
         self.buffer.kill(floating)
         outside = self.buffer.is_alive & ~self.workspace.contains(self.buffer.centers)
         self.buffer.kill(outside)
-        for reason, mask in (("robot", drifted), ("seen_through", floating), ("workspace", outside)):
+        faint = self.buffer.is_alive & (self.buffer.opacities < self.config.min_opacity)
+        self.buffer.kill(faint)
+        reasons = {"robot": drifted, "seen_through": floating, "workspace": outside, "opacity": faint}
+        for reason, mask in reasons.items():
             removed[reason] += int(mask.sum())
 
     def _remove(self, is_trail: Bool, is_floating: Bool, *, counts_time: bool = True) -> dict[str, int]:
