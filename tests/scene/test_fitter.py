@@ -240,3 +240,19 @@ def test_colour_cameras_alone_fit_planted_points() -> None:
     row = target.refine(40)
     assert row.relocated > 0, "without depth, what is idle becomes clones"
     assert row.alive > before
+
+
+def test_what_the_optimiser_moves_off_the_robot_in_the_first_time_step_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    target = fitter()
+
+    def sink(*_: object, **__: object) -> dict[int, object]:
+        """Move the seeds on the robot down into the block, where no camera sees through them."""
+        centers = target.buffer.centers
+        centers[(centers[:, 2] > 0.15) & (np.hypot(centers[:, 0], centers[:, 1]) < 0.09), 2] = 0.03
+        return {}
+
+    monkeypatch.setattr(target, "_optimise", sink)
+    row = target.step([frame(0, block=0.2)], posture(0.0))
+    assert row.removed["robot"] > 0
+    centers = target.splats().centers
+    assert not ((np.hypot(centers[:, 0], centers[:, 1]) < 0.09) & (np.abs(centers[:, 2] - 0.03) < 1e-6)).any()
