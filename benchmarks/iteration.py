@@ -13,7 +13,6 @@ from benchmarks.scenes import FitProblem, sample_problem, wall_problem
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.kernels.raster import (
     ImageLoss,
-    LossWeights,
     Moments,
     OptimiserSettings,
     Rasteriser,
@@ -21,11 +20,13 @@ from splatctrl_cli.kernels.raster import (
     unpack_parameters,
 )
 from splatctrl_cli.records import Float32
+from splatctrl_cli.scene.objective import loss_weights
 
 STAGES = ("unpack", "bin", "forward", "loss", "backward", "adam")
 # Between the planes of kernels and reference, or they did not do the same work. An alpha within rounding of 1 / 255
 # may fall on either side of the cut, so that a few values may differ by as much.
 DIFFERENCE, LARGEST_DIFFERENCE, LARGEST_SHARE = 1e-4, 1.2 / 255, 1e-4
+WEIGHTS = loss_weights(SceneConfig())
 ROUNDS, TORCH_ROUNDS = 40, 5
 
 
@@ -56,25 +57,13 @@ class KernelIteration:
         marks.append(time.perf_counter())
         self.raster.forward(self.planes)
         marks.append(time.perf_counter())
-        self.loss.evaluate(self.planes, self.problem.target, weights(), self.plane_gradients)
+        self.loss.evaluate(self.planes, self.problem.target, WEIGHTS, self.plane_gradients)
         marks.append(time.perf_counter())
         self.raster.backward(self.planes, self.plane_gradients, self.gradients)
         marks.append(time.perf_counter())
         optimiser_step(self.raster, self.gradients, self.parameters, self.moments, settings(len(radii)), 1)
         marks.append(time.perf_counter())
         return dict(zip(STAGES, np.diff(marks).tolist(), strict=True))
-
-
-def weights() -> LossWeights:
-    """Those of the configuration."""
-    c = SceneConfig()
-    return LossWeights(
-        dssim=c.lambda_dssim,
-        color=c.lambda_color,
-        depth=c.lambda_depth,
-        opacity=c.lambda_opacity,
-        normalised=c.depth_loss == "normalised",
-    )
 
 
 def settings(num_splats: int) -> OptimiserSettings:
@@ -149,7 +138,7 @@ def _measured(
 ) -> tuple[Times, TorchTimes]:
     """Every case in turn, round by round, with the reference in between."""
     torch.set_num_threads(1)  # on two, its barriers take seconds whenever another process has one of the cores
-    references = {key: TorchIteration(p, weights(), settings(len(p.parameters))) for key, p in problems.items()}
+    references = {key: TorchIteration(p, WEIGHTS, settings(len(p.parameters))) for key, p in problems.items()}
     times: Times = defaultdict(list)
     torch_times: TorchTimes = defaultdict(list)
     for case in cases.values():
