@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from splatctrl_cli.io.scene_writer import Checkpoint
     from splatctrl_cli.records import Box, PointCloud, RecordSource
     from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.scene.fitter import AuditRow, SceneFitter
+    from splatctrl_cli.scene.audit import AuditRow
+    from splatctrl_cli.scene.fitter import SceneFitter
     from splatctrl_cli.scene.posture import RobotPosture
     from splatctrl_cli.scene.time_steps import TimeStep
 
@@ -259,8 +260,8 @@ class Reconstruction:
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
 
     def _restore(self, checkpoint: "Checkpoint") -> None:
+        from splatctrl_cli.scene.audit import AuditRow
         from splatctrl_cli.scene.checkpoint import restore_fitter, workspace_of
-        from splatctrl_cli.scene.fitter import AuditRow
 
         self.rows = [AuditRow(**{**row, "cameras": tuple(row["cameras"])}) for row in self.writer.audited()]
         self.num_read = checkpoint.progress["num_read"]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from splatctrl_cli.kernels.raster import (
     unpack_parameters,
 )
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, PointCloud, RgbdFrame, SplatSet
+from splatctrl_cli.scene.audit import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.labels import relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
@@ -44,40 +44,6 @@ from splatctrl_cli.scene.window import View, Window, halved, make_view
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NOT_COVERED = 0.05  # accumulated opacity below which the background shows
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
-
-
-@dataclass(frozen=True, kw_only=True)
-class AuditRow:
-    """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames, each as the last
-    iteration that looked at it found it.
-
-    dead: slots that wait to be reused. unmet: seeds that found no free slot. without_depth: frames without
-    any valid depth, which seed nothing. loss and psnr are
-    None where no view shows anything of the workspace.
-    """
-
-    stamp_ns: int
-    cameras: tuple[str, ...]
-    alive: int
-    dead: int
-    added: int
-    relocated: int
-    unmet: int
-    removed: dict[str, int]
-    robot: int
-    human: int
-    without_depth: int
-    loss: float | None
-    psnr: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refined:
-    """How far refining has come: blocks done, where their seeds went, and what they removed by reason."""
-
-    num_blocks: int
-    filled: Filled
-    removed: dict[str, int]
 
 
 class SceneFitter:

@@ -1,0 +1,38 @@
+"""What a time step, and the refining of a scene that stands still, report of themselves."""
+
+from dataclasses import dataclass
+
+from splatctrl_cli.scene.buffer import Filled
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditRow:
+    """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames, each as the last
+    iteration that looked at it found it.
+
+    dead: slots that wait to be reused. unmet: seeds that found no free slot. without_depth: frames without any valid
+    depth, which seed nothing. loss and psnr are None where no view shows anything of the workspace.
+    """
+
+    stamp_ns: int
+    cameras: tuple[str, ...]
+    alive: int
+    dead: int
+    added: int
+    relocated: int
+    unmet: int
+    removed: dict[str, int]
+    robot: int
+    human: int
+    without_depth: int
+    loss: float | None
+    psnr: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """How far refining has come: blocks done, where their seeds went, and what they removed by reason."""
+
+    num_blocks: int
+    filled: Filled
+    removed: dict[str, int]
