@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.records import Bool, DistanceGrid, Float64
 
 BANDS: tuple[tuple[float, float], ...] = ((0.0, 0.02), (0.02, 0.05), (0.05, 0.10), (0.10, 0.20))  # [m], true distance
 ALLOWANCE = 0.01  # [m] beyond the median radius that the exact field may over-estimate
@@ -49,7 +49,10 @@ class OverEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class FieldAccuracy:
-    """Accuracy of several fields at the same points: bands by field name, over all points and over the seen ones."""
+    """Accuracy of several fields at the same points: bands by field name, over all points and over the seen ones.
+
+    seen is empty, and the over-estimate is over all points, where nobody asked which ones were seen.
+    """
 
     everywhere: Mapping[str, tuple[BandAccuracy, ...]]
     seen: Mapping[str, tuple[BandAccuracy, ...]]
@@ -75,33 +78,66 @@ def band_name(lower: float, upper: float) -> str:
 
 
 def field_accuracy(
-    distances: Mapping[str, NDArray[np.floating]], truth: Float64, seen: Bool, *, median_radius: float
+    distances: Mapping[str, NDArray[np.floating]], truth: Float64, seen: Bool | None, *, median_radius: float
 ) -> FieldAccuracy:
     """Compare fields with the truth at points outside the objects.
 
     distances: name -> (Q,) [m], `hard` among them; truth (Q,) [m], >= 0 counts; seen (Q,) True where a training
-    camera saw the nearest true surface point. The over-estimate is that of `hard` at seen points up to 20 cm, against
-    1 cm + `median_radius` [m]. Raises InputError for arrays of different lengths, or without `hard`.
+    camera saw the nearest true surface point, None where nobody looked. The over-estimate is that of `hard` at seen
+    points up to 20 cm, against 1 cm + `median_radius` [m]. Raises InputError for arrays of different lengths, or
+    without `hard`.
     """
     if "hard" not in distances:
         raise InputError(f"distances: expected one named hard, got {', '.join(distances) or 'none'}")
-    for name, values in {**distances, "seen": seen}.items():
+    for name, values in {**distances, **({} if seen is None else {"seen": seen})}.items():
         if values.shape != truth.shape:
             raise InputError(f"{name}: expected {truth.shape} values, as the truth has, got {values.shape}")
     errors = {name: values.astype(np.float64) - truth for name, values in distances.items()}
     is_near = (truth >= BANDS[0][0]) & (truth < BANDS[-1][1])
+    everyone = np.ones(truth.shape, dtype=np.bool_)
+    counted = everyone if seen is None else seen
     return FieldAccuracy(
-        everywhere={name: _bands(error, truth, np.ones_like(seen)) for name, error in errors.items()},
-        seen={name: _bands(error, truth, seen) for name, error in errors.items()},
-        over_estimate=_over_estimate(errors["hard"][is_near & seen], ALLOWANCE + median_radius),
+        everywhere={name: _bands(error, truth, everyone) for name, error in errors.items()},
+        seen={} if seen is None else {name: _bands(error, truth, seen) for name, error in errors.items()},
+        over_estimate=_over_estimate(errors["hard"][is_near & counted], ALLOWANCE + median_radius),
     )
 
 
+def grid_distances(grid: DistanceGrid) -> dict[str, NDArray[np.floating]]:
+    """The distances (X, Y, Z) [m] that a grid holds, by field name: sdf, hard, se, gpdf.
+
+    hard is its channel, or else ``bound`` with the margin of the header put back: the same to a micrometre. Raises
+    InputError where the grid has neither.
+    """
+    names = [name for name in ("sdf", "hard", "se", "gpdf") if name in grid.channels]
+    distances: dict[str, NDArray[np.floating]] = {name: grid.channels[name].astype(np.float32) for name in names}
+    if "hard" not in distances:
+        margin = grid.header.get("bound_margin")
+        if "bound" not in grid.channels or not isinstance(margin, int | float):
+            raise InputError(
+                f"distance grid: expected a channel hard or bound, got {', '.join(grid.channels)}",
+                remedy="bake with the channel bound, which is there by default",
+            )
+        distances["hard"] = grid.channels["bound"].astype(np.float32) + np.float32(margin)
+    return distances
+
+
+def median_radius(grid: DistanceGrid) -> float:
+    """The median radius [m] of the splats a grid was made of, by its header. Raises InputError where it has none."""
+    health = grid.header.get("health")
+    if not isinstance(health, dict) or not isinstance(health.get("radius"), int | float):
+        raise InputError("distance grid: expected health.radius in its header, got none", remedy="bake it again")
+    return float(health["radius"])
+
+
 def _bands(error: Float64, truth: Float64, chosen: Bool) -> tuple[BandAccuracy, ...]:
-    return tuple(_band(error[chosen & (truth >= lower) & (truth < upper)], lower, upper) for lower, upper in BANDS)
+    return tuple(
+        band_accuracy(error[chosen & (truth >= lower) & (truth < upper)], lower, upper) for lower, upper in BANDS
+    )
 
 
-def _band(error: Float64, lower: float, upper: float) -> BandAccuracy:
+def band_accuracy(error: Float64, lower: float, upper: float) -> BandAccuracy:
+    """The figures of errors (Q,) [m] in a band of true distance."""
     is_empty = not len(error)
     return BandAccuracy(
         lower=lower,

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.field_accuracy import field_accuracy
+from splatctrl_cli.evaluate.field_accuracy import field_accuracy, grid_distances, median_radius
+from splatctrl_cli.records import DistanceGrid
 
 TRUTH = np.array([0.01, 0.015, 0.03, 0.07, 0.15, 0.3, -0.01])
 
@@ -45,3 +46,28 @@ def test_arrays_that_do_not_fit_are_named() -> None:
         field_accuracy({"hard": TRUTH, "gpdf": TRUTH[:3]}, TRUTH, TRUTH > 0, median_radius=0.0)
     with pytest.raises(InputError, match="expected one named hard, got gpdf"):
         field_accuracy({"gpdf": TRUTH}, TRUTH, TRUTH > 0, median_radius=0.0)
+
+
+def test_without_a_word_on_what_was_seen_every_point_counts() -> None:
+    error = np.array([0.0149, 0.5, 0.0, 0.0, 0.0, 9.0, 9.0])
+    report = field_accuracy({"hard": TRUTH + error}, TRUTH, None, median_radius=0.005)
+    assert report.seen == {}
+    assert (report.over_estimate.count, report.over_estimate.count_beyond) == (5, 1)
+
+
+def test_hard_comes_back_from_the_bound_of_a_grid() -> None:
+    sdf = np.zeros((2, 2, 2), np.float32)
+    bound = np.full((2, 2, 2), 0.083, np.float32)
+    header: dict[str, object] = {"bound_margin": 0.0175, "health": {"radius": 0.01}}
+    grid = DistanceGrid(origin=np.zeros(3), voxel=0.02, channels={"sdf": sdf, "bound": bound}, header=header)
+    np.testing.assert_allclose(grid_distances(grid)["hard"], 0.1005, atol=1e-7)
+    assert median_radius(grid) == 0.01
+    with_hard = DistanceGrid(
+        origin=np.zeros(3), voxel=0.02, channels={"sdf": sdf, "hard": bound, "se": sdf}, header={}
+    )
+    np.testing.assert_array_equal(grid_distances(with_hard)["hard"], bound)
+    assert list(grid_distances(with_hard)) == ["sdf", "hard", "se"]
+    for header in ({}, {"bound_margin": "wide"}):
+        bare = DistanceGrid(origin=np.zeros(3), voxel=0.02, channels={"sdf": sdf, "bound": bound}, header=header)
+        with pytest.raises(InputError, match="expected a channel hard or bound, got sdf, bound"):
+            grid_distances(bare)
