@@ -15,5 +15,5 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic]], *, level: int =
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
             entry.compress_type = method
-            with archive.open(entry, "w", force_zip64=array.nbytes >= 2**31) as stream:
+            with archive.open(entry, "w", force_zip64=array.nbytes >= 2**30) as stream:
                 np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)

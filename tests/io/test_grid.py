@@ -1,39 +1,25 @@
 import json
 import re
-import struct
 import zipfile
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.grid import read_npz, write_npz, write_vti
+from splatctrl_cli.io.grid import read_npz, read_npz_head, write_npz
 from splatctrl_cli.records import DistanceGrid
-
-SHAPE = (3, 4, 5)
+from tests.io.make_grid import HEADER, SHAPE, random_grid, with_unknown
 
 
 @pytest.fixture
 def grid() -> DistanceGrid:
-    rng = np.random.default_rng(0)
-    return DistanceGrid(
-        origin=np.array([-0.1, 0.2, 0.3]),
-        voxel=0.02,
-        channels={
-            "sdf": rng.normal(size=SHAPE).astype(np.float32),
-            "gpdf": rng.normal(size=SHAPE).astype(np.float32),
-            "hard": rng.normal(size=SHAPE).astype(np.float32),
-            "gradient": rng.normal(size=(*SHAPE, 3)).astype(np.float32),
-            "observed": rng.integers(0, 4, SHAPE).astype(np.uint8),
-        },
-        header={"version": 1, "frame": "world", "sign": "positive outside", "note": 'a < "b" & ü'},
-    )
+    return random_grid()
 
 
-def test_npz_gives_back_what_was_written(tmp_path: Path, grid: DistanceGrid) -> None:
+@pytest.mark.parametrize("channels", [(), ("sdf",), ("sdf", "gradient", "bound", "observed"), ("label", "sdf")])
+def test_npz_gives_back_what_was_written(tmp_path: Path, channels: tuple[str, ...]) -> None:
+    grid = random_grid(*channels)
     write_npz(tmp_path / "field.npz", grid)
     read = read_npz(tmp_path / "field.npz")
     assert (read.header, read.voxel, read.origin.tolist()) == (grid.header, grid.voxel, grid.origin.tolist())
@@ -43,12 +29,40 @@ def test_npz_gives_back_what_was_written(tmp_path: Path, grid: DistanceGrid) -> 
         assert read.channels[name].dtype == values.dtype
 
 
+def test_a_file_is_of_the_version_that_wrote_it(tmp_path: Path, grid: DistanceGrid) -> None:
+    old = DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=grid.channels, header={"version": 1})
+    write_npz(tmp_path / "field.npz", old)
+    assert read_npz(tmp_path / "field.npz").header == {"format": "splatctrl distance grid", "version": 2}
+
+
+def test_the_head_is_read_without_the_values(tmp_path: Path) -> None:
+    path, shape = tmp_path / "field.npz", (9, 20, 40)
+    grid = random_grid(shape=shape)
+    write_npz(path, grid)
+    content = bytearray(path.read_bytes())
+    content[content.index(grid.channels["hard"].tobytes()) + 28000] ^= 1
+    path.write_bytes(content)
+    head = read_npz_head(path)
+    assert (head.shape, head.channels, head.header) == (shape, tuple(grid.channels), grid.header)
+    assert (head.voxel, head.origin.tolist()) == (grid.voxel, grid.origin.tolist())
+    with pytest.raises(InputError, match="CRC"):
+        read_npz(path)
+
+
 def test_same_grid_same_bytes(tmp_path: Path, grid: DistanceGrid) -> None:
     for name in ("a", "b"):
-        write_npz(tmp_path / f"{name}.npz", grid)
-        write_vti(tmp_path / f"{name}.vti", grid)
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert (tmp_path / "a.vti").read_bytes() == (tmp_path / "b.vti").read_bytes()
+        write_npz(tmp_path / name, grid)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_memory_map_is_written_as_an_array_is(tmp_path: Path, grid: DistanceGrid) -> None:
+    np.save(tmp_path / "sdf.npy", grid.channels["sdf"])
+    mapped = {"sdf": np.load(tmp_path / "sdf.npy", mmap_mode="r")}
+    for name, channels in (("map", mapped), ("array", {"sdf": grid.channels["sdf"]})):
+        write_npz(
+            tmp_path / name, DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header)
+        )
+    assert (tmp_path / "map").read_bytes() == (tmp_path / "array").read_bytes()
 
 
 def test_numpy_itself_reads_the_npz(tmp_path: Path, grid: DistanceGrid) -> None:
@@ -58,74 +72,57 @@ def test_numpy_itself_reads_the_npz(tmp_path: Path, grid: DistanceGrid) -> None:
         assert json.loads(str(loaded["header"]))["frame"] == "world"
 
 
-def read_vti(path: Path) -> tuple[dict[str, NDArray[np.generic]], dict[str, str], str]:
-    """Point arrays as (X, Y, Z[, components]), the ImageData's attributes and the header, by VTK's rules alone."""
-    content = path.read_bytes()
-    begin = content.index(b"_", content.index(b'<AppendedData encoding="raw">')) + 1
-    end = content.rindex(b"\n  </AppendedData>")
-    root = ElementTree.fromstring(content[:begin] + content[end:])
-    assert root.attrib == {
-        "type": "ImageData",
-        "version": "1.0",
-        "byte_order": "LittleEndian",
-        "header_type": "UInt64",
-    }
-    image = root.find("ImageData")
-    assert image is not None
-    piece = image.find("Piece")
-    assert piece is not None
-    assert piece.attrib["Extent"] == image.attrib["WholeExtent"]
-    low_x, x, low_y, y, low_z, z = map(int, piece.attrib["Extent"].split())
-    assert (low_x, low_y, low_z) == (0, 0, 0)
-    arrays, used = {}, 0
-    for array in piece.iterfind("PointData/DataArray"):
-        start = begin + int(array.attrib["offset"])
-        (size,) = struct.unpack_from("<Q", content, start)
-        dtype = {"Float32": "<f4", "UInt8": "u1"}[array.attrib["type"]]
-        flat = np.frombuffer(content[start + 8 : start + 8 + size], dtype)
-        values = flat.reshape(z + 1, y + 1, x + 1, int(array.attrib["NumberOfComponents"]))
-        arrays[array.attrib["Name"]] = (
-            values.transpose(2, 1, 0, 3).squeeze(-1) if values.shape[-1] == 1 else (values.transpose(2, 1, 0, 3))
-        )
-        used += 8 + size
-    assert begin + used == end
-    text = image.findtext("FieldData/Array")
-    assert text is not None
-    codes = [int(code) for code in text.split()]
-    assert codes[-1] == 0
-    return arrays, image.attrib, bytes(codes[:-1]).decode()
+def test_cells_without_a_value_are_let_through_only_by_their_policy(tmp_path: Path, grid: DistanceGrid) -> None:
+    blank = with_unknown(grid)
+    write_npz(tmp_path / "field.npz", blank)
+    np.testing.assert_array_equal(read_npz(tmp_path / "field.npz").channels["sdf"], blank.channels["sdf"])
+    blank.header["unknown"] = "free"
+    write_npz(tmp_path / "field.npz", blank)
+    with pytest.raises(InputError, match="sdf: expected finite values, got nan; bake it again"):
+        read_npz(tmp_path / "field.npz")
 
 
-def test_vti_holds_the_same_arrays(tmp_path: Path, grid: DistanceGrid) -> None:
-    write_vti(tmp_path / "field.vti", grid)
-    arrays, image, header = read_vti(tmp_path / "field.vti")
-    assert list(arrays) == list(grid.channels)
-    for name, values in grid.channels.items():
-        np.testing.assert_array_equal(arrays[name], values)
-    assert [float(v) for v in image["Origin"].split()] == grid.origin.tolist()
-    assert [float(v) for v in image["Spacing"].split()] == [0.02, 0.02, 0.02]
-    assert json.loads(header) == grid.header
+@pytest.mark.parametrize(("name", "value"), [("sdf", np.inf), ("gradient", -np.inf), ("bound", np.nan)])
+def test_what_no_policy_leaves_is_refused(tmp_path: Path, grid: DistanceGrid, name: str, value: float) -> None:
+    blank = with_unknown(grid)
+    blank.channels[name].flat[7] = value
+    write_npz(tmp_path / "field.npz", blank)
+    with pytest.raises(InputError, match=f"{name}: expected finite values, got {value}"):
+        read_npz(tmp_path / "field.npz")
 
 
 def test_a_pickled_npz_is_refused(tmp_path: Path, grid: DistanceGrid) -> None:
-    channels = {**grid.channels, "sdf": np.array([print], dtype=object)}
-    with (tmp_path / "field.npz").open("wb") as stream:
-        np.savez(stream, origin=grid.origin, voxel=grid.voxel, header="{}", **channels)  # type: ignore[arg-type]
+    rewrite(tmp_path / "field.npz", grid, sdf=np.array([print], dtype=object))
     with pytest.raises(InputError, match=r"field.npz: not a whole distance grid: .*allow_pickle"):
         read_npz(tmp_path / "field.npz")
 
 
-def test_every_damaged_byte_of_an_array_is_noticed(tmp_path: Path, grid: DistanceGrid) -> None:
+def test_every_cut_of_a_file_is_noticed(tmp_path: Path, grid: DistanceGrid) -> None:
     path = tmp_path / "field.npz"
     write_npz(path, grid)
     content = path.read_bytes()
-    at = content.index(grid.channels["sdf"].tobytes())
-    path.write_bytes(content[: at + 10] + bytes([content[at + 10] ^ 1]) + content[at + 11 :])
-    with pytest.raises(InputError, match="CRC"):
-        read_npz(path)
-    path.write_bytes(content[:-40])
-    with pytest.raises(InputError, match="not a whole distance grid"):
-        read_npz(path)
+    for length in (0, 10, len(content) // 2, len(content) - 40, len(content) - 1):
+        path.write_bytes(content[:length])
+        with pytest.raises(InputError, match="not a whole distance grid"):
+            read_npz(path)
+
+
+def test_no_changed_byte_ends_in_another_error_or_another_grid(tmp_path: Path) -> None:
+    grid = random_grid("sdf", "observed", shape=(2, 2, 2))
+    path = tmp_path / "field.npz"
+    write_npz(path, grid)
+    content = path.read_bytes()
+    refused = 0
+    for at in range(0, len(content), 3):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 0x15]) + content[at + 1 :])
+        try:
+            read = read_npz(path)
+        except InputError:
+            refused += 1
+        else:  # a date, an attribute: nothing that is read
+            np.testing.assert_array_equal(read.channels["sdf"], grid.channels["sdf"])
+            assert read.header == grid.header
+    assert refused > 0.7 * len(content) / 3
 
 
 def rewrite(path: Path, grid: DistanceGrid, **changes: object) -> None:
@@ -143,25 +140,41 @@ def rewrite(path: Path, grid: DistanceGrid, **changes: object) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"hard": None}, "expected the arrays gpdf, gradient, hard"),
-        ({"extra": np.zeros(1)}, "got extra, gpdf"),
-        ({"voxel": np.float64(0)}, "voxel: expected one float64 above 0 m"),
-        ({"voxel": np.zeros(2)}, "voxel: expected one float64"),
+        ({"sdf": None}, "expected the arrays origin, voxel, header and sdf, got origin, voxel, header, gradient"),
+        ({"extra": np.zeros(1)}, "expected the channel sdf and any of gradient, bound, .*, got sdf"),
+        ({"voxel": np.float64(0)}, "voxel: expected a size above 0 m, got 0.0; bake it again"),
+        ({"voxel": np.zeros(2)}, r"voxel: expected \('<f8', \(\)\), got"),
+        ({"origin": np.zeros(3, np.float32)}, r"origin: expected \('<f8', \(3,\)\), got"),
         ({"origin": np.array([0.0, np.nan, 0.0])}, "origin: expected 3 finite float64"),
         ({"header": "{"}, "header: not JSON"),
-        ({"header": '{"version": 9}'}, "header: expected version 1, got 9"),
+        ({"header": json.dumps({**HEADER, "version": 1})}, "header: expected version 2, got 1; bake it again"),
+        ({"header": "[]"}, "header: expected version 2, got None"),
         ({"header": np.zeros(3)}, "header: expected one string"),
-        ({"hard": np.zeros((3, 4, 6), np.float32)}, r"hard: expected <f4 \(3, 4, 5\), got <f4 \(3, 4, 6\)"),
+        ({"hard": np.zeros((5, 4, 6), np.float32)}, r"hard: expected <f4 \(5, 4, 11\), got <f4 \(5, 4, 6\)"),
+        ({"gradient": np.zeros(SHAPE, np.float32)}, r"gradient: expected <f4 \(5, 4, 11, 3\)"),
         ({"sdf": np.zeros(SHAPE)}, "sdf: expected <f4"),
-        ({"gpdf": np.full(SHAPE, np.inf, np.float32)}, "gpdf: expected finite values"),
+        ({"sdf": np.zeros((3, 4), np.float32)}, r"sdf: expected \(X, Y, Z\) cells, got \(3, 4\)"),
+        ({"sdf": np.zeros((3, 0, 4), np.float32)}, "sdf: expected"),
     ],
 )
 def test_an_npz_that_is_not_ours_is_named(
     tmp_path: Path, grid: DistanceGrid, changes: dict[str, object], message: str
 ) -> None:
     rewrite(tmp_path / "field.npz", grid, **changes)
-    with pytest.raises(InputError, match=message):
-        read_npz(tmp_path / "field.npz")
+    for read in (read_npz, read_npz_head):
+        with pytest.raises(InputError, match=message) as refused:
+            read(tmp_path / "field.npz")
+        assert refused.value.remedy
+
+
+def test_a_file_that_claims_more_than_it_holds_is_not_made_room_for(tmp_path: Path, grid: DistanceGrid) -> None:
+    path = tmp_path / "field.npz"
+    rewrite(path, grid, sdf=None)
+    with zipfile.ZipFile(path, "a") as archive:
+        claim = b"{'descr': '<f4', 'fortran_order': False, 'shape': (90000, 90000, 90000), }\n"
+        archive.writestr("sdf.npy", b"\x93NUMPY\x01\x00" + len(claim).to_bytes(2, "little") + claim)
+    with pytest.raises(InputError, match=r"sdf.npy: expected 2916\d+ bytes, got"):
+        read_npz(path)
 
 
 def test_a_missing_file_a_folder_and_a_zip_of_something_else_are_named(tmp_path: Path) -> None:
@@ -173,3 +186,18 @@ def test_a_missing_file_a_folder_and_a_zip_of_something_else_are_named(tmp_path:
         archive.writestr("readme.txt", "hello")
     with pytest.raises(InputError, match=re.escape(f"{tmp_path / 'other.npz'}: not a whole distance grid")):
         read_npz(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    ("channels", "message"),
+    [
+        ({"hard": np.zeros(SHAPE, "<f4")}, "grid to write: expected the channel sdf"),
+        ({"sdf": np.zeros(SHAPE)}, "grid to write: sdf: expected <f4"),
+        ({"sdf": np.zeros(SHAPE, "<f4"), "mine": np.zeros(SHAPE, "<f4")}, "got sdf, mine"),
+    ],
+)
+def test_what_could_not_be_read_is_not_written(tmp_path: Path, channels: dict[str, object], message: str) -> None:
+    grid = DistanceGrid(origin=np.zeros(3), voxel=0.1, channels=channels, header={})  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=message):
+        write_npz(tmp_path / "field.npz", grid)
+    assert not (tmp_path / "field.npz").exists()
