@@ -10,6 +10,8 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.io.capture import is_capture, read_capture_header
 from splatctrl_cli.io.describe_file import describe_file
+from splatctrl_cli.io.describe_grid import covers, header_facts
+from splatctrl_cli.io.grid_channels import FORMAT
 from splatctrl_cli.io.known_space import known_space
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
@@ -153,23 +155,12 @@ def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
     return known_space(read_occupancy(path / "occupancy.npz"), thresholds)
 
 
-FIELD_FORMAT = "splatctrl distance grid"  # as the header of a baked field says
-_FIELD_FACTS = ("voxel", "kernel", "length_scale", "sign", "frame", "labels", "splats_used", "observed", "stamp_ns")
-
-
 def _field_facts(path: Path) -> dict[str, object]:
     """What a distance grid covers and how it was made; empty where the file is none of ours."""
     header: Mapping[str, Any] = describe_file(path).facts
-    if header.get("format") != FIELD_FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
+    if header.get("format") != FORMAT or not {"shape", "first_cell", "voxel"} <= header.keys():
         return {}
-    first, sides = header["first_cell"], [header["voxel"] * (count - 1) for count in header["shape"]]
-    place = {
-        "shape": header["shape"],
-        "extent_m": [round(side, 6) for side in sides],
-        "first_cell": [round(start, 6) for start in first],
-        "last_cell": [round(start + side, 6) for start, side in zip(first, sides, strict=True)],
-    }
-    return {**place, **{key: header[key] for key in _FIELD_FACTS if header.get(key) is not None}}
+    return {**covers(header["first_cell"], header["voxel"], header["shape"]), **header_facts(header)}
 
 
 def _describe_capture(path: Path) -> Summary:

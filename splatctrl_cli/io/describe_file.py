@@ -1,7 +1,6 @@
 """Headers of single files: splats, grids, robots, JSON, arrays, images; no more than the header where it can."""
 
 import json
-import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,8 +14,21 @@ from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.curobo_grid import is_curobo_npz
+from splatctrl_cli.io.describe_grid import (
+    describe_curobo,
+    describe_grid_npz,
+    describe_mesh,
+    describe_moveit,
+    describe_nrrd,
+    describe_vdb,
+    describe_vti,
+    is_moveit,
+)
 from splatctrl_cli.io.describe_splats import describe_splats
+from splatctrl_cli.io.grid import is_grid_npz
 from splatctrl_cli.io.summary import Grid, Summary
+from splatctrl_cli.io.vdb import MAGIC
 
 _HEAD = 1 << 16  # bytes in which a text header must end
 _LIST_LIMIT = 12  # longer lists are counted, not shown
@@ -33,8 +45,8 @@ def describe_file(path: Path) -> Summary:
             return describe(path, head)
     raise InputError(
         f"{path}: unknown kind of file",
-        remedy="known: .mcap .bag .db3 .toml .ply .splat .spz .glb .usda .usdc .npz .npy .vti .urdf .json .jsonl "
-        ".csv .yaml .png .jpg",
+        remedy="known: .mcap .bag .db3 .toml .ply .splat .spz .glb .usda .usdc .npz .npy .vti .nrrd .vdb .moveit "
+        ".obj .stl .urdf .json .jsonl .csv .yaml .png .jpg",
     )
 
 
@@ -58,6 +70,10 @@ def _ply(path: Path, head: bytes) -> Summary:
 
 
 def _npz(path: Path, _head: bytes) -> Summary:
+    if is_curobo_npz(path):
+        return describe_curobo(path)
+    if is_grid_npz(path):
+        return describe_grid_npz(path)
     try:
         with zipfile.ZipFile(path) as archive:
             arrays = {name: _npy_header(archive, name) for name in archive.namelist() if name.endswith(".npy")}
@@ -98,20 +114,6 @@ def _npy(path: Path, _head: bytes) -> Summary:
     except (ValueError, EOFError) as error:
         raise InputError(f"{path}: not a readable .npy: {error}", remedy="the file is damaged") from None
     return Summary(path=str(path), kind="array", facts={"shape": list(array.shape), "dtype": str(array.dtype)})
-
-
-def _vti(path: Path, head: bytes) -> Summary:
-    text = head.decode("latin-1")
-    image = re.search(r"<ImageData\b([^>]*)>", text)
-    if image is None:
-        raise InputError(f"{path}: a .vti without ImageData", remedy="the file is damaged")
-    facts: dict[str, object] = dict(re.findall(r'(\w+)="([^"]*)"', image[1]))
-    rows = []
-    for attributes in re.findall(r"<DataArray\b([^>]*)>", text):
-        values = dict(re.findall(r'(\w+)="([^"]*)"', attributes))
-        rows.append([values.get("Name", "-"), values.get("type", "-"), values.get("NumberOfComponents", "1")])
-    grid = Grid(name="arrays", header=("array", "type", "components"), rows=rows)
-    return Summary(path=str(path), kind="ParaView image data", facts=facts, grids=(grid,))
 
 
 def _urdf(path: Path, _head: bytes) -> Summary:
@@ -227,8 +229,12 @@ _KINDS: tuple[tuple[Callable[[Path, bytes], bool], Callable[[Path, bytes], Summa
     (lambda _, head: head.startswith(b"PK\x03\x04"), _npz),
     (lambda _, head: head.startswith(b"\x93NUMPY"), _npy),
     (lambda _, head: head.startswith((b"\x89PNG", b"\xff\xd8\xff")), _image),
-    (lambda path, head: path.suffix == ".vti" or b'type="ImageData"' in head[:512], _vti),
+    (lambda path, head: path.suffix == ".vti" or b'type="ImageData"' in head[:512], describe_vti),
+    (lambda _, head: head.startswith(b"NRRD000"), describe_nrrd),
+    (lambda _, head: head.startswith(MAGIC), describe_vdb),
+    (is_moveit, describe_moveit),
     (_suffix(".splat", ".spz", ".glb", ".usda", ".usdc"), describe_splats),
+    (_suffix(".obj", ".stl"), describe_mesh),
     (_suffix(".urdf", ".xacro"), _urdf),
     (_suffix(".json"), _json),
     (_suffix(".jsonl", ".csv"), _rows),
