@@ -12,7 +12,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import audit
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.field.bake import bake
-from splatctrl_cli.field.distance import GpdfField, SafeField, SphereField
+from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.grid import GridField
 from splatctrl_cli.field.selection import field_splats
 from splatctrl_cli.records import Box, DistanceField, Float64
@@ -24,8 +24,7 @@ def run(options: Options) -> Result:
     """The sample log's arm and map: steps from its logged states towards the last one's pose, and their audit."""
     config, model = Config(), sample_robot()
     splats = field_splats(sample_fitter().splats())
-    exact = SphereField(splats.centers, splats.radii)
-    analytic = SafeField(exact, GpdfField(splats.centers, splats.radii, config.field.length_scale))
+    analytic = make_field(splats.centers, splats.radii, config.field)
     reach = model.reach()
     workspace = Box(lower=model.base_position - reach, upper=model.base_position + reach)
     grid = GridField(bake(splats, workspace, config.field))

@@ -111,10 +111,12 @@ class OccupancyConfig:
 class FieldConfig:
     """III-D: distance field."""
 
-    kernel: str = "matern"  # eq. 7
+    distance: str = "safe"  # min(se, hard); or safe_gpdf: min(gpdf, hard), hard, se, gpdf (the paper's)
+    weights: str = "rowsum"  # eq. 15; or voxel: density on a voxel grid (III-D), cg: the full GP of eq. 8
     length_scale: float = 0.02  # [m] l, IV-C
     noise: float = 1e-6  # epsilon of eq. 8
-    truncation: float = 1e-3  # share of the kernel sum that may be left out; raises the distance by at most l / 1000
+    truncation: float = 2e-5  # [m] by how much leaving out small terms of the kernel sum may raise the distance
+    unknown: str = "free"  # never-seen space: free, obstacle or nan
     voxel: float = 0.02  # [m], IV-B
     padding: float = 0.20  # [m] around the splats where no workspace is given
 

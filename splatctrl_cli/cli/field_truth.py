@@ -12,11 +12,12 @@ from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy
 from splatctrl_cli.evaluate.visibility import seen_by
+from splatctrl_cli.field.grid import exact_channel
 from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Bool, DistanceGrid, Float64, RgbdFrame
 from splatctrl_cli.simulate.truth import Truth, load_truth
 
-FIELDS = ("hard", "gpdf")  # channels of the grid that are compared
+FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
 MAX_CELLS = 200_000  # a larger grid is compared at this many cells, drawn with the seed
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
@@ -45,7 +46,7 @@ class Comparison:
 def compare_with_truth(
     grid: DistanceGrid, source: BakeSource, truth_path: Path, log: Path, *, seed: int
 ) -> Comparison:
-    """The accuracy of `hard` and `gpdf` at drawn cells; the robot is in neither the field nor the truth.
+    """The accuracy of `hard` and `sdf` at drawn cells; the robot is in neither the field nor the truth.
 
     Raises NotEvaluableError where no cell is near an object.
     """
@@ -61,7 +62,8 @@ def compare_with_truth(
         raise NotEvaluableError(f"{truth_path}: no cell of the grid lies within {BANDS[-1][1]} m outside an object")
     seen = _seen(surface[is_near], log, source.cameras, stamp_ns)
     in_workspace = np.ones_like(seen) if source.workspace is None else source.workspace.contains(surface[is_near])
-    fields = {name: grid.channels[name].reshape(-1)[drawn[is_near]].astype(np.float64) for name in FIELDS}
+    channels = {"hard": exact_channel(grid), "sdf": grid.channels["sdf"]}
+    fields = {name: channels[name].reshape(-1)[drawn[is_near]].astype(np.float64) for name in FIELDS}
     health: Any = grid.header["health"]
     return Comparison(
         accuracy=field_accuracy(fields, distance[is_near], seen & in_workspace, median_radius=health["radius"]),

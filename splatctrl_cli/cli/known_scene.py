@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,7 +41,7 @@ class KnownScene:
 def from_grid(path: Path) -> KnownScene:
     """The scene of a baked grid: one field for all times. `path` is a field folder or a ``field.npz``."""
     from splatctrl_cli.control.audit import observed_lookup
-    from splatctrl_cli.field.grid import GridField
+    from splatctrl_cli.field.grid import GridField, exact_channel
     from splatctrl_cli.io.grid import read_npz
     from splatctrl_cli.io.output import sha256
 
@@ -51,8 +51,8 @@ def from_grid(path: Path) -> KnownScene:
     fields = KnownFields(
         barrier=barrier,
         distances={
-            "exact": _distance(GridField(grid, "hard")),
-            "kernel": _distance(GridField(grid, "gpdf")),
+            "exact": _distance(GridField(replace(grid, channels={"sdf": exact_channel(grid)}))),
+            "barrier": _distance(barrier),
             "certified": barrier.certified,
         },
         median_radius=_median_radius(file, grid.header),
@@ -105,26 +105,19 @@ def from_splats(path: Path, config: "Config", threads: int) -> KnownScene:
 
 
 def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFields:
-    """Exact, kernel and barrier field (their minimum) of the splats, the robot's own left out."""
+    """Exact and barrier field of the splats, the robot's own left out."""
     import numpy as np
 
-    from splatctrl_cli.field.distance import GpdfField, SafeField, SphereField
+    from splatctrl_cli.field.distance import SphereField, field_over
     from splatctrl_cli.field.selection import field_splats
+    from splatctrl_cli.field.spheres import Spheres
 
     chosen = field_splats(splats)
-    exact = SphereField(chosen.centers, chosen.radii, threads=threads)
-    kernel = GpdfField(
-        chosen.centers,
-        chosen.radii,
-        config.field.length_scale,
-        noise=config.field.noise,
-        truncation=config.field.truncation,
-        kernel=config.field.kernel,
-        threads=threads,
-    )
+    spheres = Spheres.of(chosen.centers, chosen.radii)
+    barrier = field_over(spheres, config.field, threads=threads)
     return KnownFields(
-        barrier=SafeField(exact, kernel),
-        distances={"exact": _distance(exact), "kernel": _distance(kernel)},
+        barrier=barrier,
+        distances={"exact": _distance(SphereField.over(spheres, threads=threads)), "barrier": _distance(barrier)},
         median_radius=float(np.median(chosen.radii)),
     )
 

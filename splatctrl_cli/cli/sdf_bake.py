@@ -146,7 +146,7 @@ def _field_config(config: "FieldConfig", args: argparse.Namespace) -> "FieldConf
 def _box(args: argparse.Namespace, splats: "SplatSet", labels: "frozenset[Label]", padding: float) -> "Box":
     import numpy as np
 
-    from splatctrl_cli.field.bake import bounding_box
+    from splatctrl_cli.field.layout import bounding_box
     from splatctrl_cli.field.selection import field_splats
     from splatctrl_cli.records import Box
 

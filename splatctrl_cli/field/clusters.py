@@ -1,73 +1,105 @@
-"""Points sorted along a space-filling curve into groups of 16 with a box around each."""
+"""Points sorted along a space-filling curve into clusters of 16, those into groups of 16, a box around each."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels.field import LANES, Clusters, Float32
-from splatctrl_cli.records import Float64
+from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Float32, Offsets
+from splatctrl_cli.records import Box, Float64, UInt8
 
-_SPARE_OFFSET = -1e30  # an entry so far away that nothing ever takes it
 _BITS = 10  # of each coordinate in a Morton code
+_GROUPS = 8  # their number is a multiple of this
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClusteredPoints:
     """N points as C clusters, relative to an anchor near them (float32 keeps 0.1 um within a metre or two).
 
-    anchor (3,) float64 [m], world; source (16 C,) int64, the point behind each entry; is_spare (16 C,).
+    anchor (3,) float64 [m], world; source (16 C,) int64, the point behind each entry (0 where spare);
+    is_point (16 C,) uint8, 0 where spare.
     """
 
     anchor: Float64
     source: NDArray[np.int64]
-    is_spare: NDArray[np.bool_]
-    centers: Float32
-    bounds: Float32
+    is_point: UInt8
+    clusters: Clusters
 
     @property
     def num_points(self) -> int:
         """N."""
-        return int(np.count_nonzero(~self.is_spare))
+        return int(np.count_nonzero(self.is_point))
 
     def relative(self, points_world: NDArray[np.floating]) -> Float32:
         """Points (Q, 3), world -> (Q, 3) float32 relative to the anchor."""
         return np.ascontiguousarray(points_world - self.anchor, dtype=np.float32)
 
-    def with_offsets(self, offsets: NDArray[np.floating]) -> Clusters:
-        """The clusters with the offset o of each of the N points (N,) [m]."""
-        laid_out = offsets.astype(np.float32)[self.source]
-        laid_out[self.is_spare] = _SPARE_OFFSET
-        return Clusters(
-            centers=self.centers,
-            bounds=self.bounds,
-            offsets=laid_out,
-            max_offsets=laid_out.reshape(-1, LANES).max(axis=1),
-        )
+    def laid_out(self, values: NDArray[np.floating], *, spare: float) -> Float64:
+        """Values (N,) -> (16 C,) float64, `spare` where there is no point."""
+        return np.where(self.is_point, np.asarray(values, dtype=np.float64)[self.source], spare)
+
+    def gathered(self, values: NDArray[np.float64]) -> Float64:
+        """Values (16 C,) of the entries -> (N,) of the points."""
+        result = np.empty(self.num_points)
+        is_point = self.is_point.view(np.bool_)
+        result[self.source[is_point]] = values[is_point]
+        return result
+
+    def offsets(self, values: NDArray[np.floating]) -> Offsets:
+        """The offset of each of the N points (N,), laid out, with the largest of each cluster and group."""
+        laid_out = self.laid_out(values, spare=SPARE_OFFSET).astype(np.float32)
+        by_cluster = laid_out.reshape(-1, LANES).max(axis=1)
+        by_group = np.full(_padded(len(by_cluster) // LANES, _GROUPS), SPARE_OFFSET, np.float32)
+        by_group[: len(by_cluster) // LANES] = by_cluster.reshape(-1, LANES).max(axis=1)
+        return Offsets(values=laid_out, maxima=np.concatenate([by_cluster, by_group]))
 
 
-def cluster_points(points_world: NDArray[np.floating]) -> ClusteredPoints:
-    """Cluster points (N, 3) [m], N > 0; the same points in the same order give the same clusters."""
+def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None) -> ClusteredPoints:
+    """Cluster points (N, 3) [m], N > 0.
+
+    The anchor is the middle of `frame`, and the curve runs through it; of the points' own box where it is None. With
+    the same frame, points that two sets share keep their order and their coordinates to the bit.
+    """
     points = np.asarray(points_world, dtype=np.float64)
-    lower, upper = points.min(axis=0), points.max(axis=0)
+    lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
     anchor = 0.5 * (lower + upper)
-    order = np.argsort(_morton_codes(points, lower, float((upper - lower).max())), kind="stable")
-    num_clusters = -(-len(points) // LANES)
-    source = np.concatenate([order, np.repeat(order[-1:], num_clusters * LANES - len(order))])
-    relative = (points - anchor).astype(np.float32)[source]
-    grouped = relative.reshape(num_clusters, LANES, 3)
+    codes = _morton_codes(points, lower, float((upper - lower).max()))
+    order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], codes))
+    num_clusters = _padded(-(-len(points) // LANES), LANES)
+    source = np.zeros(LANES * num_clusters, dtype=np.int64)
+    source[: len(order)] = order
+    relative = np.full((len(source), 3), SPARE_PLACE, dtype=np.float32)
+    relative[: len(order)] = (points - anchor)[order]
     return ClusteredPoints(
         anchor=anchor,
         source=source,
-        is_spare=np.arange(len(source)) >= len(order),
-        centers=np.ascontiguousarray(relative.T),
-        bounds=np.ascontiguousarray(np.concatenate([grouped.min(axis=1), grouped.max(axis=1)], axis=1).T),
+        is_point=(np.arange(len(source)) < len(order)).astype(np.uint8),
+        clusters=Clusters(centers=np.ascontiguousarray(relative.T), boxes=_boxes(relative, len(order))),
     )
+
+
+def _boxes(relative: Float32, num_points: int) -> Float32:
+    """Boxes (6, C + G) around the points of each cluster, then of each group; spare ones stand far away."""
+    num_clusters = len(relative) // LANES
+    num_groups = num_clusters // LANES
+    boxes = np.full((6, num_clusters + _padded(num_groups, _GROUPS)), SPARE_PLACE, dtype=np.float32)
+    upper = relative.copy()
+    upper[num_points:] = -SPARE_PLACE
+    for count, first, size in ((num_clusters, 0, LANES), (num_groups, num_clusters, LANES * LANES)):
+        used = -(-num_points // size)
+        boxes[:3, first : first + used] = relative.reshape(count, size, 3).min(axis=1)[:used].T
+        boxes[3:, first : first + used] = upper.reshape(count, size, 3).max(axis=1)[:used].T
+    return boxes
+
+
+def _padded(count: int, multiple: int) -> int:
+    return -(-count // multiple) * multiple
 
 
 def _morton_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
     """Interleaved bits (N,) of the coordinates: neighbours along the curve are neighbours in space."""
-    cells = ((points - lower) / max(extent, 1e-30) * (2**_BITS - 1)).astype(np.int64)
+    last = 2**_BITS - 1
+    cells = np.clip((points - lower) / max(extent, 1e-30) * last, 0, last).astype(np.int64)
     codes = np.zeros(len(points), dtype=np.int64)
     for bit in range(_BITS):
         for axis in range(3):

@@ -1,15 +1,21 @@
-"""Distance fields over splats: exact, kernel, and the smaller of the two. Positive outside."""
+"""Distance fields over splats: exact, two kernel fields, and the smaller of exact and kernel. Positive outside."""
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.field.clusters import ClusteredPoints, cluster_points
-from splatctrl_cli.field.kernel import kernel_named
-from splatctrl_cli.field.weights import row_sum_log_weights
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.kernel import Matern12, SquaredExponential, checked_length, checked_truncation
+from splatctrl_cli.field.spheres import Spheres, checked_points
+from splatctrl_cli.field.weights import weights_named
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.records import DistanceField, Float64
+from splatctrl_cli.kernels.field import GridSpan
+from splatctrl_cli.records import DistanceField, Float32, Float64
+
+SIGNED_CARE = 1e-3  # of the truncation where weights have signs: what is left of a cancelling sum needs more of it
 
 
 class SphereField:
@@ -19,24 +25,48 @@ class SphereField:
     """
 
     def __init__(self, centers: ArrayLike, radii: ArrayLike, *, threads: int = 1) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m], zero allowed. Raises as `checked_spheres`."""
-        center_array, radius_array = checked_spheres(centers, radii)
-        self._points = cluster_points(center_array)
-        self.anchor = self._points.anchor  # what the float32 coordinates of `spheres` are relative to
-        self.spheres = self._points.with_offsets(radius_array)
+        """centers (N, 3) [m], world; radii (N,) [m], zero allowed. Raises as `Spheres.of`."""
+        self._hold(Spheres.of(centers, radii), threads)
+
+    @classmethod
+    def over(cls, spheres: Spheres, *, threads: int = 1) -> "SphereField":
+        """The field of spheres that are already clustered."""
+        field = cls.__new__(cls)
+        field._hold(spheres, threads)
+        return field
+
+    def _hold(self, spheres: Spheres, threads: int) -> None:
+        self.spheres = spheres
+        self.radii = spheres.points.offsets(spheres.radii)
         self._threads = threads
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m] and the gradient (Q, 3) of the nearest (zero at its centre)."""
-        score, gradient = native.nearest(self.spheres, _local(self._points, points), threads=self._threads)
+        local = self.spheres.points.relative(checked_points(points))
+        score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
 
 
+class KernelField(Protocol):
+    """A field whose log-sum-exp may have no distance somewhere."""
+
+    spheres: Spheres
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3), the exact ones where it has none."""
+        ...
+
+    def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
+        """The same, but NaN where it has no distance."""
+        ...
+
+
 class GpdfField:
-    """The paper's field (eq. 7 to 10, 12, 15): mass-lumped GP with a Matern-1/2 kernel, in the log domain.
+    """The paper's field (eq. 7 to 10, 12, 15): a GP with a Matern-1/2 kernel, in the log domain.
 
     ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, radius and weight in the exponent, shifted by the largest
-    exponent: finite for every l, which eq. 12 as printed (shift by the nearest centre) is not.
+    exponent: finite for every l and every mix of radii, where eq. 12 as printed (shifted by the nearest centre)
+    overflows for r / l > 88 in float32. With weights of either sign (cg) a sum that is not positive has no distance.
     """
 
     def __init__(
@@ -47,66 +77,185 @@ class GpdfField:
         *,
         noise: float = FieldConfig.noise,
         truncation: float = FieldConfig.truncation,
-        kernel: str = FieldConfig.kernel,
+        weights: str = FieldConfig.weights,
         threads: int = 1,
     ) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m]; length_scale l [m]. Raises as `checked_spheres`."""
-        center_array, radius_array = checked_spheres(centers, radii)
-        self._points = cluster_points(center_array)
-        self.kernel = kernel_named(kernel, length_scale, truncation)
-        self.log_weights = row_sum_log_weights(self._points, self.kernel, noise, threads=threads)
-        self.offsets = self.kernel.offsets(radius_array, self.log_weights)
+        """centers (N, 3) [m], world; radii (N,) [m]; length_scale l and truncation [m]. Raises as `Spheres.of`."""
+        config = FieldConfig(length_scale=length_scale, noise=noise, truncation=truncation, weights=weights)
+        self._hold(Spheres.of(centers, radii), config, threads)
+
+    @classmethod
+    def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> "GpdfField":
+        """The field of spheres that are already clustered."""
+        field = cls.__new__(cls)
+        field._hold(spheres, config, threads)
+        return field
+
+    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
+        self.spheres = spheres
+        self.kernel = Matern12(checked_length(config.length_scale))
+        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
+        tolerance = checked_truncation(config.truncation) * (1.0 if self.weights.sign is None else SIGNED_CARE)
+        self.share = self.kernel.share(tolerance)
+        offsets = spheres.radii + self.kernel.length * self.weights.log_size
         # Float32 keeps what is left of the offsets to the micrometre: the largest goes in at the end, in float64.
-        self.common_offset = float(self.offsets.max())
-        self.spheres = self._points.with_offsets(self.offsets - self.common_offset)
+        self._common = float(offsets.max())
+        self.offsets = offsets
+        self._offsets = spheres.points.offsets(offsets - self._common)
+        self.sign = laid_out_sign(spheres, self.weights.sign)
         self._threads = threads
 
-    def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3), of length at most 1, not normalised.
+    def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3); NaN where the sum is not positive.
 
-        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|`` with pi the softmax of the exponents. (Eq. 11 as printed is
+        ``grad f = sum_i pi_i (x - p_i) / |x - p_i|`` with pi the shares of the terms. (Eq. 11 as printed is
         minus this, made a unit vector; `normalised` gives the unit vector.)
         """
-        local = _local(self._points, points)
-        score, gradient = native.soft_min(
-            self.spheres, self.kernel.length, self.kernel.truncation, local, threads=self._threads
+        points_ = self.spheres.points
+        score, gradient = native.matern(
+            points_.clusters,
+            self._offsets,
+            self.sign,
+            self.kernel.length,
+            self.share,
+            points_.relative(checked_points(points)),
+            threads=self._threads,
         )
-        return score.astype(np.float64) - self.common_offset, gradient.astype(np.float64)
+        return score.astype(np.float64) - self._common, gradient.astype(np.float64)
+
+    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
+        """`query_raw` at the cells of `span`, into distance (X, Y, Z) and gradient (X, Y, Z, 3)."""
+        points = self.spheres.points
+        native.bake_matern(
+            points.clusters,
+            points.offsets(self.offsets),
+            points.laid_out(self.offsets, spare=native.SPARE_OFFSET),
+            self.sign,
+            self.kernel.length,
+            self.share,
+            span,
+            distance,
+            gradient,
+            threads=threads,
+        )
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """As `query_raw`, the exact distance and its gradient where the sum is not positive."""
+        return or_exact(self.query_raw(points), self.spheres, points)
+
+
+class SeField:
+    """The paper's Gaussian kernel in the log domain, with radii: no bias over an evenly sampled plane.
+
+    ``f(x) = sqrt(-2 l^2 L) - sum_i pi_i r_i`` with ``L = log sum_i w_i exp(-|x - p_i|^2 / (2 l^2))`` and pi the
+    shares of its terms. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) It has no distance where L >= 0,
+    which happens near and inside the surface.
+    """
+
+    def __init__(
+        self,
+        centers: ArrayLike,
+        radii: ArrayLike,
+        length_scale: float = FieldConfig.length_scale,
+        *,
+        noise: float = FieldConfig.noise,
+        truncation: float = FieldConfig.truncation,
+        weights: str = FieldConfig.weights,
+        threads: int = 1,
+    ) -> None:
+        """centers (N, 3) [m], world; radii (N,) [m]; length_scale l and truncation [m]. Raises as `Spheres.of`."""
+        config = FieldConfig(length_scale=length_scale, noise=noise, truncation=truncation, weights=weights)
+        self._hold(Spheres.of(centers, radii), config, threads)
+
+    @classmethod
+    def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> "SeField":
+        """The field of spheres that are already clustered."""
+        field = cls.__new__(cls)
+        field._hold(spheres, config, threads)
+        return field
+
+    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
+        self.spheres = spheres
+        self.kernel = SquaredExponential(checked_length(config.length_scale))
+        self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
+        self.tolerance = checked_truncation(config.truncation) * (1.0 if self.weights.sign is None else SIGNED_CARE)
+        self.unit = 2.0 * self.kernel.length**2
+        log_size = self.weights.log_size
+        self._common = self.unit * float(log_size.max())
+        self._offsets = spheres.points.offsets(self.unit * log_size - self._common)
+        self.radii = spheres.points.laid_out(spheres.radii, spare=0.0).astype(np.float32)
+        self.sign = laid_out_sign(spheres, self.weights.sign)
+        self._threads = threads
+
+    def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3), not normalised; NaN where L >= 0."""
+        points_ = self.spheres.points
+        score, gradient = native.gaussian(
+            points_.clusters,
+            self._offsets,
+            self.radii,
+            self.sign,
+            self._common,
+            self.kernel.length,
+            self.tolerance,
+            points_.relative(checked_points(points)),
+            threads=self._threads,
+        )
+        return score.astype(np.float64), gradient.astype(np.float64)
+
+    def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
+        """`query_raw` at the cells of `span`, into distance (X, Y, Z) and gradient (X, Y, Z, 3)."""
+        points, log_size = self.spheres.points, self.weights.log_size
+        native.bake_gaussian(
+            points.clusters,
+            points.offsets(self.unit * log_size),
+            points.laid_out(log_size, spare=native.SPARE_OFFSET),
+            self.radii,
+            self.sign,
+            self.kernel.length,
+            self.tolerance,
+            span,
+            distance,
+            gradient,
+            threads=threads,
+        )
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """As `query_raw`, the exact distance and its gradient where L >= 0."""
+        return or_exact(self.query_raw(points), self.spheres, points)
 
 
 class SafeField:
-    """The smallest of several fields, with the gradient of whichever it is.
+    """The smaller of the exact distance and a kernel field, with the gradient of whichever it is.
 
     Row-sum lumping over-estimates the clearance to a sparse object before a dense one; with the exact distance beside
-    it, the result never exceeds the distance to the spheres.
+    it, the result never exceeds the distance to the spheres. Where the kernel has no distance it is the exact one.
     """
 
-    def __init__(self, *fields: DistanceField) -> None:
-        self._fields = fields
+    def __init__(self, exact: DistanceField, kernel: KernelField) -> None:
+        self._exact, self._kernel = exact, kernel
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> the least distance (Q,) [m] and its gradient (Q, 3); the first wins a tie."""
-        distance, gradient = self._fields[0].query(points)
-        for field in self._fields[1:]:
-            other, other_gradient = field.query(points)
-            is_less = other < distance
-            distance = np.where(is_less, other, distance)
-            gradient = np.where(is_less[:, None], other_gradient, gradient)
-        return distance, gradient
+        """points (Q, 3) [m] -> the least distance (Q,) [m] and its gradient (Q, 3); the exact one wins a tie."""
+        distance, gradient = self._exact.query(points)
+        smooth, smooth_gradient = self._kernel.query_raw(points)
+        is_less = smooth < distance  # False for NaN
+        return np.where(is_less, smooth, distance), np.where(is_less[:, None], smooth_gradient, gradient)
 
 
-def safe_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> SafeField:
-    """``min(hard, gpdf)`` over splats: the analytic field that a controller uses."""
-    gpdf = GpdfField(
-        centers,
-        radii,
-        config.length_scale,
-        noise=config.noise,
-        truncation=config.truncation,
-        kernel=config.kernel,
-        threads=threads,
-    )
-    return SafeField(SphereField(centers, radii, threads=threads), gpdf)
+def or_exact(raw: tuple[Float64, Float64], spheres: Spheres, points: Float64) -> tuple[Float64, Float64]:
+    """Distance (Q,) and gradient (Q, 3) with those of `SphereField` where the distance is NaN."""
+    distance, gradient = raw
+    has_none = np.isnan(distance)
+    if has_none.any():
+        exact = SphereField.over(spheres)
+        distance[has_none], gradient[has_none] = exact.query(np.asarray(points, dtype=np.float64)[has_none])
+    return distance, gradient
+
+
+def laid_out_sign(spheres: Spheres, sign: Float32 | None) -> Float32 | None:
+    """Signs (N,) laid out as the kernels take them (16 C,); None stays None."""
+    return None if sign is None else spheres.points.laid_out(sign, spare=1.0).astype(np.float32)
 
 
 def normalised(gradient: Float64) -> Float64:
@@ -115,42 +264,38 @@ def normalised(gradient: Float64) -> Float64:
     return np.asarray(np.divide(gradient, length, out=np.zeros_like(gradient), where=length > 0))
 
 
-def checked_spheres(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:
-    """centers (N, 3) and radii (N,) as float64.
-
-    Raises NotEvaluableError where there is none, InputError for a wrong shape, a value that is not finite (naming the
-    index), or a negative radius.
-    """
-    center_array, radius_array = np.asarray(centers, dtype=np.float64), np.asarray(radii, dtype=np.float64)
-    if center_array.ndim != 2 or center_array.shape[1] != 3 or radius_array.shape != center_array.shape[:1]:
-        raise InputError(
-            f"splats: expected centres (N, 3) and radii (N,), got {center_array.shape}, {radius_array.shape}"
-        )
-    if not len(center_array):
-        raise NotEvaluableError("splats: expected at least one to measure distances to, got none")
-    for name, is_bad in (
-        ("a finite centre", ~np.isfinite(center_array).all(axis=1)),
-        ("a finite radius of 0 m or more", ~(np.isfinite(radius_array) & (radius_array >= 0))),
-    ):
-        if is_bad.any():
-            i = int(np.argmax(is_bad))
-            got = center_array[i].tolist() if "centre" in name else radius_array[i]
-            raise InputError(
-                f"splat {i}: expected {name}, got {got}", remedy=f"{int(is_bad.sum())} such splats in all"
-            )
-    return center_array, radius_array
+_Make = Callable[[Spheres, FieldConfig, int], DistanceField]
 
 
-def checked_points(points: NDArray[np.floating]) -> Float64:
-    """Query points (Q, 3) as float64. Raises InputError for another shape or a value that is not finite."""
-    array = np.ascontiguousarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"query points: expected shape (Q, 3), got {array.shape}")
-    if not np.isfinite(array).all():
-        i = int(np.argmax(~np.isfinite(array).all(axis=1)))
-        raise InputError(f"query point {i}: expected finite coordinates, got {array[i].tolist()}")
-    return array
+def _safe(spheres: Spheres, config: FieldConfig, threads: int) -> DistanceField:
+    return SafeField(SphereField.over(spheres, threads=threads), SeField.over(spheres, config, threads=threads))
 
 
-def _local(points: ClusteredPoints, queries: NDArray[np.floating]) -> NDArray[np.float32]:
-    return points.relative(checked_points(queries))
+def _safe_gpdf(spheres: Spheres, config: FieldConfig, threads: int) -> DistanceField:
+    return SafeField(SphereField.over(spheres, threads=threads), GpdfField.over(spheres, config, threads=threads))
+
+
+DISTANCES: Mapping[str, _Make] = {
+    "safe": _safe,
+    "safe_gpdf": _safe_gpdf,
+    "hard": lambda spheres, config, threads: SphereField.over(spheres, threads=threads),
+    "se": lambda spheres, config, threads: SeField.over(spheres, config, threads=threads),
+    "gpdf": lambda spheres, config, threads: GpdfField.over(spheres, config, threads=threads),
+}
+
+
+def checked_distance(name: str) -> str:
+    """The name of a distance. Raises UsageError for one that is not there."""
+    if name not in DISTANCES:
+        raise UsageError(f"field.distance: expected one of {', '.join(DISTANCES)}, got {name}")
+    return name
+
+
+def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> DistanceField:
+    """The field that ``config.distance`` names, over spheres that are already clustered."""
+    return DISTANCES[checked_distance(config.distance)](spheres, config, threads)
+
+
+def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:
+    """The field that ``config.distance`` names over spheres (N, 3), (N,) [m]: what a controller uses."""
+    return field_over(Spheres.of(centers, radii), config, threads=threads)

@@ -3,11 +3,10 @@
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.field.distance import checked_points
+from splatctrl_cli.field.layout import HALF_DIAGONAL
+from splatctrl_cli.field.spheres import checked_points
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64
-
-ROUNDING = 1e-6  # [m] float32 values a metre or two from their origin
+from splatctrl_cli.records import Bool, Box, DistanceGrid, Float32, Float64
 
 
 class GridField:
@@ -27,7 +26,8 @@ class GridField:
                 f"distance grid: expected at least 2 cells along each axis, got {self._values.shape}",
                 remedy="bake a larger box or a smaller voxel",
             )
-        self._hard = np.ascontiguousarray(grid.channels["hard"], dtype=np.float32)
+        bound = grid.channels.get("bound")
+        self._bound = None if bound is None else np.ascontiguousarray(bound, dtype=np.float32)
         self._origin = np.ascontiguousarray(grid.origin, dtype=np.float64)
         self._voxel = grid.voxel
         upper = self._origin + grid.voxel * (np.array(self._values.shape) - 1)
@@ -40,13 +40,29 @@ class GridField:
     def certified(self, points: Float64) -> Float64:
         """A distance (Q,) [m] that the exact distance to the splats is not below.
 
-        ``max over the corners of (hard(corner) - |x - corner|)``, less a micrometre for rounding: hard is
-        1-Lipschitz, so this holds whatever interpolation does in between. It certifies the
-        distance to the splats, not to objects.
+        ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz, so this holds
+        whatever interpolation does in between. It certifies the distance to the splats, not to objects. Raises
+        InputError for a grid without the channel bound.
         """
-        lowest = native.lipschitz_bound(self._hard, self._origin, self._voxel, checked_points(points))
-        return np.asarray(lowest - ROUNDING)
+        if self._bound is None:
+            raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
+        # The channel holds for a whole cell: at its centre the exact distance is half a diagonal more.
+        lowest = native.lipschitz_bound(self._bound, self._origin, self._voxel, checked_points(points))
+        return np.asarray(lowest + HALF_DIAGONAL * self._voxel)
 
     def contains(self, points: Float64) -> Bool:
         """(Q,) True where a point lies in the box of the cell centres."""
         return self.box.contains(points)
+
+
+def exact_channel(grid: DistanceGrid) -> Float32:
+    """The exact distance (X, Y, Z) [m] at the cell centres: the channel hard, or bound and its margin together.
+
+    Raises InputError for a grid with neither.
+    """
+    if "hard" in grid.channels:
+        return np.asarray(grid.channels["hard"], dtype=np.float32)
+    margin = grid.header.get("bound_margin")
+    if "bound" not in grid.channels or not isinstance(margin, float):
+        raise InputError("distance grid: no channel 'hard' or 'bound'", remedy="bake it with --channels sdf,bound")
+    return np.asarray(grid.channels["bound"], dtype=np.float32) + np.float32(margin)

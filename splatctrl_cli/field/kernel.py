@@ -1,5 +1,6 @@
 """Kernels of the Gaussian-process distance field (paper, III-D)."""
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -9,67 +10,72 @@ from splatctrl_cli.field.clusters import ClusteredPoints
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float64
 
-MAX_TRUNCATION = 0.1
-WEIGHT_TRUNCATION = 1e-6  # of a row sum: weights are made once, and 1e-6 of l is below a float's rounding
+MAX_SHARE = 1e-2  # of a kernel sum that is ever left out
 
 
 class Kernel(Protocol):
-    """A stationary kernel k(d) and the two things a field needs of it, both in the log domain."""
+    """A stationary kernel k(d) of length scale l [m] with k(0) = 1."""
 
     @property
-    def name(self) -> str: ...
+    def length(self) -> float: ...
 
-    @property
-    def length(self) -> float:
-        """l [m]."""
+    def value(self, distance: Float64) -> Float64:
+        """k(d) for distances of any shape [m]."""
         ...
 
-    def log_row_sums(self, points: ClusteredPoints, *, threads: int) -> Float64:
-        """``log sum_j k(p_i, p_j)`` (N,), j = i included."""
-        ...
-
-    def truncation_bound(self) -> float:
-        """By how much leaving out small terms can raise the distance, at worst [m]."""
-        ...
-
-    def offsets(self, radii: Float64, log_weights: Float64) -> Float64:
-        """Per-splat offsets (N,) [m] that carry radius and weight into the exponent."""
+    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
+        """``log sum_j k(|p_i - p_j|)`` (N,), j = i included."""
         ...
 
 
+@dataclass(frozen=True)
 class Matern12:
     """``k(d) = exp(-d / l)``, the paper's kernel: its inverse is ``r(o) = -l log o``."""
 
-    name = "matern"
+    length: float
 
-    def __init__(self, length: float, *, truncation: float) -> None:
-        self.length = length
-        self.truncation = truncation
+    def value(self, distance: Float64) -> Float64:
+        """k(d)."""
+        return np.asarray(np.exp(-distance / self.length))
 
     def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
-        """``log sum_j exp(-|p_i - p_j| / l)`` (N,): a log-sum-exp over the points themselves."""
-        itself = points.with_offsets(np.zeros(points.num_points))
-        at = np.ascontiguousarray(points.centers.T[~points.is_spare])
-        score, _ = native.soft_min(itself, self.length, WEIGHT_TRUNCATION, at, threads=threads)
-        sums = np.empty(len(score))
-        sums[points.source[~points.is_spare]] = -score.astype(np.float64) / self.length
-        return sums
+        """``log sum_j exp(-|p_i - p_j| / l)`` (N,)."""
+        return _log_row_sums(points, self.length, is_matern=True, threads=threads)
 
-    def offsets(self, radii: Float64, log_weights: Float64) -> Float64:
-        """``o_i = r_i + l log w_i``, so that the field is the soft minimum of ``|x - p_i| - o_i``."""
-        return radii + self.length * log_weights
-
-    def truncation_bound(self) -> float:
-        """By how much leaving out small terms can raise the distance, at worst [m]: ``-l log(1 - truncation)``."""
-        return -self.length * float(np.log1p(-self.truncation))
+    def share(self, tolerance: float) -> float:
+        """The share of the sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; 0.01 at most."""
+        return min(-float(np.expm1(-tolerance / self.length)), MAX_SHARE)
 
 
-def kernel_named(name: str, length: float, truncation: float) -> Matern12:
-    """The kernel that the configuration names. Raises UsageError for one that is not there, or a bad length."""
-    if not (np.isfinite(length) and length > 0):
-        raise UsageError(f"field.length_scale: expected a length above 0 m, got {length}")
-    if not 0 < truncation <= MAX_TRUNCATION:
-        raise UsageError(f"field.truncation: expected a share above 0, at most {MAX_TRUNCATION}, got {truncation}")
-    if name != Matern12.name:
-        raise UsageError(f"field.kernel: expected {Matern12.name}, got {name}")
-    return Matern12(length, truncation=truncation)
+@dataclass(frozen=True)
+class SquaredExponential:
+    """``k(d) = exp(-d^2 / (2 l^2))``, the paper's Gaussian kernel: its inverse is ``r(o) = sqrt(-2 l^2 log o)``."""
+
+    length: float
+
+    def value(self, distance: Float64) -> Float64:
+        """k(d)."""
+        return np.asarray(np.exp(-0.5 * (distance / self.length) ** 2))
+
+    def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
+        """``log sum_j exp(-|p_i - p_j|^2 / (2 l^2))`` (N,)."""
+        return _log_row_sums(points, self.length, is_matern=False, threads=threads)
+
+
+def checked_length(length: float) -> float:
+    """The length scale [m]. Raises UsageError unless it is from 1e-12 m to 1e6 m."""
+    if not 1e-12 <= length <= 1e6:
+        raise UsageError(f"field.length_scale: expected a length above 0 m, got {length}", remedy="0.02 is usual")
+    return float(length)
+
+
+def checked_truncation(truncation: float) -> float:
+    """The tolerance [m]. Raises UsageError unless it is above 0 m and at most 1 cm."""
+    if not 0 < truncation <= 0.01:
+        raise UsageError(f"field.truncation: expected a distance above 0 m, at most 0.01 m, got {truncation}")
+    return float(truncation)
+
+
+def _log_row_sums(points: ClusteredPoints, length: float, *, is_matern: bool, threads: int) -> Float64:
+    sums = native.row_sums(points.clusters, points.is_point, length, is_matern=is_matern, threads=threads)
+    return np.asarray(np.log(points.gathered(sums)))

@@ -1,7 +1,7 @@
 """Distances to spheres and on baked grids: typed wrappers, numpy in, numpy out.
 
-Shapes: N spheres laid out as C clusters of `LANES`, Q points, (X, Y, Z) cells. Frames are the caller's; float32
-wants an origin near the data.
+Shapes: N spheres laid out as C clusters of `LANES`, in G groups of as many clusters; Q points, (X, Y, Z) cells.
+Frames are the caller's; float32 wants an origin near the data.
 """
 
 from dataclasses import dataclass
@@ -12,112 +12,285 @@ from numpy.typing import NDArray
 from splatctrl_cli.kernels import native, num_threads
 
 LANES = 16
+BLOCK = 8  # cells of a block along each axis
+SPARE_OFFSET = -1e30  # of an entry so far away that nothing ever takes it
+SPARE_PLACE = 1e15
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+UInt8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clusters:
-    """Spheres in groups of 16 neighbours, each with its bounding box; spare entries have an offset of -1e30.
+    """Spheres in groups of 16 neighbours with a box around each; C is a multiple of 16, G of 8, spare ones are far.
 
-    centers (3, 16 C) float32 [m]; bounds (6, C) float32 [m], lower then upper; offsets (16 C,) float32 [m], the o of
-    the score ``|x - p| - o``; max_offsets (C,) float32 [m].
+    centers (3, 16 C) float32 [m]; boxes (6, C + G) float32 [m], lower then upper corner, clusters then groups.
     """
 
     centers: Float32
-    bounds: Float32
-    offsets: Float32
-    max_offsets: Float32
-
-
-def nearest(spheres: Clusters, points: Float32, *, threads: int = 0) -> tuple[Float32, Float32]:
-    """``min_i |x - p_i| - o_i`` (Q,) and its gradient (Q, 3), zero at a centre, for points (Q, 3) float32."""
-    score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
-    native.field_nearest(
-        spheres.centers,
-        spheres.offsets,
-        spheres.bounds,
-        spheres.max_offsets,
-        points,
-        num_threads(threads),
-        score,
-        gradient,
-    )
-    return score, gradient
-
-
-def soft_min(
-    spheres: Clusters, length: float, truncation: float, points: Float32, *, threads: int = 0
-) -> tuple[Float32, Float32]:
-    """``-l log sum_i exp(-(|x - p_i| - o_i) / l)`` (Q,) and its gradient (Q, 3), for points (Q, 3) float32.
-
-    The terms left out are at most the share `truncation` of the sum: too large by at most ``-l log(1 - truncation)``.
-    """
-    score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
-    native.field_soft(
-        spheres.centers,
-        spheres.offsets,
-        spheres.bounds,
-        spheres.max_offsets,
-        length,
-        truncation,
-        points,
-        num_threads(threads),
-        score,
-        gradient,
-    )
-    return score, gradient
+    boxes: Float32
 
 
 @dataclass(frozen=True, kw_only=True)
-class BakedChannels:
-    """float32, per cell: hard, gpdf and their minimum sdf (X, Y, Z); gradient (X, Y, Z, 3), that of sdf."""
+class Offsets:
+    """values (16 C,) float32: the o of ``|x - p| - o`` [m], or the b of ``|x - p|^2 - b`` [m^2]; -1e30 where spare.
 
-    sdf: Float32
-    gpdf: Float32
-    hard: Float32
-    gradient: Float32
+    maxima (C + G,) float32: the largest of each cluster, then of each group.
+    """
+
+    values: Float32
+    maxima: Float32
 
 
-def bake(
-    hard: Clusters,
-    soft: Clusters,
-    soft_common_offset: float,
+@dataclass(frozen=True, kw_only=True)
+class GridSpan:
+    """The cells centred at ``origin + voxel (i, j, k)``, i in [first, last), of a grid of `shape`.
+
+    origin (3,) float64 [m], in the spheres' frame; `first` is a multiple of `BLOCK`, and so is `last` unless
+    it is the grid's end. mask (blocks of the whole grid) uint8: zero where a block keeps what the channel has.
+    """
+
+    origin: Float64
+    voxel: float
+    shape: tuple[int, int, int]
+    first: int
+    last: int
+    mask: UInt8 | None = None
+
+    @property
+    def shape_of_channel(self) -> tuple[int, int, int]:
+        """(last - first, Y, Z)."""
+        return (self.last - self.first, self.shape[1], self.shape[2])
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """As the kernels take them."""
+        return np.array([*self.shape, self.first, self.last], dtype=np.int64)
+
+
+def nearest(
+    spheres: Clusters, radii: Offsets, points: Float32, *, threads: int = 0
+) -> tuple[Float32, Float32, Int32]:
+    """``min_i |x - p_i| - r_i`` (Q,) at points (Q, 3), its gradient (Q, 3), zero at a centre, its entry (Q,)."""
+    score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
+    entry = np.empty(len(points), np.int32)
+    native.field_nearest(
+        spheres.centers,
+        spheres.boxes,
+        radii.values,
+        radii.maxima,
+        points,
+        num_threads(threads),
+        score,
+        gradient,
+        entry,
+    )
+    return score, gradient, entry
+
+
+def matern(
+    spheres: Clusters,
+    offsets: Offsets,
+    sign: Float32 | None,
     length: float,
     truncation: float,
-    origin: Float64,
-    voxel: float,
-    shape: tuple[int, int, int],
+    points: Float32,
     *,
     threads: int = 0,
-) -> BakedChannels:
-    """Both distances at the cell centres ``origin + voxel (i, j, k)``; `hard` and `soft` share centres and bounds.
+) -> tuple[Float32, Float32]:
+    """``-l log sum_i c_i exp(-(|x - p_i| - o_i) / l)`` (Q,) and its gradient (Q, 3), for points (Q, 3) float32.
 
-    soft_common_offset [m] is left out of the offsets of `soft`, and taken off its distance at the end. The terms left
-    out make up at most the share `truncation`: gpdf is too large by ``-l log(1 - truncation)`` at most.
+    sign (16 C,) the c, 1 where None. The terms left out are at most the share `truncation` of the sum of all sizes:
+    without signs the result is too large by at most ``-l log(1 - truncation)``. NaN where the sum is not positive.
     """
-    sdf, gpdf, exact = (np.empty(shape, np.float32) for _ in range(3))
-    gradient = np.empty((*shape, 3), np.float32)
-    native.field_bake(
-        hard.centers,
-        hard.offsets,
-        hard.max_offsets,
-        soft.offsets,
-        soft.max_offsets,
-        hard.bounds,
-        soft_common_offset,
+    score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
+    native.field_matern(
+        spheres.centers,
+        spheres.boxes,
+        offsets.values,
+        offsets.maxima,
+        sign,
         length,
         truncation,
-        origin,
-        voxel,
+        points,
         num_threads(threads),
-        sdf,
-        gpdf,
-        exact,
+        score,
         gradient,
     )
-    return BakedChannels(sdf=sdf, gpdf=gpdf, hard=exact, gradient=gradient)
+    return score, gradient
+
+
+def gaussian(
+    spheres: Clusters,
+    offsets: Offsets,
+    radii: Float32,
+    sign: Float32 | None,
+    common: float,
+    length: float,
+    tolerance: float,
+    points: Float32,
+    *,
+    threads: int = 0,
+) -> tuple[Float32, Float32]:
+    """``sqrt(-2 l^2 L) - sum_i pi_i r_i`` (Q,) and its gradient (Q, 3), for points (Q, 3) float32.
+
+    ``L = log sum_i c_i w_i exp(-|x - p_i|^2 / (2 l^2))`` and pi the shares of its terms. offsets ``2 l^2 log w_i -
+    common`` [m^2]; radii (16 C,) [m]; sign (16 C,) the c, 1 where None. Without signs the terms left out raise the
+    result by at most `tolerance` [m]. NaN where the root has no positive argument.
+    """
+    score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
+    native.field_gaussian(
+        spheres.centers,
+        spheres.boxes,
+        offsets.values,
+        offsets.maxima,
+        radii,
+        sign,
+        common,
+        length,
+        tolerance,
+        points,
+        num_threads(threads),
+        score,
+        gradient,
+    )
+    return score, gradient
+
+
+def row_sums(spheres: Clusters, has_sphere: UInt8, length: float, *, is_matern: bool, threads: int = 0) -> Float64:
+    """``sum_j k(p_i, p_j)`` (16 C,) over the spheres where `has_sphere` (16 C,) is set, j = i included; 0 elsewhere.
+
+    Terms are rounded to 2^-24 and added as integers: the order of the spheres does not matter to the bit.
+    """
+    total = np.empty(len(has_sphere))
+    native.field_density(spheres.centers, spheres.boxes, has_sphere, is_matern, length, num_threads(threads), total)
+    return total
+
+
+def bake_hard(
+    spheres: Clusters,
+    radii: Offsets,
+    span: GridSpan,
+    distance: Float32,
+    gradient: Float32 | None = None,
+    entry: Int32 | None = None,
+    *,
+    threads: int = 0,
+) -> None:
+    """`nearest` at the cells of `span`, into distance (X, Y, Z), gradient (X, Y, Z, 3), entry (X, Y, Z)."""
+    native.field_bake_hard(
+        spheres.centers,
+        spheres.boxes,
+        radii.values,
+        radii.maxima,
+        span.origin,
+        span.voxel,
+        span.sizes,
+        span.mask,
+        num_threads(threads),
+        distance,
+        gradient,
+        entry,
+    )
+
+
+def bake_gaussian(
+    spheres: Clusters,
+    offsets: Offsets,
+    log_weights: Float64,
+    radii: Float32,
+    sign: Float32 | None,
+    length: float,
+    tolerance: float,
+    span: GridSpan,
+    distance: Float32,
+    gradient: Float32 | None = None,
+    *,
+    threads: int = 0,
+) -> None:
+    """`gaussian` at the cells of `span`; log_weights (16 C,) ``log |w_i|``, offsets ``2 l^2 log |w_i|``."""
+    native.field_bake_gaussian(
+        spheres.centers,
+        spheres.boxes,
+        offsets.values,
+        offsets.maxima,
+        log_weights,
+        radii,
+        sign,
+        length,
+        tolerance,
+        span.origin,
+        span.voxel,
+        span.sizes,
+        span.mask,
+        num_threads(threads),
+        distance,
+        gradient,
+    )
+
+
+def bake_matern(
+    spheres: Clusters,
+    offsets: Offsets,
+    exact_offsets: Float64,
+    sign: Float32 | None,
+    length: float,
+    truncation: float,
+    span: GridSpan,
+    distance: Float32,
+    gradient: Float32 | None = None,
+    *,
+    threads: int = 0,
+) -> None:
+    """`matern` at the cells of `span`; exact_offsets (16 C,) are the offsets in float64."""
+    native.field_bake_matern(
+        spheres.centers,
+        spheres.boxes,
+        offsets.values,
+        offsets.maxima,
+        exact_offsets,
+        sign,
+        length,
+        truncation,
+        span.origin,
+        span.voxel,
+        span.sizes,
+        span.mask,
+        num_threads(threads),
+        distance,
+        gradient,
+    )
+
+
+def touched_blocks(
+    spheres: Clusters,
+    offsets: Offsets,
+    changed: UInt8,
+    length: float | None,
+    span: GridSpan,
+    is_touched: UInt8,
+    *,
+    threads: int = 0,
+) -> None:
+    """Set is_touched (blocks of the grid) to 1 where a sphere marked in `changed` (16 C,) can matter.
+
+    To `bake_hard` where `length` is None (offsets are the radii), else to `bake_gaussian` (``2 l^2 log |w_i|``).
+    """
+    native.field_touched(
+        spheres.centers,
+        spheres.boxes,
+        offsets.values,
+        offsets.maxima,
+        changed,
+        0.0 if length is None else length,
+        span.origin,
+        span.voxel,
+        span.sizes,
+        num_threads(threads),
+        is_touched,
+    )
 
 
 def interpolate(values: Float32, origin: Float64, voxel: float, points: Float64) -> tuple[Float64, Float64]:

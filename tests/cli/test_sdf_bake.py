@@ -9,6 +9,7 @@ import pytest
 from splatctrl_cli.cli.field_truth import FIELDS
 from splatctrl_cli.cli.sdf_bake import SUMMARY_METRICS
 from splatctrl_cli.evaluate.field_accuracy import metric_names
+from splatctrl_cli.field.grid import exact_channel
 from splatctrl_cli.io.grid import read_npz
 from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.io.splats import write_ply
@@ -81,7 +82,11 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
         (["--length-scale", "-1"], 2, "length_scale: expected a length above 0"),
         (["--at", "3"], 2, "is one splat set"),
         (["--truth", "truth.json"], 2, "expected both or neither"),
-        (["--set", "field.kernel=se"], 2, "field.kernel: expected matern, got se"),
+        (
+            ["--set", "field.distance=tsdf"],
+            2,
+            "field.distance: expected one of safe, safe_gpdf, hard, se, gpdf, got tsdf",
+        ),
     ],
 )
 def test_bad_arguments_are_one_line_and_leave_nothing(
@@ -158,7 +163,7 @@ def test_a_scene_is_baked_as_it_was_known_then(
     result = sdf_bake(scene, "-o", tmp_path / "field", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, *times)
     assert result.returncode == 0, result.stderr
     grid = read_npz(tmp_path / "field" / "field.npz")
-    assert grid.channels["hard"][1, 1, 4] == pytest.approx(0.3 - height - 0.01, abs=1e-6)
+    assert exact_channel(grid)[1, 1, 4] == pytest.approx(0.3 - height - 0.01, abs=1e-6)
     assert (grid.channels["observed"] == observed).all()
     digests = grid.header["digests"]
     assert isinstance(digests, dict)

@@ -6,9 +6,11 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field import bake as bake_module
-from splatctrl_cli.field.bake import bake, bounding_box, grid_shape
-from splatctrl_cli.field.distance import GpdfField, SphereField
+from splatctrl_cli.field import layout as layout_module
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
+from splatctrl_cli.field.layout import GridLayout, bounding_box
 from splatctrl_cli.io.grid import write_npz
 from splatctrl_cli.records import SWEPT, Box, DistanceGrid, Float64, Label, OccupancyGrid
 from tests.field.scenes import cloud, splat_set
@@ -27,26 +29,52 @@ def cell_centers(grid: DistanceGrid) -> Float64:
 def test_culled_bake_equals_brute_force(length: float) -> None:
     centers, radii = cloud()
     centers, radii = centers.astype(np.float32).astype(np.float64), radii.astype(np.float32).astype(np.float64)
-    grid = bake(splat_set(centers, radii), BOX, replace(CONFIG, length_scale=length))
+    config = replace(CONFIG, length_scale=length)
+    grid = bake(splat_set(centers, radii), BOX, config, channels=("sdf", "hard", "se", "gpdf", "bound"))
     points = cell_centers(grid)
     hard = reference.hard(points, centers, radii)
     gpdf = reference.gpdf(points, centers, radii, length, CONFIG.noise)
     np.testing.assert_allclose(grid.channels["hard"].ravel(), hard, atol=2e-7)
     error = grid.channels["gpdf"].ravel() - gpdf
     assert error.min() > -3e-7 - 2e-6 * length
-    assert error.max() < length * 1.001e-3 + 4e-7
-    np.testing.assert_array_equal(grid.channels["sdf"], np.minimum(grid.channels["hard"], grid.channels["gpdf"]))
+    assert error.max() < CONFIG.truncation + 4e-7 + 1e-6 * length
+    if length > 1e-6:  # below, which of two centres is nearer is beyond float32
+        smooth, _ = reference.se(points, centers, radii, length, CONFIG.noise)
+        error = grid.channels["se"].ravel() - np.where(np.isnan(smooth), hard, smooth)
+        rounding = 2e-6 + 2e-8 / length + 6e-5 * length  # of exponents where l is small, of a small root where large
+        assert error.min() > -rounding
+        assert error.max() < CONFIG.truncation + rounding
+    np.testing.assert_array_equal(grid.channels["sdf"], np.minimum(grid.channels["hard"], grid.channels["se"]))
+    half_diagonal = 0.5 * np.sqrt(3) * grid.voxel
+    assert (grid.channels["bound"].ravel() <= hard - half_diagonal).all()
+    assert (grid.channels["bound"].ravel() > hard - half_diagonal - 5e-6).all()
 
 
-def test_baked_gradient_is_that_of_the_smaller_distance() -> None:
+@pytest.mark.parametrize(("distance", "kind"), [("safe", SeField), ("safe_gpdf", GpdfField)])
+def test_baked_gradient_is_that_of_the_smaller_distance(distance: str, kind: type[SeField] | type[GpdfField]) -> None:
     centers, radii = cloud()
-    grid = bake(splat_set(centers, radii), BOX, CONFIG)
+    config = replace(CONFIG, distance=distance)
+    kernel = {"safe": "se", "safe_gpdf": "gpdf"}[distance]
+    grid = bake(splat_set(centers, radii), BOX, config, channels=("sdf", "gradient", "hard", kernel))
     points, gradient = cell_centers(grid), grid.channels["gradient"].reshape(-1, 3)
-    is_exact = (grid.channels["hard"] < grid.channels["gpdf"]).ravel()
-    exact, smooth = SphereField(centers, radii), GpdfField(centers, radii, CONFIG.length_scale, truncation=1e-6)
+    is_exact = (grid.channels["hard"] <= grid.channels[kernel]).ravel()
+    exact, smooth = SphereField(centers, radii), kind(centers, radii, CONFIG.length_scale, truncation=1e-6)
     assert is_exact.any()
+    assert (~is_exact).any()
     np.testing.assert_allclose(gradient[~is_exact], smooth.query(points[~is_exact])[1], atol=2e-3)
     np.testing.assert_allclose(gradient[is_exact], exact.query(points[is_exact])[1], atol=1e-4)
+
+
+def test_how_the_planes_are_cut_does_not_change_a_bit() -> None:
+    splats = splat_set(*cloud())
+    whole = bake(splats, BOX, CONFIG).channels
+    layout = GridLayout.over(BOX, CONFIG.voxel)
+    baker = Baker(splats, layout, CONFIG)
+    for first, last in ((0, 8), (8, 24), (24, layout.shape[0])):
+        part = baker.allocate(last - first)
+        baker.bake(first, last, part)
+        for name, values in part.items():
+            np.testing.assert_array_equal(values, whole[name][first:last], err_msg=name)
 
 
 def test_threads_and_repeats_do_not_change_a_bit(tmp_path: Path) -> None:
@@ -57,8 +85,8 @@ def test_threads_and_repeats_do_not_change_a_bit(tmp_path: Path) -> None:
 
 
 def test_grid_covers_its_box_with_cell_centres() -> None:
-    assert grid_shape(Box(lower=np.zeros(3), upper=np.array([1.0, 0.5, 0.05])), 0.1) == (11, 6, 2)
-    assert grid_shape(Box(lower=np.zeros(3), upper=np.array([0.01, 0.3, 0.31])), 0.1) == (2, 4, 5)
+    assert GridLayout.over(Box(lower=np.zeros(3), upper=np.array([1.0, 0.5, 0.05])), 0.1).shape == (11, 6, 2)
+    assert GridLayout.over(Box(lower=np.zeros(3), upper=np.array([0.01, 0.3, 0.31])), 0.1).shape == (2, 4, 5)
 
 
 def test_bounding_box_holds_every_sphere() -> None:
@@ -78,9 +106,12 @@ def test_robot_splats_are_left_out_unless_asked_for() -> None:
         },
     )
     box = Box(lower=np.full(3, -0.03), upper=np.full(3, 0.03))
-    assert bake(both, box, CONFIG).channels["hard"][1, 1, 1] == pytest.approx(0.29, abs=1e-6)
-    with_robot = bake(both, box, CONFIG, labels=set(Label))
+    assert bake(both, box, CONFIG, channels=("sdf", "hard")).channels["hard"][1, 1, 1] == pytest.approx(
+        0.29, abs=1e-6
+    )
+    with_robot = bake(both, box, CONFIG, channels=("sdf", "hard", "label"), labels=set(Label))
     assert with_robot.channels["hard"][1, 1, 1] == pytest.approx(-0.01, abs=1e-6)
+    assert with_robot.channels["label"][1, 1, 1] == Label.ROBOT
     assert with_robot.header["splats_used"] == {"object": 0, "robot": 1, "human": 1}
     with pytest.raises(NotEvaluableError, match="none of 1 is labelled object, human"):
         bake(robot, box, CONFIG)
@@ -112,33 +143,33 @@ def test_observed_comes_from_the_occupancy_voxel_of_the_cell() -> None:
 
 def test_header_says_what_the_numbers_mean() -> None:
     header = bake(splat_set(*cloud()), BOX, CONFIG).header
-    wanted = {"sign": "positive outside", "frame": "world", "units": "m", "weights": "rowsum", "kernel": "matern"}
+    wanted = {"sign": "positive outside", "frame": "world", "units": "m", "weights": "rowsum", "distance": "safe"}
     assert {name: header[name] for name in wanted} == wanted
-    assert header["truncation_bound"] == pytest.approx(2.0e-5, rel=1e-2)
+    assert header["truncation_bound"] == CONFIG.truncation
 
 
 def test_a_grid_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bake_module, "available_memory", lambda: 10**5)
+    monkeypatch.setattr(layout_module, "available_memory", lambda: 10**5)
     with pytest.raises(UsageError, match=r"27 x 27 x 19 cells: needs 0.0 GiB.*larger --voxel"):
         bake(splat_set(*cloud(10)), BOX, CONFIG)
-    assert bake_module.grid_shape(BOX, CONFIG.voxel) == (27, 27, 19)
+    assert GridLayout.over(BOX, CONFIG.voxel).shape == (27, 27, 19)
 
 
 def test_free_memory_is_what_the_machine_and_the_container_leave(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bake_module, "PROC", tmp_path)
-    monkeypatch.setattr(bake_module, "CGROUP", tmp_path)
+    monkeypatch.setattr(layout_module, "PROC", tmp_path)
+    monkeypatch.setattr(layout_module, "CGROUP", tmp_path)
     (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:    5000 kB\n")
-    assert bake_module.available_memory() == 5000 * 1024
+    assert layout_module.available_memory() == 5000 * 1024
     (tmp_path / "memory.max").write_text("3000\n")
     (tmp_path / "memory.current").write_text("1000\n")
-    assert bake_module.available_memory() == 2000
+    assert layout_module.available_memory() == 2000
     (tmp_path / "memory.max").write_text("max\n")
-    assert bake_module.available_memory() == 5000 * 1024
+    assert layout_module.available_memory() == 5000 * 1024
     (tmp_path / "meminfo").write_text("MemTotal: 9 kB\n")
     with pytest.raises(UsageError, match="no MemAvailable line"):
-        bake_module.available_memory()
+        layout_module.available_memory()
 
 
 def test_bad_boxes_voxels_and_splats_are_named() -> None:

@@ -3,7 +3,7 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field.distance import GpdfField, SafeField, SphereField, normalised, safe_field
+from splatctrl_cli.field.distance import DISTANCES, GpdfField, SafeField, SeField, SphereField, make_field, normalised
 from splatctrl_cli.field.health import planar_zero_level
 from splatctrl_cli.geometry import rotation_from_quat
 from splatctrl_cli.records import DistanceField
@@ -11,11 +11,12 @@ from tests.field.scenes import cloud, queries
 from tests.reference import field as reference
 
 LENGTH, NOISE = 0.02, 1e-6
-TRUNCATION_BOUND = 2.1e-5  # [m] -l log(1 - 1e-3), and float32
+TRUNCATION_BOUND = FieldConfig.truncation + 1e-6  # [m], and float32
 
 
 def fields(centers: np.ndarray, radii: np.ndarray) -> list[DistanceField]:
-    return [SphereField(centers, radii), GpdfField(centers, radii, LENGTH), safe_field(centers, radii, FieldConfig())]
+    """Every field of the configuration."""
+    return [make_field(centers, radii, FieldConfig(distance=name, length_scale=LENGTH)) for name in DISTANCES]
 
 
 def test_sdf_is_zero_on_an_isolated_sphere() -> None:
@@ -45,11 +46,42 @@ def test_gpdf_is_the_log_sum_exp_of_the_paper() -> None:
 def test_gpdf_errs_upwards_and_by_no_more_than_its_truncation() -> None:
     centers, radii = cloud()
     expected = reference.gpdf(queries(), centers, radii, LENGTH, NOISE)
-    for truncation in (0.1, 1e-2, 1e-4):
-        field = GpdfField(centers, radii, LENGTH, truncation=truncation)
-        error = field.query(queries())[0] - expected
+    for truncation in (2e-4, 2e-5, 2e-6):
+        error = GpdfField(centers, radii, LENGTH, truncation=truncation).query(queries())[0] - expected
         assert error.min() > -3e-7
-        assert error.max() < field.kernel.truncation_bound() + 3e-7
+        assert error.max() < truncation + 3e-7
+
+
+def test_se_is_the_gaussian_log_sum_exp_with_the_mean_radius() -> None:
+    centers, radii = cloud()
+    for length in (0.005, LENGTH, 0.1):
+        expected, slope = reference.se(queries(), centers, radii, length, NOISE)
+        distance, gradient = SeField(centers, radii, length, truncation=1e-6).query_raw(queries())
+        np.testing.assert_array_equal(np.isnan(distance), np.isnan(expected))
+        np.testing.assert_allclose(distance, expected, atol=2.5e-6)
+        far = expected > 0.02  # nearer, the root's slope grows without limit
+        np.testing.assert_allclose(gradient[far], slope[far], atol=2e-3)
+
+
+def test_se_errs_upwards_and_by_no_more_than_its_truncation() -> None:
+    centers, radii = cloud()
+    expected, _ = reference.se(queries(), centers, radii, LENGTH, NOISE)
+    has_value = ~np.isnan(expected)
+    for truncation in (2e-3, 2e-4, 2e-5):
+        distance = SeField(centers, radii, LENGTH, truncation=truncation).query_raw(queries())[0]
+        error = (distance - expected)[has_value]
+        assert error.min() > -1e-6
+        assert error.max() < truncation + 1e-6
+
+
+def test_fields_without_a_value_fall_back_to_the_exact_one() -> None:
+    centers, radii = cloud()
+    points = centers[:200] + 1e-3
+    field = SeField(centers, radii, 0.1)
+    has_none = np.isnan(field.query_raw(points)[0])
+    assert has_none.any()
+    for got, exact in zip(field.query(points), SphereField(centers, radii).query(points), strict=True):
+        np.testing.assert_array_equal(got[has_none], exact[has_none])
 
 
 def test_log_domain_agrees_with_the_printed_form_where_that_is_finite() -> None:
@@ -62,7 +94,7 @@ def test_log_domain_agrees_with_the_printed_form_where_that_is_finite() -> None:
 def test_gradient_is_that_of_the_distance(length: float) -> None:
     centers, radii = cloud(200)
     points = queries(100) + np.array([0.0, 0.0, 0.6])  # away from the kinks of the nearest sphere's surface
-    field = GpdfField(centers, radii, length, truncation=1e-6)
+    field = GpdfField(centers, radii, length, truncation=1e-8)
     step = 1e-3
     for axis in range(3):
         shift = step * np.eye(3)[axis]
@@ -152,7 +184,7 @@ def test_safe_field_never_exceeds_the_exact_distance() -> None:
     centers = np.concatenate([sparse, np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.02)], axis=1)])
     radii, points = np.full(len(centers), 0.003), queries(400, extent=0.15)
     hard, kernel = SphereField(centers, radii).query(points)[0], GpdfField(centers, radii, LENGTH).query(points)[0]
-    safe, gradient = safe_field(centers, radii, FieldConfig()).query(points)
+    safe, gradient = make_field(centers, radii, FieldConfig(distance="safe_gpdf")).query(points)
     assert (kernel > hard + 1e-3).any()
     assert (safe <= hard).all()
     np.testing.assert_array_equal(safe, np.minimum(hard, kernel))
@@ -208,8 +240,10 @@ def test_bad_queries_and_settings_are_named() -> None:
         GpdfField(centers, radii).query(np.zeros(3))
     with pytest.raises(UsageError, match="length_scale: expected a length above 0"):
         GpdfField(centers, radii, 0.0)
-    with pytest.raises(UsageError, match="kernel: expected matern, got se"):
-        GpdfField(centers, radii, kernel="se")
+    with pytest.raises(UsageError, match=r"weights: expected one of rowsum.*, got mass"):
+        GpdfField(centers, radii, weights="mass")
+    with pytest.raises(UsageError, match="distance: expected one of safe, safe_gpdf, hard, se, gpdf, got tsdf"):
+        make_field(centers, radii, FieldConfig(distance="tsdf"))
     with pytest.raises(UsageError, match="truncation"):
         GpdfField(centers, radii, truncation=0.0)
 
@@ -219,7 +253,8 @@ def test_normalised_gradients_have_length_one_or_none() -> None:
     np.testing.assert_allclose(unit, [[0, 0, 0], [0.6, 0, 0.8]])
 
 
-def test_the_first_of_equal_fields_wins() -> None:
-    field = SphereField(np.zeros((1, 3)), np.zeros(1))
-    distance, gradient = SafeField(field, field).query(np.array([[1.0, 0, 0]]))
+def test_of_equal_distances_the_exact_one_wins() -> None:
+    place, radius = np.zeros((1, 3)), np.zeros(1)
+    safe = SafeField(SphereField(place, radius), GpdfField(place, radius, noise=0.0))
+    distance, gradient = safe.query(np.array([[1.0, 0, 0]]))
     assert (distance[0], gradient[0, 0]) == (1.0, 1.0)

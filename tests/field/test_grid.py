@@ -14,7 +14,7 @@ BOX = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.4))
 
 @pytest.fixture(scope="module")
 def grid() -> DistanceGrid:
-    return bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.04))
+    return bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.04), channels=("sdf", "hard", "bound"))
 
 
 def test_at_a_cell_centre_the_field_is_the_cell(grid: DistanceGrid) -> None:
@@ -55,7 +55,7 @@ def test_certified_distance_never_exceeds_the_exact_one(grid: DistanceGrid) -> N
 
 
 def test_bad_grids_and_channels_are_named(grid: DistanceGrid) -> None:
-    with pytest.raises(InputError, match="no channel 'se'; it has: sdf, gpdf, hard"):
+    with pytest.raises(InputError, match="no channel 'se'; it has: sdf, bound, hard"):
         GridField(grid, "se")
     flat = {name: values[:1] for name, values in grid.channels.items()}
     with pytest.raises(InputError, match="at least 2 cells"):

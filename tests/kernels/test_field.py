@@ -4,58 +4,103 @@ import pytest
 from splatctrl_cli.field.clusters import cluster_points
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels import native as module
+from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries
 
 
-def test_soft_min_of_one_entry_is_its_score() -> None:
+def test_a_kernel_of_one_entry_is_its_score() -> None:
     points = cluster_points(np.array([[1.0, 2.0, 3.0]]))
-    score, gradient = native.soft_min(
-        points.with_offsets(np.array([0.25])), 0.02, 1e-3, points.relative(np.array([[1.0, 2.0, 5.0]]))
-    )
+    at = points.relative(np.array([[1.0, 2.0, 5.0]]))
+    offset = points.offsets(np.array([0.25]))
+    score, gradient = native.matern(points.clusters, offset, None, 0.02, 1e-3, at)
     assert (score[0], gradient[0].tolist()) == (1.75, [0.0, 0.0, 1.0])
+    radii = points.laid_out(np.array([0.25]), spare=0.0).astype(np.float32)
+    none = points.offsets(np.zeros(1))
+    score, gradient = native.gaussian(points.clusters, none, radii, None, 0.0, 0.02, 1e-5, at)
+    np.testing.assert_allclose([score[0], *gradient[0]], [1.75, 0.0, 0.0, 1.0], atol=2e-7)
 
 
-@pytest.mark.parametrize("num", [1, 15, 16, 17, 33])
-def test_spare_entries_of_the_last_cluster_are_never_taken(num: int) -> None:
+@pytest.mark.parametrize("num", [1, 15, 16, 17, 33, 257])
+def test_spare_entries_are_never_taken(num: int) -> None:
     centers, radii = cloud(num)
     points = cluster_points(centers)
-    score, _ = native.nearest(points.with_offsets(radii), points.relative(queries()))
-    expected = np.min(np.linalg.norm(queries()[:, None] - centers, axis=2) - radii, axis=1)
-    np.testing.assert_allclose(score, expected, atol=2e-7)
+    score, _, entry = native.nearest(points.clusters, points.offsets(radii), points.relative(queries()))
+    each = np.linalg.norm(queries()[:, None] - centers, axis=2) - radii
+    np.testing.assert_allclose(score, each.min(axis=1), atol=2e-7)
+    assert points.is_point[entry].all()
+    np.testing.assert_allclose(each[np.arange(len(each)), points.source[entry]], each.min(axis=1), atol=2e-7)
     assert points.num_points == num
 
 
-def test_every_point_is_in_the_box_of_its_cluster() -> None:
+def test_every_point_is_in_the_box_of_its_cluster_and_group() -> None:
     points = cluster_points(cloud(500)[0])
-    grouped = points.centers.reshape(3, -1, native.LANES)
-    np.testing.assert_array_equal(grouped.min(axis=2), points.bounds[:3])
-    np.testing.assert_array_equal(grouped.max(axis=2), points.bounds[3:])
-    assert sorted(points.source[~points.is_spare]) == list(range(500))
+    is_point = points.is_point.view(np.bool_)
+    assert sorted(points.source[is_point]) == list(range(500))
+    place, boxes = points.clusters.centers[:, is_point], points.clusters.boxes
+    cluster = np.flatnonzero(is_point) // native.LANES
+    group = len(points.source) // native.LANES + cluster // native.LANES
+    for box in (cluster, group):
+        assert (boxes[:3, box] <= place).all()
+        assert (place <= boxes[3:, box]).all()
 
 
-def test_at_a_centre_the_gradient_is_zero() -> None:
+def test_points_that_two_sets_share_keep_their_order_and_bits_in_one_frame() -> None:
+    centers, _ = cloud(500)
+    frame = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.6))
+    whole, half = cluster_points(centers, frame), cluster_points(centers[::2], frame)
+    kept = np.flatnonzero(whole.is_point.view(np.bool_) & (whole.source % 2 == 0))
+    np.testing.assert_array_equal(whole.source[kept], 2 * half.source[half.is_point.view(np.bool_)])
+    np.testing.assert_array_equal(
+        whole.clusters.centers[:, kept], half.clusters.centers[:, half.is_point.view(np.bool_)]
+    )
+
+
+@pytest.mark.parametrize("is_matern", [True, False])
+def test_row_sums_are_those_of_the_kernel_matrix_in_any_order(is_matern: bool) -> None:
+    centers, _ = cloud(700)
+    d = np.linalg.norm(centers[:, None] - centers, axis=2)
+    for length in (1e-6, 0.004, 0.05, 3.0):
+        kernel = np.exp(-d / length) if is_matern else np.exp(-0.5 * (d / length) ** 2)
+        points = cluster_points(centers)
+        sums = points.gathered(native.row_sums(points.clusters, points.is_point, length, is_matern=is_matern))
+        np.testing.assert_allclose(sums, kernel.sum(axis=1), rtol=1e-6, atol=700 * 2.0**-25)
+        order = np.random.default_rng(0).permutation(700)
+        frame = Box(lower=centers.min(axis=0), upper=centers.max(axis=0))
+        more = np.concatenate([centers[order], [[9.0, 9.0, 9.0]]])
+        first, other = cluster_points(centers, frame), cluster_points(more, frame)
+        a = first.gathered(native.row_sums(first.clusters, first.is_point, 0.05, is_matern=is_matern, threads=1))
+        b = other.gathered(native.row_sums(other.clusters, other.is_point, 0.05, is_matern=is_matern, threads=3))
+        np.testing.assert_array_equal(b[:-1], a[order])
+
+
+def test_at_a_centre_the_gradient_is_zero_or_finite() -> None:
     points = cluster_points(cloud(50)[0])
-    at = np.ascontiguousarray(points.centers.T[:5])
-    assert not native.nearest(points.with_offsets(np.full(50, 0.01)), at)[1].any()
-    assert np.isfinite(native.soft_min(points.with_offsets(np.zeros(50)), 1e-10, 1e-3, at)[1]).all()
+    at = np.ascontiguousarray(points.clusters.centers.T[:5])
+    assert not native.nearest(points.clusters, points.offsets(np.full(50, 0.01)), at)[1].any()
+    assert np.isfinite(native.matern(points.clusters, points.offsets(np.zeros(50)), None, 1e-10, 1e-3, at)[1]).all()
 
 
 def test_another_dtype_is_refused_not_converted() -> None:
     points = cluster_points(cloud(50)[0])
     with pytest.raises(TypeError):
-        native.nearest(points.with_offsets(np.zeros(50)), queries())  # float64
+        native.nearest(points.clusters, points.offsets(np.zeros(50)), queries())  # float64
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
     points = cluster_points(cloud(50)[0])
-    whole = points.with_offsets(np.zeros(50))
+    clusters, offsets = points.clusters, points.offsets(np.zeros(50))
     at, score, gradient = np.zeros((2, 3), np.float32), np.zeros(2, np.float32), np.zeros((1, 3), np.float32)
+    entry = np.zeros(2, np.int32)
     with pytest.raises(ValueError, match="one entry per point"):
-        module.field_nearest(whole.centers, whole.offsets, whole.bounds, whole.max_offsets, at, 1, score, gradient)
-    with pytest.raises(ValueError, match=r"expected \(16 C\)"):
         module.field_nearest(
-            whole.centers, whole.offsets[:16].copy(), whole.bounds, whole.max_offsets, at, 1, score, gradient
+            clusters.centers, clusters.boxes, offsets.values, offsets.maxima, at, 1, score, gradient, entry
         )
+    short = offsets.values[:16].copy()
+    with pytest.raises(ValueError, match=r"expected \(16 C\)"):
+        module.field_nearest(clusters.centers, clusters.boxes, short, offsets.maxima, at, 1, score, gradient, entry)
+    span = native.GridSpan(origin=np.zeros(3), voxel=0.1, shape=(20, 4, 4), first=4, last=12)
+    with pytest.raises(ValueError, match="whole blocks"):
+        native.bake_hard(clusters, offsets, span, np.zeros((8, 4, 4), np.float32))
 
 
 def test_interpolation_repeats_a_trilinear_function() -> None:

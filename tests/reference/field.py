@@ -42,6 +42,22 @@ def gpdf_gradient(points: Array, centers: Array, radii: Array, length: float, no
     return np.einsum("qn,qna->qa", weight / distances(points, centers), away)
 
 
+def se(points: Array, centers: Array, radii: Array, length: float, noise: float) -> tuple[Array, Array]:
+    """The Gaussian kernel of III-D in the log domain with the mean radius, and its gradient; NaN where L >= 0."""
+    away = points[:, None, :] - centers[None, :, :]
+    sums = np.exp(-(distances(centers, centers) ** 2) / (2 * length**2)).sum(axis=1)
+    exponent = -(distances(points, centers) ** 2) / (2 * length**2) - np.log(noise + sums)
+    largest = exponent.max(axis=1, keepdims=True)
+    share = np.exp(exponent - largest)
+    squared = -2 * length**2 * (largest[:, 0] + np.log(share.sum(axis=1)))
+    share /= share.sum(axis=1, keepdims=True)
+    root = np.sqrt(np.where(squared > 0, squared, np.nan))
+    radius = share @ radii
+    mean = np.einsum("qn,qna->qa", share, away)
+    turn = np.einsum("qn,qna->qa", share * (radii - radius[:, None]), away) / length**2
+    return root - radius, mean / root[:, None] + turn
+
+
 def gpdf_as_printed(points: Array, centers: Array, radii: Array, length: float, noise: float) -> Array:
     """Eq. 7 to 9 with eq. 15 as printed: no log domain, finite only where nothing under- or overflows."""
     occupancy = np.exp(-distances(points, centers) / length) @ (

@@ -1,28 +1,43 @@
-// Both distances on a regular grid, with exact culling by blocks of 8^3 and 4^3 cells.
+// The distances of field_query.h at every cell of a grid, faster: spheres are culled by blocks of cells.
+//
+// Each block's result depends on the spheres that can matter in it and on their order, never on the others: the same
+// block of two scenes that differ elsewhere has the same bits, if the order of the spheres they share is the same.
 #pragma once
 
-#include "field_clusters.h"
+#include "field_blocks.h"
 
 namespace splatctrl {
 
-// Cell (i, j, k) is centred at origin + voxel (i, j, k), in the frame of the spheres.
-struct GridLayout {
-  double origin[3];
-  double voxel;
-  int size[3];
+// hard (X, Y, Z): min_i |x - p_i| - r_i. gradient (X, Y, Z, 3) and entry (X, Y, Z), the sphere that has it, where they
+// are not null.
+//
+// With s_0 the least score at the middle c of a block of radius R, sphere i can be the nearest in it only if
+// s_i(c) - s_0(c) <= turn(...): exact, and far tighter than 2 R where the block is far from both.
+void bake_hard(const Clusters& spheres, const Offsets& radii, const GridSpan& grid, float* hard, float* gradient, int* entry);
+
+// Per sphere: what bake_gaussian needs beside the place. log_weight (16 C) log |w_i|; radius (16 C); sign (16 C) or null.
+struct GaussianTerms {
+  const double* log_weight;
+  const float* radius;
+  const float* sign;
 };
 
-// `soft` has offsets less a common one, which is taken off its distance in double at the end.
-// Writes, per cell (last index fastest): hard, the least score of `hard`; soft, the log-sum-exp of `soft` (the same
-// centres, other offsets; terms left out make up no more than the share `truncation` of the sum, as in query_soft);
-// sdf, the smaller of the two; gradient (3), that of sdf, not normalised.
+// As query_gaussian. offsets: 2 l^2 log |w_i| less any constant; they only cull.
 //
-// Culling: with c the centre of a block and R its half-diagonal, |s_i(x) - s_i(c)| <= R in the block. So
-// - sphere i can be the nearest somewhere in it only if s_i(c) <= min_j s_j(c) + 2 R;
-// - its term there is at most e^(2 R / l) times as large a share of the sum as it is at c. Blocks of 8^3 drop terms that
-//   cannot reach truncation / (2 N) each; sub-blocks of 4^3 drop the farthest, while their shares at c, times
-//   e^(2 R / l), add up to no more than truncation / 2.
-void bake_grid(const Clusters& hard, const Clusters& soft, double soft_common_offset, float length, float truncation,
-               const GridLayout& grid, int num_threads, float* sdf_out, float* soft_out, float* hard_out, float* gradient_out);
+// Exponents of one kernel differ by a linear function: E_i(x) - E_0(x) = E_i(c) - E_0(c) + (x - c).(p_i - p_0) / l^2. So the
+// largest of it over a block is known exactly, the sum over a block factors into exponentials along x, y and z, and
+// with the largest term at the block's middle as reference the sum cannot underflow anywhere in it. Where a factor
+// could overflow, each cell is summed from its own largest term.
+void bake_gaussian(const Clusters& spheres, const Offsets& offsets, const GaussianTerms& terms, float length,
+                   float tolerance, const GridSpan& grid, float* distance, float* gradient);
+
+// As query_matern. offset (16 C): o_i in double; offsets: the same less any constant; they only cull.
+void bake_matern(const Clusters& spheres, const Offsets& offsets, const double* offset, const float* sign, float length,
+                 float truncation, const GridSpan& grid, float* distance, float* gradient);
+
+// changed (16 C) marks spheres; is_touched (blocks of the grid): set to 1 where a marked sphere can matter in bake_hard
+// (length 0) or in bake_gaussian. `offsets` are the radii, or 2 l^2 log |w_i| less any constant.
+void touched_blocks(const Clusters& spheres, const Offsets& offsets, const unsigned char* changed, float length,
+                    const GridSpan& grid, unsigned char* is_touched);
 
 }  // namespace splatctrl

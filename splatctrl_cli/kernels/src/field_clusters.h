@@ -1,108 +1,147 @@
-// Spheres in clusters of 16 neighbours with a box around each: what distance queries and the bake both walk.
+// Spheres in clusters of 16 neighbours, clusters in groups of 16, a box around each: what every distance here walks.
 //
-// Every field here is made of scores s_i(x) = |x - p_i| - o_i: the exact distance is min_i s_i with o_i = r_i, the
-// Matern field is -l log sum_i exp(-s_i / l) with o_i = r_i + l log w_i. A score changes by at most |x - y| from x to
-// y, and inside a cluster it is at least (distance to the box) - (largest o): both culls below rest on these two facts.
+// The fields are made of scores s_i(x) = |x - p_i| - o_i (exact distance: o = r; Matern: o = r + l log w) or of
+// squared ones q_i(x) = |x - p_i|^2 - b_i (squared exponential: b = 2 l^2 log w). A score changes by no more than one
+// moves, and inside a box it is at least (distance to the box) - (largest offset): all culls rest on these two facts.
 #pragma once
 
 #include <cmath>
 #include <vector>
 
+#include "simd.h"
+
 namespace splatctrl {
 
-constexpr int kLanes = 16;
+constexpr int kLanes = 16;  // spheres of a cluster, clusters of a group
+constexpr float kFar = 3e38f;
 
 struct Point {
   float x, y, z;
 };
 
-// Views of C clusters; entry 16 c + k is sphere k of cluster c; spare entries have an offset of -1e30.
+// Views of C clusters (a multiple of 16) and G groups (a multiple of 8). Boxes (6, C + G): lower then upper corner,
+// clusters then groups. Spare entries stand far away with an offset of -1e30.
 struct Clusters {
-  int num_clusters;
-  const float *x, *y, *z, *offset;                                          // (16 C)
-  const float *lower_x, *lower_y, *lower_z, *upper_x, *upper_y, *upper_z;  // (C)
-  const float* max_offset;                                                 // (C)
-  float offset_scale;                                                      // the largest |max_offset|
+  int num_clusters, num_groups;
+  const float *x, *y, *z;  // (16 C)
+  const float* boxes[6];   // (C + G) each
 };
 
-// Work space of one thread.
-struct Scratch {
-  std::vector<float> bounds;  // (C) lower bound of the scores in each cluster
-  std::vector<int> kept;
+// One offset for each sphere, and the largest of each cluster and group.
+struct Offsets {
+  const float* value;    // (16 C)
+  const float* maximum;  // (C + G)
 };
 
-// Smallest of 16 floats.
-inline float min_lanes(const float* values) {
-  float m[kLanes / 2];
-  for (int k = 0; k < 8; ++k) m[k] = values[k] < values[k + 8] ? values[k] : values[k + 8];
-  for (int k = 0; k < 4; ++k) m[k] = m[k] < m[k + 4] ? m[k] : m[k + 4];
-  for (int k = 0; k < 2; ++k) m[k] = m[k] < m[k + 2] ? m[k] : m[k + 2];
-  return m[0] < m[1] ? m[0] : m[1];
+// Squared distances from q to eight boxes, the first of them at `box`.
+inline Float8 squared_box_distances(const Clusters& s, int box, Point q) {
+  const Float8 zero{};
+  const Float8 dx = max8(load8(s.boxes[0] + box) - q.x, q.x - load8(s.boxes[3] + box));
+  const Float8 dy = max8(load8(s.boxes[1] + box) - q.y, q.y - load8(s.boxes[4] + box));
+  const Float8 dz = max8(load8(s.boxes[2] + box) - q.z, q.z - load8(s.boxes[5] + box));
+  const Float8 x = max8(dx, zero), y = max8(dy, zero), z = max8(dz, zero);
+  return x * x + y * y + z * z;
 }
 
-// Sum of 16 floats, in one fixed order.
-inline float sum_lanes(const float* values) {
-  float s[kLanes / 2];
-  for (int k = 0; k < 8; ++k) s[k] = values[k] + values[k + 8];
-  for (int k = 0; k < 4; ++k) s[k] += s[k + 4];
-  return (s[0] + s[2]) + (s[1] + s[3]);
+inline Float8 box_distances(const Clusters& s, int box, Point q) { return sqrt8(squared_box_distances(s, box, q)); }
+
+// Distances from q to the farthest corners of eight boxes.
+inline Float8 farthest_corners(const Clusters& s, int box, Point q) {
+  const Float8 dx = max8(q.x - load8(s.boxes[0] + box), load8(s.boxes[3] + box) - q.x);
+  const Float8 dy = max8(q.y - load8(s.boxes[1] + box), load8(s.boxes[4] + box) - q.y);
+  const Float8 dz = max8(q.z - load8(s.boxes[2] + box), load8(s.boxes[5] + box) - q.z);
+  return sqrt8(dx * dx + dy * dy + dz * dz);
 }
 
-// Scores (16) of cluster c at q.
-inline void cluster_scores(const Clusters& s, int c, Point q, float* scores) {
-  const float *x = s.x + kLanes * c, *y = s.y + kLanes * c, *z = s.z + kLanes * c, *o = s.offset + kLanes * c;
-  for (int k = 0; k < kLanes; ++k) {
-    const float dx = q.x - x[k], dy = q.y - y[k], dz = q.z - z[k];
-    scores[k] = std::sqrt(dx * dx + dy * dy + dz * dz) - o[k];
-  }
+// Squared distances from q to eight spheres' centres, the first of them at `entry`.
+inline Float8 squared_center_distances(const Clusters& s, int entry, Point q) {
+  const Float8 dx = q.x - load8(s.x + entry), dy = q.y - load8(s.y + entry), dz = q.z - load8(s.z + entry);
+  return dx * dx + dy * dy + dz * dz;
 }
+
+inline Float8 center_distances(const Clusters& s, int entry, Point q) { return sqrt8(squared_center_distances(s, entry, q)); }
+
+// The kinds of score, of a squared distance and an offset; a bound of a box is the same of its distance and maximum.
+struct LinearScore {
+  static Float8 of(Float8 squared, Float8 offset) { return sqrt8(squared) - offset; }
+};
+struct SquaredScore {
+  static Float8 of(Float8 squared, Float8 offset) { return squared - offset; }
+};
 
 // What float32 may have lost in any score near `score` at q: added to every threshold, so that culls stay exact.
-inline float rounding_slack(const Clusters& s, Point q, float score) {
-  return 2e-6f * (std::fabs(q.x) + std::fabs(q.y) + std::fabs(q.z) + std::fabs(score) + s.offset_scale);
+inline float rounding_slack(Point q, float score) {
+  return 4e-6f * (std::fabs(q.x) + std::fabs(q.y) + std::fabs(q.z) + std::fabs(score)) + 1e-30f;
 }
 
-// Lower bounds of the scores at q, by cluster; returns the cluster with the least.
-inline int bound_clusters(const Clusters& s, Point q, std::vector<float>& bounds) {
-  bounds.resize(s.num_clusters);
-  float* out = bounds.data();
-  for (int c = 0; c < s.num_clusters; ++c) {
-    const float below_x = s.lower_x[c] - q.x, above_x = q.x - s.upper_x[c];
-    const float below_y = s.lower_y[c] - q.y, above_y = q.y - s.upper_y[c];
-    const float below_z = s.lower_z[c] - q.z, above_z = q.z - s.upper_z[c];
-    float dx = below_x > above_x ? below_x : above_x, dy = below_y > above_y ? below_y : above_y;
-    float dz = below_z > above_z ? below_z : above_z;
-    dx = dx > 0.0f ? dx : 0.0f;
-    dy = dy > 0.0f ? dy : 0.0f;
-    dz = dz > 0.0f ? dz : 0.0f;
-    out[c] = std::sqrt(dx * dx + dy * dy + dz * dz) - s.max_offset[c];
-  }
-  int least = 0;
-  for (int c = 1; c < s.num_clusters; ++c) least = out[c] < out[least] ? c : least;
-  return least;
-}
-
-// The least score at q and the entry that has it (the first, among equals in the order visited).
+// The least score at q and the first entry that has it.
 struct Nearest {
   float score;
   int entry;
 };
 
-// Fills scratch.bounds on the way.
-inline Nearest find_nearest(const Clusters& s, Point q, Scratch& scratch) {
-  Nearest nearest{3e38f, 0};
-  float scores[kLanes];
-  const auto visit = [&](int c) {
-    cluster_scores(s, c, q, scores);
-    if (!(min_lanes(scores) < nearest.score)) return;
+// Lower bounds of the scores at q in each group; returns the group with the least.
+template <typename Score>
+int bound_groups(const Clusters& s, const Offsets& o, Point q, std::vector<float>& bounds) {
+  bounds.resize(s.num_groups);
+  for (int g = 0; g < s.num_groups; g += 8)
+    store8(&bounds[g], Score::of(squared_box_distances(s, s.num_clusters + g, q), load8(o.maximum + s.num_clusters + g)));
+  int least = 0;
+  for (int g = 1; g < s.num_groups; ++g) least = bounds[g] < bounds[least] ? g : least;
+  return least;
+}
+
+// Lower bounds (16) of the scores at q in the clusters of a group.
+template <typename Score>
+void bound_clusters(const Clusters& s, const Offsets& o, int group, Point q, float* bounds) {
+  for (int k = 0; k < kLanes; k += 8) {
+    const int cluster = kLanes * group + k;
+    store8(bounds + k, Score::of(squared_box_distances(s, cluster, q), load8(o.maximum + cluster)));
+  }
+}
+
+// Calls visit(cluster) where a cluster's bound does not exceed limit(), which may fall on the way. `bounds` as filled
+// by bound_groups at q.
+template <typename Score, typename Limit, typename Visit>
+void walk_clusters(const Clusters& s, const Offsets& o, Point q, const std::vector<float>& bounds, const Limit& limit,
+                   const Visit& visit) {
+  float cluster_bounds[kLanes];
+  const int groups = (s.num_clusters + kLanes - 1) / kLanes;
+  for (int g = 0; g < groups; ++g) {
+    if (!(bounds[g] <= limit())) continue;
+    bound_clusters<Score>(s, o, g, q, cluster_bounds);
     for (int k = 0; k < kLanes; ++k)
-      if (scores[k] < nearest.score) nearest = {scores[k], kLanes * c + k};
+      if (cluster_bounds[k] <= limit()) visit(kLanes * g + k);
+  }
+}
+
+// Fills `bounds` on the way.
+template <typename Score>
+Nearest find_nearest(const Clusters& s, const Offsets& o, Point q, std::vector<float>& bounds) {
+  Nearest nearest{kFar, 0};
+  float slack = 0.0f;
+  const auto visit = [&](int cluster) {
+    Float8 score[2];
+    for (int h = 0; h < 2; ++h) {
+      const int entry = kLanes * cluster + 8 * h;
+      score[h] = Score::of(squared_center_distances(s, entry, q), load8(o.value + entry));
+    }
+    if (!any8((score[0] <= nearest.score) | (score[1] <= nearest.score))) return;
+    for (int k = 0; k < kLanes; ++k) {
+      const Nearest other{score[k / 8][k % 8], kLanes * cluster + k};
+      if (other.score < nearest.score || (other.score == nearest.score && other.entry < nearest.entry)) nearest = other;
+    }
   };
-  const int first = bound_clusters(s, q, scratch.bounds);
-  visit(first);
-  const float slack = rounding_slack(s, q, nearest.score);
-  for (int c = 0; c < s.num_clusters; ++c)
-    if (scratch.bounds[c] <= nearest.score + slack && c != first) visit(c);
+  const int group = bound_groups<Score>(s, o, q, bounds);
+  float cluster_bounds[kLanes];
+  bound_clusters<Score>(s, o, group, q, cluster_bounds);
+  int first = 0;
+  for (int k = 1; k < kLanes; ++k) first = cluster_bounds[k] < cluster_bounds[first] ? k : first;
+  visit(kLanes * group + first);
+  slack = rounding_slack(q, nearest.score);
+  walk_clusters<Score>(s, o, q, bounds, [&] { return nearest.score + slack; }, [&](int c) {
+    if (c != kLanes * group + first) visit(c);
+  });
   return nearest;
 }
 

@@ -1,17 +1,38 @@
-// Distances and gradients at points: the exact one, and the log-sum-exp of the Matern field.
+// Distances and gradients at points: the exact one, and the log-sum-exps of the two kernels.
 #pragma once
 
 #include "field_clusters.h"
 
 namespace splatctrl {
 
-// Score and its gradient at Q points (Q, 3): min_i s_i(x).
-void query_nearest(const Clusters& spheres, const float* points, int num_points, int num_threads, float* score,
-                   float* gradient);
+// What is asked at Q points (Q, 3), and where the answers go: score (Q) and its gradient (Q, 3).
+struct Query {
+  const float* points;
+  int num_points, num_threads;
+  float *score, *gradient;
+};
 
-// -l log sum_i exp(-s_i(x) / l) and its gradient. Terms may be left out that together make up no more than the share
-// `truncation` of the sum: the result is then too large by at most -l log(1 - truncation).
-void query_soft(const Clusters& spheres, float length, float truncation, const float* points, int num_points,
-                int num_threads, float* score, float* gradient);
+// min_i s_i(x); entry (Q): which sphere has it.
+void query_nearest(const Clusters& spheres, const Offsets& radii, const Query& query, int* entry);
+
+// -l log sum_i c_i exp(-s_i(x) / l), c_i = sign (16 C) or 1 where it is null. Terms may be left out that together make
+// up no more than the share `truncation` of the sum of all |terms|: without signs the result is too large by at most
+// -l log(1 - truncation). NaN where the sum is not positive.
+void query_matern(const Clusters& spheres, const Offsets& offsets, const float* sign, float length, float truncation,
+                  const Query& query);
+
+// With L = log sum_i c_i exp(-q_i(x) / (2 l^2)), b_i = 2 l^2 log w_i less `common`: sqrt(-2 l^2 L - common) less the mean
+// of the radii (16 C) under the terms. Without signs the terms left out raise it by at most `tolerance`. NaN where the
+// root has no positive argument.
+void query_gaussian(const Clusters& spheres, const Offsets& offsets, const float* radii, const float* sign, double common,
+                    float length, float tolerance, const Query& query);
+
+// By how much the logarithm of the Gaussian sum may fall short where the distance is `distance`, so that the distance
+// grows by no more than `tolerance`: (d + t)^2 - d^2 = 2 l^2 log_share. At most a thousandth, for the gradient's sake.
+inline float gaussian_log_share(float distance, float tolerance, float length) {
+  const float d = distance > tolerance ? 2.0f * distance - tolerance : tolerance;
+  const float share = 0.5f * (tolerance / length) * (d / length);
+  return share < 1e-3f ? share : 1e-3f;
+}
 
 }  // namespace splatctrl

@@ -100,4 +100,14 @@ inline Float8 exp2_8(Float8 x) {
   return (Float8)((Int8)p + ((Int8)shifted << 23));
 }
 
+// log x for positive, normal x, to 2e-7 of 1 or of the result, whichever is larger. x = 2^n m with m in [1/sqrt 2, sqrt 2);
+// log m = 2 atanh((m - 1) / (m + 1)), five terms of its series.
+inline Float8 log8(Float8 x) {
+  const Int8 n = ((Int8)x - 0x3f3504f3) >> 23;
+  const Float8 m = (Float8)((Int8)x - (n << 23));
+  const Float8 s = (m - 1.0f) / (m + 1.0f), ss = s * s;
+  const Float8 series = 2.0f + ss * (0.666666667f + ss * (0.4f + ss * (0.285714286f + ss * 0.222222222f)));
+  return __builtin_convertvector(n, Float8) * 0.693147181f + s * series;
+}
+
 }  // namespace splatctrl

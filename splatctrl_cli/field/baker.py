@@ -1,0 +1,174 @@
+"""A distance field over the planes of a grid, a few at a time: what every way of baking is made of."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import FieldConfig, OccupancyConfig
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.distance import GpdfField, SeField, SphereField, checked_distance
+from splatctrl_cli.field.layout import HALF_DIAGONAL, GridLayout
+from splatctrl_cli.field.observed import observed_planes
+from splatctrl_cli.field.spheres import Spheres
+from splatctrl_cli.kernels import field as native
+from splatctrl_cli.kernels.field import BLOCK, GridSpan
+from splatctrl_cli.records import Bool, Float32, OccupancyGrid, SplatSet, UInt8
+
+CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
+    "sdf": ("<f4", 1),
+    "gradient": ("<f4", 3),
+    "bound": ("<f4", 1),
+    "observed": ("|u1", 1),
+    "label": ("|u1", 1),
+    "hard": ("<f4", 1),
+    "se": ("<f4", 1),
+    "gpdf": ("<f4", 1),
+}
+DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
+KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
+_TEMPORARY_BYTES = 64 << 20  # of the arrays beside the channels
+
+Planes = dict[str, NDArray[np.generic]]
+
+
+class Baker:
+    """The channels of a field over splats at the cells of `layout`.
+
+    Nothing depends on how the planes are cut or on the number of threads, to the bit. num_without_value counts the
+    cells where a kernel field had no distance and the exact one stands in, by its name.
+    """
+
+    def __init__(
+        self,
+        splats: SplatSet,
+        layout: GridLayout,
+        config: FieldConfig,
+        *,
+        channels: Collection[str] = DEFAULT_CHANNELS,
+        occupancy: OccupancyGrid | None = None,
+        thresholds: OccupancyConfig | None = None,
+        threads: int = 0,
+    ) -> None:
+        """splats: those of the field. Raises as `Spheres.of`; UsageError for unknown channels, or without sdf."""
+        unknown = [name for name in channels if name not in CHANNELS]
+        if unknown or "sdf" not in channels:
+            raise UsageError(f"channels: expected sdf and some of {', '.join(CHANNELS)}, got {', '.join(channels)}")
+        self.layout, self.config, self.threads = layout, config, threads
+        self.channels = tuple(name for name in CHANNELS if name in channels)
+        self.labels = splats.labels
+        self.spheres = Spheres.of(splats.centers, splats.radii, layout.box)
+        self.exact = SphereField.over(self.spheres, threads=threads)
+        self.kernel_name = KERNEL_OF[checked_distance(config.distance)]
+        names = {self.kernel_name, *channels}
+        self.se = SeField.over(self.spheres, config, threads=threads) if "se" in names else None
+        self.gpdf = GpdfField.over(self.spheres, config, threads=threads) if "gpdf" in names else None
+        self.num_without_value: dict[str, int] = {name: 0 for name in ("se", "gpdf") if name in names}
+        self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
+
+    @property
+    def bound_margin(self) -> float:
+        """What `bound` stands below the exact distance at a cell's centre [m].
+
+        Half a cell's diagonal (the exact distance changes by no more than one moves), and what float32 may lose: of
+        coordinates relative to the grid's middle, and of the distance.
+        """
+        box = self.layout.box
+        reach = np.abs(self.spheres.points.clusters.centers[:, self.spheres.points.is_point.view(np.bool_)]).max()
+        size = float(np.abs(box.upper - box.lower).max()) + float(reach)
+        return HALF_DIAGONAL * self.layout.voxel + 1e-6 + 1e-6 * size
+
+    def allocate(self, num_planes: int) -> Planes:
+        """Arrays for the channels of `num_planes` x-planes."""
+        return {name: np.empty(self.shape_of(name, num_planes), CHANNELS[name][0]) for name in self.channels}
+
+    def shape_of(self, channel: str, num_planes: int) -> tuple[int, ...]:
+        """(num_planes, Y, Z), or (num_planes, Y, Z, 3)."""
+        shape = (num_planes, *self.layout.shape[1:])
+        return shape if CHANNELS[channel][1] == 1 else (*shape, CHANNELS[channel][1])
+
+    def bake(self, first: int, last: int, out: Planes, mask: UInt8 | None = None) -> None:
+        """Fill the channels `out` (last - first, Y, Z) of the x-planes [first, last), whole blocks of 8 cells.
+
+        mask (blocks of the grid) uint8: where it is zero, a block of `out` keeps what it has.
+        """
+        per_plane = 40 * self.layout.shape[1] * self.layout.shape[2]
+        step = BLOCK * max(1, _TEMPORARY_BYTES // (BLOCK * per_plane))
+        for begin in range(first, last, step):
+            end = min(begin + step, last)
+            part = {name: values[begin - first : end - first] for name, values in out.items()}
+            self._bake_planes(begin, end, part, mask)
+
+    def _bake_planes(self, first: int, last: int, out: Planes, mask: UInt8 | None) -> None:
+        span = GridSpan(
+            origin=self.layout.origin - self.spheres.points.anchor,
+            voxel=self.layout.voxel,
+            shape=self.layout.shape,
+            first=first,
+            last=last,
+            mask=mask,
+        )
+        where = np.ones(span.shape_of_channel, np.bool_) if mask is None else _cells(mask, span)
+        hard, gradient, entry = self._hard(span)
+        kernels: dict[str, tuple[Float32, Float32 | None]] = {}
+        for name in self.num_without_value:
+            kernels[name] = self._kernel(name, span)
+        for name, (distance, _) in kernels.items():
+            self.num_without_value[name] += int(np.count_nonzero(np.isnan(distance) & where))
+        sdf, slope = self._chosen(hard, gradient, kernels)
+        made: dict[str, NDArray[np.generic]] = {"sdf": sdf, "hard": hard}
+        if slope is not None:
+            made["gradient"] = slope
+        if "bound" in self.channels:
+            made["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
+        if entry is not None:
+            made["label"] = self.labels[self.spheres.points.source[entry]]
+        if "observed" in self.channels:
+            made["observed"] = observed_planes(self._occupancy, self.layout, self._thresholds, first, last)
+        for name, (distance, _) in kernels.items():
+            made[name] = np.where(np.isnan(distance), hard, distance)
+        for name in self.channels:
+            if mask is None:
+                out[name][...] = made[name]
+            else:
+                np.copyto(out[name], made[name], where=where if made[name].ndim == 3 else where[..., None])
+
+    def _hard(self, span: GridSpan) -> tuple[Float32, Float32 | None, NDArray[np.int32] | None]:
+        hard = np.zeros(span.shape_of_channel, np.float32)
+        gradient = np.zeros((*hard.shape, 3), np.float32) if "gradient" in self.channels else None
+        entry = np.zeros(hard.shape, np.int32) if "label" in self.channels else None
+        native.bake_hard(
+            self.spheres.points.clusters, self.exact.radii, span, hard, gradient, entry, threads=self.threads
+        )
+        return hard, gradient, entry
+
+    def _kernel(self, name: str, span: GridSpan) -> tuple[Float32, Float32 | None]:
+        distance = np.zeros(span.shape_of_channel, np.float32)
+        has_gradient = "gradient" in self.channels and name == self.kernel_name
+        gradient = np.zeros((*distance.shape, 3), np.float32) if has_gradient else None
+        field = self.se if name == "se" else self.gpdf
+        assert field is not None
+        field.bake_raw(span, distance, gradient, threads=self.threads)
+        return distance, gradient
+
+    def _chosen(
+        self, hard: Float32, gradient: Float32 | None, kernels: Mapping[str, tuple[Float32, Float32 | None]]
+    ) -> tuple[Float32, Float32 | None]:
+        """The distance that the configuration names, and its gradient."""
+        if self.kernel_name is None:
+            return hard, gradient
+        smooth, smooth_gradient = kernels[self.kernel_name]
+        is_smooth: Bool = ~np.isnan(smooth) if self.config.distance == self.kernel_name else smooth < hard
+        sdf = np.where(is_smooth, smooth, hard)
+        if gradient is None or smooth_gradient is None:
+            return sdf, None
+        return sdf, np.where(is_smooth[..., None], smooth_gradient, gradient)
+
+
+def _cells(mask: UInt8, span: GridSpan) -> Bool:
+    """A mask of blocks as one of the span's cells."""
+    blocks = mask[span.first // BLOCK : -(-span.last // BLOCK)].view(np.bool_)
+    for axis in range(3):
+        blocks = np.repeat(blocks, BLOCK, axis=axis)
+    x, y, z = span.shape_of_channel
+    return np.ascontiguousarray(blocks[:x, :y, :z])

@@ -1,0 +1,59 @@
+"""What a baked field says of itself."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.health import field_health
+from splatctrl_cli.field.selection import label_counts
+from splatctrl_cli.records import Label, SplatSet
+
+FORMAT_VERSION = 2
+MEANING = {
+    "safe": "min(se, hard)",
+    "safe_gpdf": "min(gpdf, hard)",
+    "hard": "exact distance to the splats' spheres",
+    "se": "squared-exponential field; hard where it has no value",
+    "gpdf": "Matern-1/2 field of the paper; hard where it has no value",
+}
+
+
+def field_header(
+    splats: SplatSet, chosen: SplatSet, labels: Collection[Label], baker: Baker, *, has_occupancy: bool
+) -> dict[str, object]:
+    """The header of what `baker` baked of `chosen`, those of `splats` that have one of `labels`."""
+    config = baker.config
+    radii: Mapping[str, float] = {
+        "min": float(chosen.radii.min()),
+        "median": float(np.median(chosen.radii)),
+        "mean": float(chosen.radii.mean(dtype=np.float64)),
+        "max": float(chosen.radii.max()),
+    }
+    return {
+        "format": "splatctrl distance grid",
+        "version": FORMAT_VERSION,
+        "sign": "positive outside",
+        "frame": "world",
+        "units": "m",
+        "origin": "centre of cell (0, 0, 0)",
+        "distance": config.distance,
+        "sdf": MEANING[config.distance],
+        "gradient": "of sdf, not normalised",
+        "bound": "no point of the cell is nearer to a splat's sphere; bound + bound_margin is hard at its centre",
+        "bound_margin": baker.bound_margin,
+        "kernel": {None: "none", "se": "squared exponential", "gpdf": "matern 1/2"}[baker.kernel_name],
+        "length_scale": config.length_scale,
+        "noise": config.noise,
+        "weights": config.weights,
+        "truncation_bound": config.truncation,
+        "cells_without_value": dict(baker.num_without_value),
+        "unknown": config.unknown,
+        "observed": "from the occupancy grid" if has_occupancy else "no occupancy grid: all never seen",
+        "inside": "a shell: cells deep inside a closed object read positive; take the sign there from observed",
+        "labels": sorted(label.name.lower() for label in labels),
+        "splats_given": label_counts(splats),
+        "splats_used": label_counts(chosen),
+        "radius": radii,
+        "health": field_health(chosen.centers, chosen.radii, config.length_scale).as_dict(),
+    }

@@ -1,0 +1,86 @@
+"""Where the cells of a distance grid stand, and whether there is room for them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.records import Box, Float64, SplatSet
+
+PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
+
+HALF_DIAGONAL = 0.5 * 3.0**0.5  # of a cell, in voxels
+
+Shape = tuple[int, int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridLayout:
+    """Cells (i, j, k) of size `voxel` [m], centred at ``origin + voxel (i, j, k)``, world [m]."""
+
+    origin: Float64
+    voxel: float
+    shape: Shape
+
+    @classmethod
+    def over(cls, box: Box, voxel: float) -> "GridLayout":
+        """Cells whose centres run from the box's lower corner to its upper one or just beyond, two at least.
+
+        Raises UsageError for a voxel or a box without size.
+        """
+        if not (np.isfinite(voxel) and voxel > 0):
+            raise UsageError(f"voxel: expected a size above 0 m, got {voxel}")
+        extent = box.upper - box.lower
+        if not np.isfinite(extent).all() or not (extent > 0).all():
+            raise UsageError(
+                f"box: expected lower < upper along each axis, got {box.lower.tolist()}, {box.upper.tolist()}"
+            )
+        x, y, z = (max(2, int(np.ceil(side / voxel - 1e-6)) + 1) for side in extent)
+        return cls(origin=box.lower.copy(), voxel=voxel, shape=(x, y, z))
+
+    @property
+    def box(self) -> Box:
+        """The box of the cell centres."""
+        return Box(lower=self.origin, upper=self.origin + self.voxel * (np.array(self.shape) - 1))
+
+    @property
+    def num_cells(self) -> int:
+        """X Y Z."""
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+
+def bounding_box(splats: SplatSet, padding: float) -> Box:
+    """The box of the splats' spheres, widened by `padding` [m] on every side."""
+    lower = (splats.centers - splats.radii[:, None]).min(axis=0).astype(np.float64)
+    upper = (splats.centers + splats.radii[:, None]).max(axis=0).astype(np.float64)
+    return Box(lower=lower - padding, upper=upper + padding)
+
+
+def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:
+    """Raise UsageError where a grid needs more memory than is free."""
+    needed, free = bytes_per_cell * layout.num_cells, available_memory()
+    if needed > free:
+        size = " x ".join(str(n) for n in layout.shape)
+        raise UsageError(
+            f"grid of {size} cells: needs {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
+            remedy="give a larger --voxel or a smaller --box",
+        )
+
+
+def available_memory() -> int:
+    """Bytes that can be had without swapping, by the kernel's own estimate and the limit on this process's group."""
+    for line in (PROC / "meminfo").read_text(encoding="ascii").splitlines():
+        if line.startswith("MemAvailable:"):
+            return min([int(line.split()[1]) * 1024, *_group_room()])
+    raise UsageError("/proc/meminfo: no MemAvailable line", remedy="run on Linux 3.14 or newer")
+
+
+def _group_room() -> list[int]:
+    """What a container may still take, where its control group says so."""
+    try:
+        limit = (CGROUP / "memory.max").read_text(encoding="ascii").strip()
+        used = int((CGROUP / "memory.current").read_text(encoding="ascii"))
+    except OSError:
+        return []
+    return [] if limit == "max" else [max(int(limit) - used, 0)]
