@@ -14,6 +14,7 @@ grid by the pose of its middle, ``x y z qw qx qy qz``. They differ in the rest:
 """
 
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.io.arrays import savez
+from splatctrl_cli.io.arrays import Pieces, savez
 from splatctrl_cli.io.grid_channels import check_grid, header_text, slabs
 from splatctrl_cli.records import DistanceGrid, Float64
 
@@ -35,8 +36,8 @@ def write_curobo(path: Path, grid: DistanceGrid, *, version: str = "0.7", channe
     """Write `channel`, a distance, for cuRobo of `version`: 0.7 (0.7.5 to 0.7.7) or 0.8.
 
     With ``bound`` no sphere in a cell is nearer than the cell says, whatever the look-up. float16 (0.8) is rounded
-    towards less distance. The whole channel is held in memory once, as its user will hold it.
-    Raises UsageError for another version or a channel that is no distance of the grid, InputError for NaN.
+    towards less distance. Raises UsageError for another version or a channel that is no distance of the grid,
+    InputError for NaN.
     """
     shape = check_grid(grid)
     if version not in VERSIONS:
@@ -44,19 +45,18 @@ def write_curobo(path: Path, grid: DistanceGrid, *, version: str = "0.7", channe
     if channel not in DISTANCES or channel not in grid.channels:
         have = [name for name in DISTANCES if name in grid.channels]
         raise UsageError(f"cuRobo channel {channel}: expected a distance of the grid: {', '.join(have)}")
+    if any(np.isnan(layers).any() for layers in slabs(grid.channels[channel])):
+        raise InputError(
+            f"grid to write for cuRobo: {channel}: expected distances, got NaN",
+            remedy="bake with field.unknown=obstacle or free",
+        )
     dims, center = _place(grid, np.array(shape, np.float64), version)
-    features = np.empty(np.prod(shape), np.float32 if version == "0.7" else np.float16)
-    at = 0
-    for layers in slabs(grid.channels[channel]):
-        values = layers.ravel().astype(np.float32, copy=False)
-        if np.isnan(values).any():
-            raise InputError(
-                f"grid to write for cuRobo: {channel}: expected distances, got NaN",
-                remedy="bake with field.unknown=obstacle or free",
-            )
-        features[at : at + values.size] = -values if version == "0.7" else round_down(values)
-        at += values.size
-    arrays: dict[str, NDArray[np.generic]] = {
+    features = Pieces(
+        dtype="<f4" if version == "0.7" else "<f2",
+        shape=(shape[0] * shape[1] * shape[2],),
+        make=lambda: _features(grid.channels[channel], version),
+    )
+    arrays: dict[str, NDArray[np.generic] | Pieces] = {
         "features": features,
         "dims": dims,
         "voxel_size": np.asarray(grid.voxel, "<f8"),
@@ -67,6 +67,12 @@ def write_curobo(path: Path, grid: DistanceGrid, *, version: str = "0.7", channe
         "header": np.asarray(header_text(grid)),
     }
     savez(path, arrays, level=0)
+
+
+def _features(distances: NDArray[np.generic], version: str) -> Iterator[NDArray[np.generic]]:
+    for layers in slabs(distances):
+        values = layers.astype(np.float32, copy=False)
+        yield -values if version == "0.7" else round_down(values)
 
 
 def _place(grid: DistanceGrid, shape: Float64, version: str) -> tuple[Float64, Float64]:

@@ -72,7 +72,7 @@ def write_grid(
 ) -> tuple[Path, ...]:
     """Write the grid in each of the formats `names` into `folder`, and return the files.
 
-    Channels may be memory maps: none is held in memory whole (but for vdb and curobo). Raises as `check_formats`
+    Channels may be memory maps: none is held in memory whole (but for vdb). Raises as `check_formats`
     does, and NotEvaluableError where a surface is asked for that the grid does not have.
     """
     check_formats(names, grid.channels)
