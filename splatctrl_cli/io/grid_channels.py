@@ -104,7 +104,7 @@ def check_layout(name: str, arrays: Mapping[str, tuple[str, tuple[int, ...]]]) -
             remedy="give a grid that sdf-bake wrote",
         )
     cells = arrays["sdf"][1]
-    if len(cells) != 3 or 0 in cells:
+    if len(cells) != 3 or min(cells) < 1:
         raise InputError(f"{name}: sdf: expected (X, Y, Z) cells, got {cells}", remedy="bake it again")
     shape = (cells[0], cells[1], cells[2])
     for channel, got in arrays.items():

@@ -42,7 +42,7 @@ class _Block:
     name: str
     dtype: str
     components: int
-    start: int  # [bytes] of its length, in the file
+    start: int  # [bytes] in the file, of the length before it
 
 
 def write_vti(path: Path, grid: DistanceGrid) -> None:
@@ -152,7 +152,10 @@ def _parsed(path: Path, image: Element, piece: Element, begin: int) -> tuple[Gri
     layout = {b.name: (b.dtype, shape if b.components == 1 else (*shape, b.components)) for b in blocks}
     check_layout(str(path), layout)
     origin = np.array([float(number) for number in image.attrib["Origin"].split()])
-    head = GridHead(origin=origin, voxel=spacing.pop(), shape=shape, channels=tuple(layout), header=header)
+    voxel = spacing.pop()
+    if origin.shape != (3,) or not np.isfinite(origin).all() or not 0.0 < voxel < np.inf:
+        raise ValueError(f"expected a place and a size above 0, got {image.attrib['Origin']}, {voxel}")
+    head = GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header)
     return head, blocks
 
 
@@ -160,12 +163,14 @@ def _values(path: Path, stream: BinaryIO, head: GridHead, block: _Block) -> NDAr
     stream.seek(block.start)
     x, y, z = head.shape
     count = x * y * z * block.components
-    length = int.from_bytes(stream.read(8), "little")
-    flat: NDArray[np.generic] = np.fromfile(stream, block.dtype, count)  # short where the file ends
-    if length != count * np.dtype(block.dtype).itemsize or len(flat) != count:
+    size = count * np.dtype(block.dtype).itemsize
+    there = min(int.from_bytes(stream.read(8), "little"), path.stat().st_size - block.start - 8)
+    if there != size:
         raise InputError(
-            f"{path}: {block.name}: expected {count} values, got {len(flat)}", remedy="the file is cut; bake it again"
+            f"{path}: {block.name}: expected {size} bytes, got {max(there, 0)}",
+            remedy="the file is cut; bake it again",
         )
+    flat: NDArray[np.generic] = np.fromfile(stream, block.dtype, count)
     planes = flat.reshape((z, y, x) if block.components == 1 else (z, y, x, block.components))
     return from_x_fastest(planes)
 

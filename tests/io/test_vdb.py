@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.grid import write_npz
 from splatctrl_cli.io.vdb import openvdb, read_vdb_head, write_vdb
 from tests.io.make_grid import random_grid, with_unknown
@@ -85,6 +86,10 @@ def test_openvdb_reads_every_value_at_its_place(tmp_path: Path) -> None:
         key: grid.header[key] for key in ("frame", "version", "note")
     }
     assert (tmp_path / "a.vdb").read_bytes() == (tmp_path / "b.vdb").read_bytes()
+    summary = describe(tmp_path / "a.vdb")
+    assert (summary.kind, summary.facts["grids"]) == ("OpenVDB", len(grid.channels))
+    assert (summary.facts["labels"], summary.facts["distance"]) == (["human", "object"], "safe")
+    assert ["sdf", "Tree_float_5_4_3", "level set", 20 * 9 * 13 - 12] in list(summary.grids[0].rows)
     content = (tmp_path / "a.vdb").read_bytes()
     for length in (9, 30, 70, 200):
         (tmp_path / "cut.vdb").write_bytes(content[:length])

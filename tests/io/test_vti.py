@@ -62,12 +62,21 @@ def test_same_grid_same_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: text[:-300], "sdf: expected 220 values, got"),
+        (lambda text: text[:-300], "sdf: expected 880 bytes, got"),
         (lambda text: text.replace(b'"Float32"', b'"Float64"'), "not a distance grid of ours: KeyError"),
         (lambda text: text.replace(b"LittleEndian", b"BigEndian"), "expected a VTKFile"),
         (lambda text: text.replace(b'encoding="raw"', b'encoding="base64"'), "expected raw appended data"),
         (lambda text: text.replace(b"0.02 0.02 0.02", b"0.02 0.02 0.03"), "expected cubic cells"),
         (lambda text: text.replace(b'Extent="0 4', b'Extent="1 5'), "expected one piece"),
+        (
+            lambda text: text.replace(b'Extent="0 4', b'Extent="0 400000000'),
+            "sdf: expected 70400000176 bytes, got 880",
+        ),
+        (
+            lambda text: text.replace(b'Extent="0 4', b'Extent="0 -4'),
+            r"expected \(X, Y, Z\) cells, got \(-3, 4, 11\)",
+        ),
+        (lambda text: text.replace(b'Origin="-0.1', b'Origin="nan'), "expected a place and a size above 0"),
         (lambda text: text.replace(b"<Piece", b"<Peace"), "not readable XML"),
         (lambda text: text.replace(b'Name="sdf"', b'Name="foo"'), "expected the channel sdf"),
         (lambda text: text.replace(b"123 10 32 34", b"124 10 32 34"), "header: not JSON"),
