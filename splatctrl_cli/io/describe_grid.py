@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.arrays import DAMAGE
 from splatctrl_cli.io.grid import read_npz_head
 from splatctrl_cli.io.grid_channels import CHANNELS, FORMAT, GridHead
 from splatctrl_cli.io.moveit_field import read_moveit_head
@@ -87,17 +88,20 @@ def describe_vdb(path: Path, _head: bytes) -> Summary:
 
 
 def describe_curobo(path: Path) -> Summary:
-    """A ``field.curobo.npz``."""
-    with np.load(path, allow_pickle=False) as content:
-        facts: dict[str, object] = {
-            "curobo": str(content["curobo"]),
-            "channel": str(content["channel"]),
-            "shape": content["shape"].tolist(),
-            "voxel": float(content["voxel_size"]),
-            "dims": content["dims"].tolist(),
-            "pose_xyz_qwxyz": content["pose"].tolist(),
-            **header_facts(json.loads(str(content["header"]))),
-        }
+    """A ``field.curobo.npz``. Raises InputError for one that is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            facts: dict[str, object] = {
+                "curobo": str(content["curobo"]),
+                "channel": str(content["channel"]),
+                "shape": content["shape"].tolist(),
+                "voxel": float(content["voxel_size"]),
+                "dims": content["dims"].tolist(),
+                "pose_xyz_qwxyz": content["pose"].tolist(),
+                **header_facts(json.loads(str(content["header"]))),
+            }
+    except (*DAMAGE, OSError, TypeError) as error:
+        raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
     return Summary(path=str(path), kind="cuRobo voxel grid", facts=facts)
 
 
@@ -116,6 +120,7 @@ def describe_mesh(path: Path, _head: bytes) -> Summary:
 
     try:
         mesh = trimesh.load_mesh(path, process=False)
+        mesh.merge_vertices()  # .stl has three a triangle
         facts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "is_watertight": bool(mesh.is_watertight)}
         lower, upper = np.round(mesh.bounds, 6).tolist()
     except Exception as error:  # whatever its parsers meet

@@ -5,9 +5,7 @@ Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () st
 """
 
 import errno
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.arrays import savez
+from splatctrl_cli.io.arrays import DAMAGE, savez
 from splatctrl_cli.io.grid_channels import (
     GridHead,
     check_finite,
@@ -32,10 +30,6 @@ from splatctrl_cli.records import DistanceGrid
 __all__ = ["is_grid_npz", "read_npz", "read_npz_head", "write_npz", "write_vti"]
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
-_DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError),
-    *(SyntaxError, tokenize.TokenError, OverflowError),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +88,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
         raise InputError(f"{path}: no such file", remedy="bake one with sdf-bake") from None
     except IsADirectoryError:
         raise InputError(f"{path}: expected a file, got a folder", remedy="give the field.npz in it") from None
-    except (*_DAMAGE, OSError) as error:
+    except (*DAMAGE, OSError) as error:
         if isinstance(error, OSError) and error.errno != errno.EINVAL:  # which is a place before the file's start
             raise
         raise InputError(f"{path}: not a whole distance grid: {error}", remedy="bake it again") from None

@@ -75,6 +75,28 @@ def test_an_older_file_is_described_as_one_to_bake_again(tmp_path: Path) -> None
         describe(tmp_path / "field.npz")
 
 
+@pytest.mark.parametrize(
+    "file", ["field.npz", "field.vti", "field.sdf.nrrd", "field.curobo.npz", "field.moveit", "field.stl"]
+)
+def test_a_cut_file_is_refused_in_one_line(tmp_path: Path, file: str) -> None:
+    write_grid(tmp_path, ball_grid(), ["npz", "vti", "nrrd", "curobo", "moveit", "stl"])
+    content = (tmp_path / file).read_bytes()
+    for length in (60, 100):
+        (tmp_path / file).write_bytes(content[:length])
+        with pytest.raises(InputError) as refused:
+            describe(tmp_path / file)
+        assert refused.value.remedy
+
+
+def test_a_curobo_file_whose_list_of_contents_is_damaged_is_refused(tmp_path: Path) -> None:
+    (path,) = write_grid(tmp_path, ball_grid(), ["curobo"])
+    content = bytearray(path.read_bytes())
+    content[content.rindex(b"PK\x01\x02") + 42] ^= 0xFF  # the place of a member
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"field.curobo.npz: not a readable .npz: .*; the file is damaged"):
+        describe(path)
+
+
 def test_the_options_reach_the_files(tmp_path: Path) -> None:
     grid = ball_grid()
     write_grid(
