@@ -1,0 +1,192 @@
+"""A million random queries against what a baked grid certifies: not one may read more than the exact distance.
+
+    python -m benchmarks.certificate [--num N] [--voxel M] [--json FILE]
+
+The exact distance is that to the splats' spheres, in float64 over all pairs. Prints per scene how many queries break
+each promise, how much the bound gives away, and how often and by how much the interpolated `sdf`, which promises
+nothing between cell centres, exceeds the exact distance. The exit code is 1 where a promise breaks.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measure import machine
+from benchmarks.surfaces import exact_distance, random_balls, shapes, splats_on
+from splatctrl_cli.cli.common import table
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.grid import GridField
+from splatctrl_cli.records import Box, DistanceGrid, Float64, Label, SplatSet
+
+NUM = 1_000_000
+NUM_BALLS = 300
+PADDING = 0.2  # [m] of the grid around the splats
+ROUNDING = 1e-6  # [m] sdf is no bound: it may equal hard, whose float32 is within this of the exact distance
+BEYOND = 0.05  # [m] beyond the grid that queries reach: certified holds there too
+PROMISES = ("bound_at_cell", "bound_nearest_cell", "bound_interpolated", "certified", "sdf_at_cell")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What one scene's grid was asked, and what it answered.
+
+    excess: by promise, the number of queries above the exact distance and the largest excess [m] (negative where
+    none is); given_away: median [m] by which bound (of the nearest cell, interpolated) and certified stay below;
+    interpolated_*: of sdf between cell centres, the share above exact, and the median and largest excess of those.
+    """
+
+    scene: str
+    num_splats: int
+    num_cells: int
+    num_queries: int
+    excess: dict[str, tuple[int, float]]
+    given_away: dict[str, float]
+    interpolated_share: float
+    interpolated_median: float
+    interpolated_max: float
+
+    @property
+    def holds(self) -> bool:
+        """True where no query breaks a promise."""
+        return all(count == 0 for count, _ in self.excess.values())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Ask, print, write JSON."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.certificate", description=__doc__)
+    parser.add_argument("--num", type=int, default=NUM, help=f"queries over all scenes (default: {NUM})")
+    parser.add_argument("--voxel", type=float, default=FieldConfig.voxel, metavar="M")
+    parser.add_argument("--json", type=Path, default=Path("bench_output/certificate.json"), metavar="FILE")
+    args = parser.parse_args(argv)
+    scenes = [(shape.name, *splats_on(shape, 0.01, is_inset=True, seed=0)) for shape in shapes()]
+    scenes += [(f"random balls {seed}", *random_balls(NUM_BALLS, seed=seed)) for seed in (1, 2)]
+    each = -(-args.num // len(scenes))
+    verdicts = [ask(name, centers, radii, args.voxel, each) for name, centers, radii in scenes]
+    print("\n".join(lines(verdicts)))
+    args.json.parent.mkdir(parents=True, exist_ok=True)
+    report = {"machine": machine(), "voxel": args.voxel, "verdicts": [asdict(verdict) for verdict in verdicts]}
+    args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    num_broken = sum(count for verdict in verdicts for count, _ in verdict.excess.values())
+    print(f"{sum(v.num_queries for v in verdicts)} queries, {num_broken} broken promises; wrote {args.json}")
+    return int(num_broken > 0)
+
+
+def ask(scene: str, centers: Float64, radii: Float64, voxel: float, num_queries: int) -> Verdict:
+    """Bake the splats, and hold the grid to its word."""
+    box = Box(
+        lower=(centers - radii[:, None]).min(axis=0) - PADDING, upper=(centers + radii[:, None]).max(axis=0) + PADDING
+    )
+    grid = bake(splat_set(centers, radii), box, FieldConfig(voxel=voxel))
+    return judge(scene, grid, centers, radii, num_queries)
+
+
+def judge(
+    scene: str, grid: DistanceGrid, centers: Float64, radii: Float64, num_queries: int, *, seed: int = 0
+) -> Verdict:
+    """Hold a grid to its word at random points and at random cells, as many of each."""
+    voxel = grid.voxel
+    shape = np.array(grid.channels["sdf"].shape)
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, shape, (num_queries, 3))
+    exact_at_cell = exact_distance(grid.origin + voxel * cells, centers, radii)
+    extent = voxel * (shape - 1)
+    points = grid.origin + rng.uniform(-BEYOND, extent + BEYOND, (num_queries, 3))
+    exact = exact_distance(points, centers, radii)
+    inside = GridField(grid).contains(points)
+    within = points[inside]
+    nearest = np.rint((within - grid.origin) / voxel).astype(np.int64)
+    between = {
+        "bound_nearest_cell": _at(grid, "bound", nearest),
+        "bound_interpolated": GridField(grid, "bound").query(within)[0],
+    }
+    certified = GridField(grid).certified(points)
+    over = GridField(grid).query(within)[0] - exact[inside]
+    excess = {name: over_of(value - exact[inside]) for name, value in between.items()}
+    excess["certified"] = over_of(certified - exact)
+    excess["bound_at_cell"] = over_of(_at(grid, "bound", cells) - exact_at_cell)
+    excess["sdf_at_cell"] = over_of(_at(grid, "sdf", cells) - exact_at_cell - ROUNDING)
+    return Verdict(
+        scene=scene,
+        num_splats=len(radii),
+        num_cells=int(shape.prod()),
+        num_queries=num_queries,
+        excess={name: excess[name] for name in PROMISES},
+        given_away={
+            **{name: float(np.median(exact[inside] - value)) for name, value in between.items()},
+            "certified": float(np.median(exact[inside] - certified[inside])),
+        },
+        interpolated_share=float(np.mean(over > ROUNDING)),
+        interpolated_median=float(np.median(over[over > ROUNDING])) if (over > ROUNDING).any() else 0.0,
+        interpolated_max=float(over.max()),
+    )
+
+
+def over_of(error: Float64) -> tuple[int, float]:
+    """How many errors are above 0, and the largest."""
+    return int(np.count_nonzero(error > 0)), float(error.max())
+
+
+def splat_set(centers: Float64, radii: Float64) -> SplatSet:
+    """Grey object splats."""
+    num = len(radii)
+    return SplatSet(
+        centers=centers.astype(np.float32),
+        radii=radii.astype(np.float32),
+        colors=np.full((num, 3), 0.5, np.float32),
+        opacities=np.full(num, 0.8, np.float32),
+        labels=np.full(num, Label.OBJECT, np.uint8),
+        density=np.zeros(num, np.float32),
+    )
+
+
+def lines(verdicts: Sequence[Verdict]) -> list[str]:
+    """Two tables: broken promises, and what the interpolated sdf does."""
+    header = ("scene", "splats", "cells", "queries", *(f"{name}" for name in PROMISES))
+    broken = [
+        [v.scene, str(v.num_splats), str(v.num_cells), str(v.num_queries), *(str(v.excess[p][0]) for p in PROMISES)]
+        for v in verdicts
+    ]
+    header_of_sdf = (
+        *(
+            "scene",
+            "bound, nearest cell",
+            "bound, interpolated",
+            "certified",
+            "sdf above exact %",
+            "median mm",
+            "max mm",
+        ),
+    )
+    given = [
+        [
+            v.scene,
+            *(
+                f"{v.given_away[name] * 1e3:.1f}"
+                for name in ("bound_nearest_cell", "bound_interpolated", "certified")
+            ),
+            f"{v.interpolated_share * 100:.1f}",
+            f"{v.interpolated_median * 1e3:.2f}",
+            f"{v.interpolated_max * 1e3:.1f}",
+        ]
+        for v in verdicts
+    ]
+    return [
+        "queries that read more than the exact distance to the splats:",
+        *table(header, broken),
+        "",
+        "median below the exact distance [mm], and the interpolated sdf above it:",
+        *table(header_of_sdf, given),
+    ]
+
+
+def _at(grid: DistanceGrid, channel: str, cells: np.ndarray) -> Float64:
+    return np.asarray(grid.channels[channel][tuple(cells.T)], dtype=np.float64)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

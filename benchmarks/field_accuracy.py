@@ -1,0 +1,257 @@
+"""How far the distance fields are from exact surfaces, by shape, spacing, radius, field and weights.
+
+    python -m benchmarks.field_accuracy [--quick] [--plots docs/images]
+
+The truth is exact: solids made here, and the closed meshes below SPLATCTRL_REAL_DATA. Errors are field less truth at
+points even in space from 1 to 20 cm outside; positive is a clearance that is not there. The bar that `safe` is held
+to is 1 mm and a third of the spacing, RMSE; the exit code is 1 where a row misses it.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measure import machine
+from benchmarks.surfaces import Shape, points_around, shapes, splats_on
+from splatctrl_cli.cli.common import table
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.evaluate.field_accuracy import BANDS, BandAccuracy, band_accuracy
+from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
+from splatctrl_cli.field.health import median_spacing
+from splatctrl_cli.field.weights import METHODS as WEIGHTS
+from splatctrl_cli.records import DistanceField, Float64
+
+BAND = (0.01, 0.20)  # [m] of true distance
+SPACINGS = (0.01, 0.02)  # [m]
+NUM_POINTS, NUM_QUICK = 20_000, 3_000
+ALLOWED, ALLOWED_OF_SPACING = 1e-3, 1 / 3  # the bar: [m], and a share of the spacing
+LENGTHS = (0.01, 0.02, 0.04)  # [m] of the planar bias
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Accuracy of one field on one covering of one shape: over the whole band, and by the usual bands.
+
+    share_below_hard: of points where the field reads less than the exact distance to the splats.
+    """
+
+    shape: str
+    spacing: float
+    is_inset: bool
+    field: str
+    weights: str
+    num_splats: int
+    median_spacing: float
+    median_radius: float
+    share_below_hard: float
+    whole: BandAccuracy
+    bands: tuple[BandAccuracy, ...]
+
+    @property
+    def bar(self) -> float:
+        """The RMSE [m] that `safe` may have."""
+        return ALLOWED + ALLOWED_OF_SPACING * self.spacing
+
+    @property
+    def is_kept(self) -> bool:
+        """True where the RMSE is within the bar."""
+        return self.whole.rmse is not None and self.whole.rmse <= self.bar
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanarBias:
+    """What gpdf reads over a dense plane of centres: at heights (40,), beside ``z - l log(1 + z / l)`` [m]."""
+
+    length: float
+    heights: list[float]
+    measured: list[float]
+    closed_form: list[float]
+    largest_difference: float
+    at_10_cm: float
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print, write JSON and plots."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.field_accuracy", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="solids made here only, fewer points")
+    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the plots of docs/field.md here")
+    parser.add_argument("--json", type=Path, default=Path("bench_output/field_accuracy.json"), metavar="FILE")
+    args = parser.parse_args(argv)
+    num = NUM_QUICK if args.quick else NUM_POINTS
+    rows = [row for shape in shapes(with_meshes=not args.quick) for row in shape_rows(shape, num)]
+    bias = [planar_bias(length) for length in LENGTHS]
+    print("\n".join(default_lines(rows)), end="\n\n")
+    print("\n".join(weight_lines(rows)), end="\n\n")
+    print("\n".join(bias_lines(bias)), end="\n\n")
+    missed = [row for row in rows if row.field == "safe" and row.weights == FieldConfig.weights and not row.is_kept]
+    print(f"{len(missed)} of {sum(_is_judged(row) for row in rows)} rows miss the bar of safe")
+    args.json.parent.mkdir(parents=True, exist_ok=True)
+    report = {
+        "machine": machine(),
+        "quick": args.quick,
+        "band": BAND,
+        "rows": [{**asdict(row), "bar": row.bar, "kept": row.is_kept} for row in rows],
+        "planar_bias": [asdict(one) for one in bias],
+    }
+    args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    print(f"wrote {args.json}")
+    if args.plots is not None:
+        from benchmarks.field_plots import write_plots
+
+        write_plots(args.plots, bias)
+    return int(bool(missed))
+
+
+def shape_rows(shape: Shape, num_points: int) -> list[Row]:
+    """Every covering, field and way to make weights on one shape."""
+    points, truth = points_around(shape, num_points, *BAND, seed=1)
+    rows = []
+    for spacing in SPACINGS:
+        for is_inset in (False, True):
+            centers, radii = splats_on(shape, spacing, is_inset=is_inset, seed=0)
+            readings = distances(centers, radii, points)
+            for (name, weights), distance in readings.items():
+                error = distance - truth
+                rows.append(
+                    Row(
+                        shape=shape.name,
+                        spacing=spacing,
+                        is_inset=is_inset,
+                        field=name,
+                        weights=weights,
+                        num_splats=len(radii),
+                        median_spacing=median_spacing(centers),
+                        median_radius=float(np.median(radii)),
+                        share_below_hard=float(np.mean(distance < readings["hard", ""])),
+                        whole=band_accuracy(error, *BAND),
+                        bands=tuple(
+                            band_accuracy(error[(truth >= lower) & (truth < upper)], lower, upper)
+                            for lower, upper in BANDS
+                        ),
+                    )
+                )
+    return rows
+
+
+def distances(centers: Float64, radii: Float64, points: Float64) -> dict[tuple[str, str], Float64]:
+    """Distance (Q,) [m] by (field, weights); hard has no weights."""
+    exact = SphereField(centers, radii, threads=0)
+    found = {("hard", ""): exact.query(points)[0]}
+    for weights in WEIGHTS:
+        kernels: dict[str, DistanceField] = {
+            "se": SeField(centers, radii, weights=weights, threads=0),
+            "gpdf": GpdfField(centers, radii, weights=weights, threads=0),
+        }
+        for name, kernel in kernels.items():
+            found[name, weights] = kernel.query(points)[0]
+            safe = "safe" if name == "se" else f"safe_{name}"
+            found[safe, weights] = SafeField(exact, kernel).query(points)[0]
+    return found
+
+
+def planar_bias(length: float) -> PlanarBias:
+    """The Matern field over a plane of centres l / 5 apart, wide enough for its rim not to count."""
+    step, half, num = length / 5, 0.35 + 5 * length, 40
+    axis = np.arange(-half, half, step)
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    centers = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    heights = np.linspace(0.005, 0.20, num)
+    points = np.stack([np.full(num, 0.3 * step), np.full(num, 0.2 * step), heights], axis=1)
+    measured = GpdfField(centers, np.zeros(len(centers)), length, threads=0).query(points)[0]
+    closed_form = heights - length * np.log1p(heights / length)
+    return PlanarBias(
+        length=length,
+        heights=heights.tolist(),
+        measured=measured.tolist(),
+        closed_form=closed_form.tolist(),
+        largest_difference=float(np.abs(measured - closed_form).max()),
+        at_10_cm=float(np.interp(0.10, heights, measured)),
+    )
+
+
+def default_lines(rows: Sequence[Row]) -> list[str]:
+    """One line per covering: RMSE of every field with the default weights, and all of `safe`."""
+    header = (
+        *("shape", "spacing cm", "centres", "splats", "radius mm", "hard", "gpdf", "se", "safe"),
+        *("mean", "95 %", "max", "se < hard %", "bar", "kept"),
+    )
+    by_field = {(*_covering(row), row.field): row for row in rows if row.weights in {"", FieldConfig.weights}}
+    cells = []
+    for row in rows:
+        if _is_judged(row):
+            others = [by_field[*_covering(row), name].whole.rmse for name in ("hard", "gpdf", "se")]
+            figures = (*others, row.whole.rmse, row.whole.mean, row.whole.over_95, row.whole.over_max)
+            place = "inside" if row.is_inset else "on it"
+            cells.append(
+                [
+                    *(row.shape, f"{row.spacing * 100:g}", place, str(row.num_splats)),
+                    *(f"{row.median_radius * 1e3:.1f}", *map(millimetres, figures)),
+                    *(f"{row.share_below_hard * 100:.0f}", millimetres(row.bar), "yes" if row.is_kept else "NO"),
+                ]
+            )
+    title = (
+        f"error = field - truth [mm], true distance {BAND[0] * 100:g} to {BAND[1] * 100:g} cm, "
+        f"l = {FieldConfig.length_scale * 100:g} cm, {FieldConfig.weights}; RMSE by field; mean to max of safe"
+    )
+    return [title, *table(header, cells)]
+
+
+def weight_lines(rows: Sequence[Row]) -> list[str]:
+    """RMSE over all shapes, and the largest over-estimate, by field and weights."""
+    header = (
+        "spacing cm",
+        "centres",
+        "field",
+        *(f"{w}: {what}" for w in WEIGHTS for what in ("RMSE", "95 %", "max")),
+    )
+    cells = []
+    for spacing in SPACINGS:
+        for is_inset in (False, True):
+            for name in ("hard", "gpdf", "se", "safe_gpdf", "safe"):
+                row = [f"{spacing * 100:g}", "inside" if is_inset else "on it", name]
+                for weights in WEIGHTS:
+                    wanted = (spacing, is_inset, name, "" if name == "hard" else weights)
+                    row += map(millimetres, _pooled(rows, *wanted))
+                cells.append(row)
+    return ["over all shapes [mm]: RMSE of equal shares, mean of the 95 %, largest error", *table(header, cells)]
+
+
+def _pooled(
+    rows: Sequence[Row], spacing: float, is_inset: bool, name: str, weights: str
+) -> tuple[float, float, float]:
+    wanted = (spacing, is_inset, name, weights)
+    wholes = [row.whole for row in rows if (row.spacing, row.is_inset, row.field, row.weights) == wanted]
+    rmse = np.array([whole.rmse for whole in wholes], dtype=np.float64)
+    over_95 = np.array([whole.over_95 for whole in wholes], dtype=np.float64)
+    over_max = np.array([whole.over_max for whole in wholes], dtype=np.float64)
+    return float(np.sqrt(np.mean(rmse**2))), float(over_95.mean()), float(over_max.max())
+
+
+def bias_lines(bias: Sequence[PlanarBias]) -> list[str]:
+    """What the Matern field reads over a dense plane."""
+    header = ("l cm", "reads at 10 cm [mm]", "largest difference from z - l log(1 + z / l), 0.5 to 20 cm [mm]")
+    cells = [
+        [f"{one.length * 100:g}", millimetres(one.at_10_cm), millimetres(one.largest_difference, 3)] for one in bias
+    ]
+    return ["gpdf over a dense plane of centres with radius 0", *table(header, cells)]
+
+
+def millimetres(value: float | None, digits: int = 1) -> str:
+    """A length [m] in mm."""
+    return "-" if value is None else f"{value * 1e3:.{digits}f}"
+
+
+def _covering(row: Row) -> tuple[str, float, bool]:
+    return row.shape, row.spacing, row.is_inset
+
+
+def _is_judged(row: Row) -> bool:
+    return row.field == "safe" and row.weights == FieldConfig.weights
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,128 @@
+"""What a grid certifies is never above the exact distance; what `safe` reads is never above that to the splats."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.certificate import Verdict, ask, judge, splat_set
+from benchmarks.surfaces import Shape, exact_distance, lone_splat, random_balls, shapes, splats_on
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
+from splatctrl_cli.records import Box, DistanceGrid, Float64
+
+NUM = 4000
+LONE = [  # wall distance, length scale, spacing of the wall, radius [m]
+    (0.02, 0.01, 0.005, 0.0),
+    (0.03, 0.01, 0.005, 0.003),
+    (0.02, 0.02, 0.010, 0.0),
+    (0.03, 0.02, 0.010, 0.005),
+    (0.04, 0.02, 0.010, 0.0),
+    (0.04, 0.02, 0.010, 0.007),
+    (0.04, 0.02, 0.005, 0.0035),
+    (0.06, 0.02, 0.010, 0.0),
+    (0.08, 0.02, 0.005, 0.0),
+    (0.03, 0.04, 0.010, 0.0),
+    (0.04, 0.04, 0.010, 0.007),
+]
+
+
+@pytest.mark.parametrize("shape", shapes(with_meshes=False), ids=lambda shape: shape.name)
+@pytest.mark.parametrize("is_inset", [False, True])
+def test_no_query_at_a_covered_solid_breaks_a_promise(shape: Shape, is_inset: bool) -> None:
+    assert_holds(ask(shape.name, *splats_on(shape, 0.02, is_inset=is_inset, seed=0), 0.02, NUM))
+
+
+@pytest.mark.parametrize("voxel", [0.02, 0.05])
+def test_no_query_among_balls_of_1_mm_to_30_cm_breaks_a_promise(voxel: float) -> None:
+    assert_holds(ask("balls", *random_balls(60, seed=4), voxel, NUM))
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(0.02, 100.0), (100.0, 0.0), (1.0, 5000.0)])
+def test_the_bound_holds_for_parts_and_halls_and_far_from_the_origin(scale: float, shift: float) -> None:
+    centers, radii = random_balls(60, seed=4)
+    centers = (scale * centers + shift).astype(np.float32).astype(np.float64)
+    radii = (scale * radii).astype(np.float32).astype(np.float64)
+    box = Box(lower=np.full(3, shift - 1.2 * scale), upper=np.full(3, shift + 1.2 * scale))
+    grid = bake(splat_set(centers, radii), box, FieldConfig(voxel=0.05 * scale))
+    excess = judge("scaled", grid, centers, radii, 4 * NUM).excess
+    for promise in ("bound_at_cell", "bound_nearest_cell", "bound_interpolated", "certified"):
+        assert excess[promise][0] == 0, (promise, excess[promise])
+    assert excess["certified"][1] > -2e-3 * scale
+    assert excess["sdf_at_cell"][1] < 5e-7 * scale + 1e-6  # hard itself, in float32
+
+
+def assert_holds(verdict: Verdict) -> None:
+    assert verdict.holds, verdict.excess
+    assert verdict.excess["certified"][1] > -0.02  # it does not hold by giving everything away
+    assert verdict.given_away["certified"] < verdict.given_away["bound_nearest_cell"]
+    assert verdict.interpolated_max > 0.0  # which is why there is a bound at all
+
+
+@pytest.mark.parametrize("promise", ["bound_at_cell", "bound_nearest_cell", "bound_interpolated", "certified"])
+def test_a_bound_without_its_margin_is_found_out(promise: str) -> None:
+    grid, centers, radii = balls_grid()
+    margin = np.float32(grid.header["bound_margin"])
+    too_high = {"bound_at_cell": 1.01, "certified": 1.2}.get(promise, 1.0) * margin
+    grid.channels["bound"] = grid.channels["bound"] + np.float32(too_high)
+    verdict = judge("doctored", grid, centers, radii, NUM)
+    assert not verdict.holds
+    assert verdict.excess[promise][0] > 0
+
+
+def test_a_safe_distance_above_the_exact_one_is_found_out() -> None:
+    grid, centers, radii = balls_grid()
+    grid.channels["sdf"] = grid.channels["sdf"] + np.float32(1e-5)
+    assert judge("doctored", grid, centers, radii, NUM).excess["sdf_at_cell"][0] > 0
+
+
+def balls_grid() -> tuple[DistanceGrid, Float64, Float64]:
+    centers, radii = random_balls(60, seed=5)
+    box = Box(lower=np.full(3, -1.1), upper=np.full(3, 1.1))
+    return bake(splat_set(centers, radii), box, FieldConfig(voxel=0.04)), centers, radii
+
+
+def test_the_bound_is_hard_at_the_centre_less_the_margin() -> None:
+    grid, centers, radii = balls_grid()
+    margin = grid.header["bound_margin"]
+    assert isinstance(margin, float)
+    assert margin == pytest.approx(np.sqrt(3) / 2 * 0.04, abs=1e-5)
+    cells = np.random.default_rng(0).integers(0, grid.channels["bound"].shape, (NUM, 3))
+    exact = exact_distance(grid.origin + grid.voxel * cells, centers, radii)
+    np.testing.assert_allclose(grid.channels["bound"][tuple(cells.T)] + margin, exact, atol=1e-6)
+
+
+@pytest.mark.parametrize("distance", ["safe", "safe_gpdf"])
+def test_safe_at_a_cell_is_never_above_the_exact_distance(distance: str) -> None:
+    centers, radii = lone_splat(0.02, wall_spacing=0.01, radius=0.004)
+    config = replace(FieldConfig(voxel=0.02), distance=distance)
+    box = Box(lower=np.array([-0.1, -0.2, -0.2]), upper=np.array([0.25, 0.2, 0.2]))
+    grid = bake(splat_set(centers, radii), box, config)
+    verdict = judge("lone", grid, centers, radii, NUM)
+    assert verdict.excess["sdf_at_cell"][0] == 0
+
+
+@pytest.mark.parametrize("case", LONE)
+def test_safe_reads_no_clearance_that_a_lone_splat_takes(case: tuple[float, float, float, float]) -> None:
+    wall, length, spacing, radius = case
+    centers, radii = lone_splat(wall, wall_spacing=spacing, radius=radius)
+    points = before_the_splat(radius)
+    hard = exact_distance(points, centers, radii)
+    exact = SphereField(centers, radii)
+    for kernel in (SeField(centers, radii, length), GpdfField(centers, radii, length)):
+        alone = kernel.query(points)[0]
+        assert (alone - hard).max() > 2e-3  # the kernel alone reads clearance that is not there
+        safe = SafeField(exact, kernel).query(points)[0]
+        assert (safe <= exact.query(points)[0]).all()
+        assert (safe <= hard + 1e-6).all()
+
+
+def before_the_splat(radius: float) -> Float64:
+    """Points from 2 mm to 15 cm before the lone splat, on the side that the wall is not on."""
+    rng = np.random.default_rng(6)
+    direction = rng.normal(size=(400, 3))
+    direction[:, 0] = np.abs(direction[:, 0])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    along = np.stack([radius + np.linspace(0.002, 0.15, 70), np.zeros(70), np.zeros(70)], axis=1)
+    return np.concatenate([along, (radius + rng.uniform(0.002, 0.15, (400, 1))) * direction])
