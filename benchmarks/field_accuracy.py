@@ -16,7 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import machine
-from benchmarks.surfaces import Shape, points_around, shapes, splats_on
+from benchmarks.surfaces import (
+    LONE_SPLATS,
+    LoneSplat,
+    Shape,
+    exact_distance,
+    lone_splat,
+    points_around,
+    shapes,
+    splats_on,
+)
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.evaluate.field_accuracy import BANDS, BandAccuracy, band_accuracy
@@ -87,6 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print("\n".join(default_lines(rows)), end="\n\n")
     print("\n".join(weight_lines(rows)), end="\n\n")
     print("\n".join(bias_lines(bias)), end="\n\n")
+    lone = [lone_reading(case) for case in LONE_SPLATS]
+    print("\n".join(lone_lines(lone)), end="\n\n")
     missed = [row for row in rows if row.field == "safe" and row.weights == FieldConfig.weights and not row.is_kept]
     print(f"{len(missed)} of {sum(_is_judged(row) for row in rows)} rows miss the bar of safe")
     args.json.parent.mkdir(parents=True, exist_ok=True)
@@ -96,6 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "band": BAND,
         "rows": [{**asdict(row), "bar": row.bar, "kept": row.is_kept} for row in rows],
         "planar_bias": [asdict(one) for one in bias],
+        "lone_splat": [asdict(one) for one in lone],
     }
     args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     print(f"wrote {args.json}")
@@ -173,6 +185,28 @@ def planar_bias(length: float) -> PlanarBias:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class LoneReading:
+    """How much more than the exact distance the fields read on the way to a lone splat: the largest [m]."""
+
+    case: LoneSplat
+    gpdf: float
+    se: float
+    safe: float
+
+
+def lone_reading(case: LoneSplat) -> LoneReading:
+    """From 2 mm to 15 cm before the splat, on the side away from the wall."""
+    centers, radii = lone_splat(case.wall, wall_spacing=case.spacing, radius=case.radius)
+    steps = case.radius + np.linspace(0.002, 0.15, 149)
+    points = np.stack([steps, np.zeros_like(steps), np.zeros_like(steps)], axis=1)
+    hard = exact_distance(points, centers, radii)
+    se = SeField(centers, radii, case.length)
+    fields = (GpdfField(centers, radii, case.length), se, SafeField(SphereField(centers, radii), se))
+    gpdf_over, se_over, safe_over = (float((field.query(points)[0] - hard).max()) for field in fields)
+    return LoneReading(case=case, gpdf=gpdf_over, se=se_over, safe=safe_over)
+
+
 def default_lines(rows: Sequence[Row]) -> list[str]:
     """One line per covering: RMSE of every field with the default weights, and all of `safe`."""
     header = (
@@ -238,6 +272,19 @@ def bias_lines(bias: Sequence[PlanarBias]) -> list[str]:
         [f"{one.length * 100:g}", millimetres(one.at_10_cm), millimetres(one.largest_difference, 3)] for one in bias
     ]
     return ["gpdf over a dense plane of centres with radius 0", *table(header, cells)]
+
+
+def lone_lines(readings: Sequence[LoneReading]) -> list[str]:
+    """The largest over-estimates by configuration."""
+    header = ("l cm", "wall behind cm", "wall spacing mm", "radius mm", "gpdf", "se", "safe")
+    cells = [
+        [
+            *(f"{one.case.length * 100:g}", f"{one.case.wall * 100:g}", f"{one.case.spacing * 1e3:g}"),
+            *(f"{one.case.radius * 1e3:g}", *(millimetres(value) for value in (one.gpdf, one.se, one.safe))),
+        ]
+        for one in readings
+    ]
+    return ["a lone splat before a wall: largest reading above the exact distance [mm]", *table(header, cells)]
 
 
 def millimetres(value: float | None, digits: int = 1) -> str:

@@ -175,6 +175,34 @@ def _solid(kind: str, size: tuple[float, ...], middle: tuple[float, float, float
     return Primitive(name=kind, kind=kind, size=size, T_world_shape=T, texture=grey)
 
 
+@dataclass(frozen=True, kw_only=True)
+class LoneSplat:
+    """A splat before a wall [m]: how far before it, the wall's spacing, the radius of all, and l of the kernel."""
+
+    wall: float
+    spacing: float
+    radius: float
+    length: float
+
+
+LONE_SPLATS = tuple(
+    LoneSplat(wall=wall, length=length, spacing=spacing, radius=radius)
+    for wall, length, spacing, radius in (
+        (0.02, 0.01, 0.005, 0.0),
+        (0.03, 0.01, 0.005, 0.003),
+        (0.02, 0.02, 0.010, 0.0),
+        (0.03, 0.02, 0.010, 0.005),
+        (0.04, 0.02, 0.010, 0.0),
+        (0.04, 0.02, 0.010, 0.007),
+        (0.04, 0.02, 0.005, 0.0035),
+        (0.06, 0.02, 0.010, 0.0),
+        (0.08, 0.02, 0.005, 0.0),
+        (0.03, 0.04, 0.010, 0.0),
+        (0.04, 0.04, 0.010, 0.007),
+    )
+)
+
+
 def lone_splat(distance: float, *, wall_spacing: float, radius: float) -> tuple[Float64, Float64]:
     """One splat at the origin and a wall of splats, a square of 40 cm at x = -`distance` [m]: centres, radii.
 

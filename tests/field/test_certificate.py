@@ -6,26 +6,22 @@ import numpy as np
 import pytest
 
 from benchmarks.certificate import Verdict, ask, judge, splat_set
-from benchmarks.surfaces import Shape, exact_distance, lone_splat, random_balls, shapes, splats_on
+from benchmarks.surfaces import (
+    LONE_SPLATS,
+    LoneSplat,
+    Shape,
+    exact_distance,
+    lone_splat,
+    random_balls,
+    shapes,
+    splats_on,
+)
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
 from splatctrl_cli.records import Box, DistanceGrid, Float64
 
 NUM = 4000
-LONE = [  # wall distance, length scale, spacing of the wall, radius [m]
-    (0.02, 0.01, 0.005, 0.0),
-    (0.03, 0.01, 0.005, 0.003),
-    (0.02, 0.02, 0.010, 0.0),
-    (0.03, 0.02, 0.010, 0.005),
-    (0.04, 0.02, 0.010, 0.0),
-    (0.04, 0.02, 0.010, 0.007),
-    (0.04, 0.02, 0.005, 0.0035),
-    (0.06, 0.02, 0.010, 0.0),
-    (0.08, 0.02, 0.005, 0.0),
-    (0.03, 0.04, 0.010, 0.0),
-    (0.04, 0.04, 0.010, 0.007),
-]
 
 
 @pytest.mark.parametrize("shape", shapes(with_meshes=False), ids=lambda shape: shape.name)
@@ -103,14 +99,13 @@ def test_safe_at_a_cell_is_never_above_the_exact_distance(distance: str) -> None
     assert verdict.excess["sdf_at_cell"][0] == 0
 
 
-@pytest.mark.parametrize("case", LONE)
-def test_safe_reads_no_clearance_that_a_lone_splat_takes(case: tuple[float, float, float, float]) -> None:
-    wall, length, spacing, radius = case
-    centers, radii = lone_splat(wall, wall_spacing=spacing, radius=radius)
-    points = before_the_splat(radius)
+@pytest.mark.parametrize("case", LONE_SPLATS, ids=str)
+def test_safe_reads_no_clearance_that_a_lone_splat_takes(case: LoneSplat) -> None:
+    centers, radii = lone_splat(case.wall, wall_spacing=case.spacing, radius=case.radius)
+    points = before_the_splat(case.radius)
     hard = exact_distance(points, centers, radii)
     exact = SphereField(centers, radii)
-    for kernel in (SeField(centers, radii, length), GpdfField(centers, radii, length)):
+    for kernel in (SeField(centers, radii, case.length), GpdfField(centers, radii, case.length)):
         alone = kernel.query(points)[0]
         assert (alone - hard).max() > 2e-3  # the kernel alone reads clearance that is not there
         safe = SafeField(exact, kernel).query(points)[0]
