@@ -1,0 +1,136 @@
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.field import conjugate, voxel_density
+from splatctrl_cli.field.conjugate import conjugate_gradients, solve_process
+from splatctrl_cli.field.distance import GpdfField, SeField
+from splatctrl_cli.field.kernel import Matern12, SquaredExponential
+from splatctrl_cli.field.spheres import Spheres
+from splatctrl_cli.field.voxel_density import voxel_row_sums
+from splatctrl_cli.field.weights import weights_named
+from tests.field.scenes import cloud, queries
+from tests.reference import field as reference
+
+LENGTH, NOISE = 0.02, 1e-6
+
+
+def test_voxel_density_is_spread_convolved_and_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    centers, _ = cloud(60)
+    centers = 0.1 * centers  # all within reach of each other
+    expected = reference.voxel_row_sums(centers, LENGTH, LENGTH / voxel_density.VOXELS_PER_LENGTH)
+    sums = voxel_row_sums(centers, LENGTH, Matern12(LENGTH).value)
+    np.testing.assert_allclose(sums, expected, rtol=1e-9)
+    monkeypatch.setattr(voxel_density, "NODES", 48)  # blocks of 15 cells rather than 63
+    np.testing.assert_allclose(voxel_row_sums(centers + 7.0, LENGTH, Matern12(LENGTH).value), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", [Matern12(LENGTH), SquaredExponential(LENGTH)])
+def test_voxel_density_is_near_the_exact_one_across_blocks(kernel: Matern12 | SquaredExponential) -> None:
+    centers, radii = cloud(3000)
+    centers *= 2.0  # 1.2 m: blocks of 0.63 m
+    exact = np.exp(kernel.log_row_sums(Spheres.of(centers, radii).points))
+    sums = voxel_row_sums(centers, LENGTH, kernel.value)
+    error = LENGTH * np.log(sums / exact)  # of the distance, were the splat alone in being near [m]
+    assert np.sqrt(np.mean(error**2)) < 3e-4
+    assert np.abs(error).max() < 2e-3
+
+
+def test_a_lone_splat_has_a_density_of_one_and_a_distant_one_does_not_change_it() -> None:
+    assert voxel_row_sums(np.array([[0.3, 0.1, 0.2]]), LENGTH, Matern12(LENGTH).value) == pytest.approx(1.0)
+    several = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.5, 0.5, 0.5], [900.0, 0.0, 0.0]])
+    sums = voxel_row_sums(several, LENGTH, Matern12(LENGTH).value)
+    np.testing.assert_allclose(sums[2:], 1.0, atol=1e-12)
+    np.testing.assert_allclose(sums[:2], 1 + np.exp(-0.5), rtol=0.1)
+
+
+def test_voxel_weights_give_nearly_the_field_of_the_row_sums() -> None:
+    centers, radii = cloud()
+    for kind in (GpdfField, SeField):
+        exact, voxel = (
+            kind(centers, radii, LENGTH, weights=name).query(queries())[0] for name in ("rowsum", "voxel")
+        )
+        assert np.abs(voxel - exact).max() < 1e-3
+        assert np.abs(voxel - exact).max() > 0
+
+
+def test_too_many_blocks_are_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    centers, radii = cloud()
+    monkeypatch.setattr(voxel_density, "MAX_BLOCKS", 0)
+    with pytest.raises(UsageError, match=r"at most 0 blocks of voxels with splats, got .*; set"):
+        GpdfField(centers, radii, LENGTH, weights="voxel")
+
+
+@pytest.mark.parametrize("is_matern", [True, False])
+def test_process_weights_solve_the_dense_system(is_matern: bool) -> None:
+    centers, radii = cloud(400)
+    kernel = Matern12(LENGTH) if is_matern else SquaredExponential(LENGTH)
+    log_values = radii / LENGTH if is_matern else np.zeros(400)
+    solution = solve_process(centers, log_values, LENGTH, kernel.value, NOISE)
+    dense = reference.process_weights(kernel.value(reference.distances(centers, centers)), np.exp(log_values), NOISE)
+    # The dense kernel is not cut off at 8 l, where a Matern kernel is 3e-4.
+    np.testing.assert_allclose(solution.scaled * np.exp(solution.log_scale), dense, atol=3e-3)
+    assert (dense < 0).any()
+    assert solution.residual < 1e-6
+    weights = weights_named("cg", Spheres.of(centers, radii), kernel, NOISE, 1)
+    assert weights.sign is not None
+    assert weights.num_iterations
+    size = np.exp(weights.log_size + log_values)
+    np.testing.assert_allclose(weights.sign * size, dense, atol=3e-3)
+
+
+def test_field_of_the_full_process_is_that_of_the_dense_one() -> None:
+    centers, radii = cloud(500)
+    distance = GpdfField(centers, radii, LENGTH, weights="cg").query_raw(queries())[0]
+    expected = reference.process_gpdf(queries(), centers, radii, LENGTH, NOISE)
+    np.testing.assert_allclose(distance, expected, atol=2e-4)  # of the cut-off at 8 l
+    se = SeField(centers, radii, LENGTH, noise=1e-2, weights="cg").query_raw(queries())[0]
+    np.testing.assert_allclose(se, reference.process_se(queries(), centers, radii, LENGTH, 1e-2), atol=2e-5)
+
+
+def test_the_full_process_is_zero_on_each_sphere_where_lumping_is_not() -> None:
+    centers, radii = cloud(500)
+    occupied = {
+        name: GpdfField(centers, radii, LENGTH, weights=name, truncation=1e-7).query(centers)[0] + radii
+        for name in ("cg", "rowsum")
+    }
+    assert np.abs(occupied["cg"]).max() < 2e-4  # eq. 8 interpolates; the matrix is cut off at 8 l, the field is not
+    assert np.abs(occupied["rowsum"]).max() > 1e-3
+
+
+def test_groups_of_splats_far_apart_do_not_drown_each_other() -> None:
+    centers = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.001, 0.0, 0.0]])
+    radii = np.array([0.5, 0.001, 0.002])
+    length = 1e-3  # e^(0.5 / l) is beyond float64
+    distance = GpdfField(centers, radii, length, weights="cg").query(np.array([[2.2, 0.0, 0.0], [0.0, 0.9, 0.0]]))[0]
+    np.testing.assert_allclose(distance, [0.197, 0.4], atol=1e-5)
+
+
+def test_what_cannot_be_solved_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    centers, radii = cloud(300)
+    radii[0] = 0.3
+    with pytest.raises(
+        UsageError, match=r"radii that differ by at most 16 length scales .*, got 60\.0; set a larger"
+    ):
+        GpdfField(centers, radii, 0.005, weights="cg")
+    monkeypatch.setattr(conjugate, "MAX_ITERATIONS", 20)
+    with pytest.raises(NotEvaluableError, match=r"after 20 iterations, got .*; set a larger field.noise"):
+        SeField(centers, radii, LENGTH, weights="cg")
+    monkeypatch.setattr(conjugate, "available_memory", lambda: 1000)
+    with pytest.raises(UsageError, match=r"pairs of splats within 8 length scales need .* GiB is free"):
+        SeField(centers, radii, LENGTH, weights="cg")
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
+    from scipy.sparse import csr_array
+
+    with pytest.raises(NotEvaluableError, match="not positive definite"):
+        conjugate_gradients(csr_array(np.array([[1.0, 3.0], [3.0, 1.0]])), np.array([1.0, -0.5]), 1e-9)
+
+
+def test_coinciding_splats_share_their_weight() -> None:
+    centers, radii = np.zeros((3, 3)), np.full(3, 0.01)
+    for weights in ("rowsum", "voxel", "cg"):
+        field = GpdfField(centers, radii, LENGTH, weights=weights, noise=1e-3)
+        distance = field.query(np.array([[0.1, 0.0, 0.0]]))[0][0]
+        assert distance == pytest.approx(0.09, abs=5e-3 if weights == "voxel" else 1e-4), weights
