@@ -16,6 +16,7 @@ Int64 = NDArray[np.int64]
 
 POINTS_PER_CHUNK = 20_000
 PAIRS_PER_CHUNK = 400_000  # of the (pairs x 3) float64 arrays
+ROUNDING = 1e-9  # [m] of the distance to a disc, generously: only what is certainly farther is left out
 NEXT, OPPOSITE = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -77,7 +78,7 @@ class MeshDistance:
 
     Faces go into a k-d tree by their centroids c_f, one tree per octave of size R_f (the largest distance of a corner
     from the centroid), because a face lies within R_f of c_f: where a face is known at distance u, only faces with
-    ``|x - c_f| <= u + R_f`` can be nearer.
+    ``|x - c_f| <= u + R_f`` can be nearer, and of those only the ones whose disc about c_f reaches as near as u.
     """
 
     def __init__(self, mesh: TriangleMesh) -> None:
@@ -132,10 +133,16 @@ class MeshDistance:
         for group, tree in zip(self._groups, self._trees, strict=True):
             for asking, asked in _within(tree, points, best + self._reach[group].max()):
                 found = group[asked]
-                gap = np.linalg.norm(points[asking] - self._centroids[found], axis=1) - self._reach[found]
-                may_be = gap <= best[asking]
+                may_be = self._disc_distance(points[asking], found) <= best[asking] + ROUNDING
                 self._improve(points, asking[may_be], found[may_be], best, face, shares)
         return face, shares
+
+    def _disc_distance(self, points: Float64, faces: Int64) -> Float64:
+        """Distance (P,) to the disc of radius R_f about c_f in the plane of a face, which holds the face."""
+        away = points - self._centroids[faces]
+        height = _dot(away, self._normals.of_face[faces])
+        aside = np.sqrt(np.maximum(_dot(away, away) - height**2, 0.0))
+        return np.hypot(height, np.maximum(aside - self._reach[faces], 0.0))
 
     def _improve(
         self, points: Float64, asking: Int64, faces: Int64, best: Float64, face: Int64, shares: Float64
@@ -198,22 +205,22 @@ class _Normals:
     def __init__(self, mesh: TriangleMesh) -> None:
         corners, faces = mesh.corners, mesh.faces
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._of_face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
+        self.of_face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
         self._faces = faces
         self._of_vertex = np.zeros_like(mesh.vertices)
         for k in range(3):
             u, v = corners[:, NEXT[k]] - corners[:, k], corners[:, OPPOSITE[k]] - corners[:, k]
             angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), _dot(u, v))
-            np.add.at(self._of_vertex, faces[:, k], angle[:, None] * self._of_face)
+            np.add.at(self._of_vertex, faces[:, k], angle[:, None] * self.of_face)
         ends = np.sort(np.stack([faces, faces[:, NEXT]], axis=2).reshape(-1, 2), axis=1)
         _, edge = np.unique(ends, axis=0, return_inverse=True)
         self._edge = edge.reshape(-1, 3)  # (F, 3): edge k runs from corner k to the next
         self._of_edge = np.zeros((int(edge.max()) + 1, 3))
-        np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self._of_face, 3, axis=0))
+        np.add.at(self._of_edge, self._edge.reshape(-1), np.repeat(self.of_face, 3, axis=0))
 
     def at(self, face: Int64, shares: Float64) -> Float64:
         """Outward directions (Q, 3), not normalised, where a point of a face has these barycentric coordinates."""
-        normal = np.asarray(self._of_face[face])
+        normal = np.asarray(self.of_face[face])
         num_zero = np.count_nonzero(shares == 0, axis=1)
         for k in range(3):
             on_edge = np.flatnonzero((num_zero == 1) & (shares[:, OPPOSITE[k]] == 0))

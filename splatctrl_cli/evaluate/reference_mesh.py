@@ -39,7 +39,7 @@ class MeshComparison:
         return {**counts, **self.accuracy.as_dict()}
 
 
-def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_points: int = 200_000) -> MeshComparison:
+def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_points: int = 50_000) -> MeshComparison:
     """Errors of the grid's distances at cell centres, drawn with the seed, against the exact distance to a mesh.
 
     The mesh is in the grid's frame, in metres, and neither moved nor scaled. Inside a closed mesh nothing is compared
