@@ -142,7 +142,7 @@ class MeshDistance:
         away = points - self._centroids[faces]
         height = _dot(away, self._normals.of_face[faces])
         aside = np.sqrt(np.maximum(_dot(away, away) - height**2, 0.0))
-        return np.hypot(height, np.maximum(aside - self._reach[faces], 0.0))
+        return np.asarray(np.hypot(height, np.maximum(aside - self._reach[faces], 0.0)))
 
     def _improve(
         self, points: Float64, asking: Int64, faces: Int64, best: Float64, face: Int64, shares: Float64
