@@ -115,8 +115,10 @@ class FieldConfig:
     weights: str = "rowsum"  # eq. 15; or voxel: density on a voxel grid (III-D), cg: the full GP of eq. 8
     length_scale: float = 0.02  # [m] l, IV-C
     noise: float = 1e-6  # epsilon of eq. 8
-    truncation: float = 2e-5  # [m] by how much leaving out small terms of the kernel sum may raise the distance
+    truncation: float = 5e-5  # [m] by how much leaving out or merging small terms may change a kernel distance
     unknown: str = "free"  # never-seen space: free, obstacle or nan
+    probability: str = "calibrated"  # of collision: Phi(-sdf / error); or paper: eq. 13 and 14, a score
+    error: float = 0.003  # [m] sigma of that; what `safe` measured near solids, splats 1 to 2 cm apart
     voxel: float = 0.02  # [m], IV-B
     padding: float = 0.20  # [m] around the splats where no workspace is given
 
@@ -193,7 +195,7 @@ def load_config(path: Path | None, assignments: typing.Sequence[str]) -> Config:
 _POSITIVE = (
     *("scene.max_splats", "scene.snapshot_every", "scene.min_radius", "scene.max_radius", "scene.radius_per_edge"),
     *("scene.fill", "scene.final_rate", "occupancy.voxel", "occupancy.max_range"),
-    *("occupancy.log_odds_hit", "occupancy.log_odds_limit", "field.voxel", "field.length_scale"),
+    *("occupancy.log_odds_hit", "occupancy.log_odds_limit", "field.voxel", "field.length_scale", "field.error"),
     *("gaussians.max_gaussians", "gaussians.lr_center", "gaussians.lr_center_final", "gaussians.densify_every"),
     *("gaussians.split_shrink", "gaussians.max_screen_radius", "gaussians.max_size_share"),
 )
@@ -226,6 +228,8 @@ _CHOICES = {
     "scene.depth_loss": ("normalised", "printed"),
     "scene.background": ("median", "black"),
     "scene.when_idle": ("detail", "clone", "leave"),
+    "field.unknown": ("free", "obstacle", "nan"),
+    "field.probability": ("calibrated", "paper"),
 }
 _AT_MOST_ONE = (
     *("scene.lambda_dssim", "scene.hole_opacity", "scene.gap_reserve", "scene.fill", "scene.final_rate"),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.kernels.field import LANES, SPARE_OFFSET, SPARE_PLACE, Clusters, Float32, Offsets
 from splatctrl_cli.records import Box, Float64, UInt8
 
-_BITS = 10  # of each coordinate in a Morton code
+_BITS = 10  # of each coordinate in a Hilbert code
 _GROUPS = 8  # their number is a multiple of this
 
 
@@ -63,7 +63,7 @@ def cluster_points(points_world: NDArray[np.floating], frame: Box | None = None)
     points = np.asarray(points_world, dtype=np.float64)
     lower, upper = (points.min(axis=0), points.max(axis=0)) if frame is None else (frame.lower, frame.upper)
     anchor = 0.5 * (lower + upper)
-    codes = _morton_codes(points, lower, float((upper - lower).max()))
+    codes = _hilbert_codes(points, lower, float((upper - lower).max()))
     order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], codes))
     num_clusters = _padded(-(-len(points) // LANES), LANES)
     source = np.zeros(LANES * num_clusters, dtype=np.int64)
@@ -96,12 +96,29 @@ def _padded(count: int, multiple: int) -> int:
     return -(-count // multiple) * multiple
 
 
-def _morton_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
-    """Interleaved bits (N,) of the coordinates: neighbours along the curve are neighbours in space."""
+def _hilbert_codes(points: Float64, lower: Float64, extent: float) -> NDArray[np.int64]:
+    """Places (N,) along a Hilbert curve: what is near on the curve is near in space, with no jumps.
+
+    Skilling, "Programming the Hilbert curve" (AIP Conf. Proc. 707, 2004): from the highest bit down, each axis is
+    reflected or swapped with the first by what its bit says, then the bits are Gray-coded and interleaved.
+    """
     last = 2**_BITS - 1
-    cells = np.clip((points - lower) / max(extent, 1e-30) * last, 0, last).astype(np.int64)
+    cells = np.clip((points - lower) / max(extent, 1e-30) * last, 0, last).astype(np.int64).T.copy()
+    for bit in range(_BITS - 1, 0, -1):
+        below = (1 << bit) - 1
+        for axis in range(3):
+            is_set = (cells[axis] >> bit) & 1 == 1
+            swapped = np.where(is_set, 0, (cells[0] ^ cells[axis]) & below)
+            cells[0] ^= np.where(is_set, below, swapped)
+            cells[axis] ^= swapped
+    cells[1] ^= cells[0]
+    cells[2] ^= cells[1]
+    flips = np.zeros(len(points), dtype=np.int64)
+    for bit in range(_BITS - 1, 0, -1):
+        flips ^= np.where((cells[2] >> bit) & 1 == 1, (1 << bit) - 1, 0)
+    cells ^= flips
     codes = np.zeros(len(points), dtype=np.int64)
     for bit in range(_BITS):
         for axis in range(3):
-            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+            codes |= ((cells[axis] >> bit) & 1) << (3 * bit + 2 - axis)
     return codes

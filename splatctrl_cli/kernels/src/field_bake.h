@@ -1,7 +1,8 @@
 // The distances of field_query.h at every cell of a grid, faster: spheres are culled by blocks of cells.
 //
-// Each block's result depends on the spheres that can matter in it and on their order, never on the others: the same
-// block of two scenes that differ elsewhere has the same bits, if the order of the spheres they share is the same.
+// Each block's result in bake_hard and bake_gaussian depends on the spheres that can matter in it and on their order,
+// never on the others: the same block of two scenes that differ elsewhere has the same bits, if the order of the spheres
+// they share is the same.
 #pragma once
 
 #include "field_blocks.h"
@@ -31,7 +32,12 @@ struct GaussianTerms {
 void bake_gaussian(const Clusters& spheres, const Offsets& offsets, const GaussianTerms& terms, float length,
                    float tolerance, const GridSpan& grid, float* distance, float* gradient);
 
-// As query_matern. offset (16 C): o_i in double; offsets: the same less any constant; they only cull.
+// As query_matern, but off by up to -l log(1 - truncation) either way. offset (16 C): o_i in double; offsets: the same
+// less any constant; they only cull.
+//
+// Half of the truncation goes to terms left out; a quarter to neighbouring spheres taken together where they look alike
+// (field_groups.h), which each cell checks against the errors' bounds, and takes the spheres one by one where it must; a
+// quarter to distances taken as parabolas along the columns of a block, where their third and fourth order allow it.
 void bake_matern(const Clusters& spheres, const Offsets& offsets, const double* offset, const float* sign, float length,
                  float truncation, const GridSpan& grid, float* distance, float* gradient);
 
