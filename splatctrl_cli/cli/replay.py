@@ -258,6 +258,12 @@ def _with_truth(args: argparse.Namespace, inputs: _Inputs, replayed: "Replay") -
 
 def _verdict(args: argparse.Namespace, metrics: "dict[str, float | None]", source: "RecordSource") -> int:
     """The exit code, after the outputs were written."""
+    if metrics["num_without_distance"]:
+        raise NotEvaluableError(
+            f"replay: the path leaves known space: at {metrics['num_without_distance']:g} of "
+            f"{metrics['num_states']:g} states a sphere is where the field has no distance",
+            remedy="the figures above leave those states out; bake with field.unknown = free or obstacle",
+        )
     unknown = metrics["unknown_share"]
     if unknown is not None and unknown > args.max_unknown:
         raise NotEvaluableError(

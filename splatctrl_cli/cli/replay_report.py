@@ -61,6 +61,7 @@ def metrics_of(replay: Replay) -> Metrics:
         "min_self_clearance": least(audit.self_clearance),
         "min_limit_margin": least(audit.limit_margin),
         "unknown_share": float(np.mean(audit.unknown_share)),
+        "num_without_distance": int(np.sum(np.any([np.isnan(c.distance) for c in audit.clearance.values()], axis=0))),
         "num_static_violations": len(replay.static_violations),
     }
     if replay.closed_loop is not None:

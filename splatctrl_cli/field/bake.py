@@ -7,6 +7,7 @@ from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.layout import GridLayout, check_memory
 from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats
+from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.records import Box, DistanceGrid, Label, OccupancyGrid, SplatSet
 
 
@@ -37,7 +38,8 @@ def bake(
     arrays = baker.allocate(layout.shape[0])
     baker.bake(0, layout.shape[0], arrays)
     header = field_header(splats, chosen, labels, baker, has_occupancy=occupancy is not None)
-    return DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=arrays, header=header)
+    grid = DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=arrays, header=header)
+    return apply_unknown(grid, config.unknown)
 
 
 def bytes_per_cell(channels: Collection[str]) -> int:

@@ -10,6 +10,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField, checked_distance
 from splatctrl_cli.field.layout import HALF_DIAGONAL, GridLayout
 from splatctrl_cli.field.observed import observed_planes
+from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
@@ -20,6 +21,7 @@ CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
     "gradient": ("<f4", 3),
     "bound": ("<f4", 1),
     "observed": ("|u1", 1),
+    "probability": ("<f4", 1),
     "label": ("|u1", 1),
     "hard": ("<f4", 1),
     "se": ("<f4", 1),
@@ -63,6 +65,8 @@ class Baker:
         names = {self.kernel_name, *channels}
         self.se = SeField.over(self.spheres, config, threads=threads) if "se" in names else None
         self.gpdf = GpdfField.over(self.spheres, config, threads=threads) if "gpdf" in names else None
+        has_probability = "probability" in channels
+        self.probability = make_probability(self.spheres, config, threads=threads) if has_probability else None
         self.num_without_value: dict[str, int] = {name: 0 for name in ("se", "gpdf") if name in names}
         self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
 
@@ -121,6 +125,8 @@ class Baker:
             made["gradient"] = slope
         if "bound" in self.channels:
             made["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
+        if self.probability is not None:
+            made["probability"] = self.probability.baked(span, sdf, threads=self.threads)
         if entry is not None:
             made["label"] = self.labels[self.spheres.points.source[entry]]
         if "observed" in self.channels:

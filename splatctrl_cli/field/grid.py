@@ -14,6 +14,7 @@ class GridField:
 
     Outside the box of the cell centres it reads the value at the nearest point of the box less the distance to it:
     a lower bound of a distance, so that a robot that leaves the grid is told of less clearance, never of more.
+    Beside a cell that is NaN (never-seen space under the policy ``nan``) it is NaN, and so is the certified distance.
     """
 
     def __init__(self, grid: DistanceGrid, channel: str = "sdf") -> None:
@@ -26,6 +27,7 @@ class GridField:
                 f"distance grid: expected at least 2 cells along each axis, got {self._values.shape}",
                 remedy="bake a larger box or a smaller voxel",
             )
+        self._has_blank = bool(np.isnan(self._values).any())
         bound = grid.channels.get("bound")
         self._bound = None if bound is None else np.ascontiguousarray(bound, dtype=np.float32)
         self._origin = np.ascontiguousarray(grid.origin, dtype=np.float64)
@@ -34,21 +36,24 @@ class GridField:
         self.box = Box(lower=self._origin, upper=upper)
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3), not normalised."""
+        """points (Q, 3) [m], world -> distance (Q,) [m], gradient (Q, 3), not normalised; NaN beside a NaN cell."""
         return native.interpolate(self._values, self._origin, self._voxel, checked_points(points))
 
     def certified(self, points: Float64) -> Float64:
         """A distance (Q,) [m] that the exact distance to the splats is not below.
 
         ``max over the corners of (hard(corner) - |x - corner|)``, less rounding: hard is 1-Lipschitz, so this holds
-        whatever interpolation does in between. It certifies the distance to the splats, not to objects. Raises
-        InputError for a grid without the channel bound.
+        whatever interpolation does in between. It certifies the distance to the splats (and to never-seen cells that
+        are obstacles), not to objects. NaN where `query` is. Raises InputError for a grid without the channel bound.
         """
         if self._bound is None:
             raise InputError("distance grid: no channel 'bound'", remedy="bake it with --channels sdf,bound")
         # The channel holds for a whole cell: at its centre the exact distance is half a diagonal more.
         lowest = native.lipschitz_bound(self._bound, self._origin, self._voxel, checked_points(points))
-        return np.asarray(lowest + HALF_DIAGONAL * self._voxel)
+        certified = np.asarray(lowest + HALF_DIAGONAL * self._voxel)
+        if self._has_blank:
+            certified[np.isnan(self.query(points)[0])] = np.nan
+        return certified
 
     def contains(self, points: Float64) -> Bool:
         """(Q,) True where a point lies in the box of the cell centres."""

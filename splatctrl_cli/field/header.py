@@ -30,7 +30,7 @@ def field_header(
         "mean": float(chosen.radii.mean(dtype=np.float64)),
         "max": float(chosen.radii.max()),
     }
-    return {
+    header: dict[str, object] = {
         "format": "splatctrl distance grid",
         "version": FORMAT_VERSION,
         "sign": "positive outside",
@@ -57,3 +57,11 @@ def field_header(
         "radius": radii,
         "health": field_health(chosen.centers, chosen.radii, config.length_scale).as_dict(),
     }
+    if baker.probability is not None:
+        header |= {"probability": config.probability, "probability_numbers": baker.probability.described()}
+    solved = {
+        name: {"num_iterations": field.weights.num_iterations, "residual": field.weights.residual}
+        for name, field in (("se", baker.se), ("gpdf", baker.gpdf))
+        if field is not None and field.weights.num_iterations is not None
+    }
+    return header | ({"weights_solved": solved} if solved else {})

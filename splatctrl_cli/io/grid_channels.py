@@ -41,7 +41,7 @@ CHANNELS: Mapping[str, Channel] = {
     "gradient": Channel(dtype="<f4", components=3, may_be_unknown=True),
     "bound": _DISTANCE,
     "observed": Channel(dtype="|u1"),
-    "probability": Channel(dtype="<f4"),
+    "probability": Channel(dtype="<f4", may_be_unknown=True),
     "label": Channel(dtype="|u1"),
     "hard": _DISTANCE,
     "se": _DISTANCE,

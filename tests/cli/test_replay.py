@@ -172,6 +172,22 @@ def test_a_baked_field_says_nearly_the_same_and_certifies_less(desk: Desk, arm: 
     assert float(row["clearance_certified"]) <= clearance(arm, START) + 1e-6
 
 
+def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    box = Box(lower=np.array([-0.4, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.2]))
+    seen = grid_seen()
+    seen.num_updates[:, :, 15:] = 0  # above half a metre
+    config = FieldConfig(voxel=0.04, unknown="nan")
+    (desk.folder / "field").mkdir()
+    write_npz(desk.folder / "field" / "field.npz", bake(splats_of(BALL), box, config, occupancy=seen, threads=1))
+    assert desk.replay("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1") == 5
+    assert "the path leaves known space: at 11 of 11 states" in capsys.readouterr().err
+    assert desk.metrics()["num_without_distance"] == 11
+    assert {row["clearance_barrier"] for row in desk.rows()} == {""}
+    driven = ("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1", "--mode", "closed-loop")
+    assert desk.replay(*driven, out="driven") == 5
+    assert "the field has no distance there" in capsys.readouterr().err
+
+
 def test_unknown_space_is_said_after_the_outputs_are_written(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), is_seen=False)
     assert desk.replay("--scene", str(scene), "-q", "--require", "min_clearance>=9") == 5

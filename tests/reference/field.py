@@ -109,3 +109,36 @@ def process_se(points: Array, centers: Array, radii: Array, length: float, noise
     occupancy = terms.sum(axis=1)
     log = np.log(np.where((occupancy > 0) & (occupancy < 1), occupancy, np.nan))
     return np.sqrt(-2 * length**2 * log) - (terms @ radii) / occupancy
+
+
+def explained(points: Array, centers: Array, length: float, noise: float) -> Array:
+    """What eq. 13 takes off k(x, x), lumped by eq. 15: ``sum_i w_i k(x, p_i)^2``."""
+    squared = np.exp(-2 * distances(points, centers) / length)
+    return squared @ (1 / (noise + row_sums(centers, length)))
+
+
+def collision_probability(occupancy: Array, variance: Array) -> Array:
+    """Eq. 14 as printed, the variance divided by 9."""
+    from math import erf
+
+    def phi(values: Array) -> Array:
+        return np.array([0.5 * (1 + erf(value / np.sqrt(2))) for value in values])
+
+    deviation = np.sqrt(variance / 9)
+    return (1 - phi((1 - occupancy) / deviation)) / (1 - phi(-occupancy / deviation))
+
+
+def march(
+    points: Array, centers: Array, radii: Array, length: float, noise: float, steps: int
+) -> tuple[Array, Array]:
+    """III-D's sphere marching on `gpdf`, one point and one step after the other: distance and point reached."""
+    results = []
+    for start in points:
+        place, walked = start[None], 0.0
+        for _ in range(steps):
+            here = gpdf(place, centers, radii, length, noise)[0]
+            step = max(min(here, hard(place, centers, radii)[0]), 0.0)
+            slope = gpdf_gradient(place, centers, radii, length, noise)
+            place, walked = place - step * slope / np.linalg.norm(slope), walked + step
+        results.append((walked + gpdf(place, centers, radii, length, noise)[0], place[0]))
+    return np.array([walked for walked, _ in results]), np.array([place for _, place in results])

@@ -1,0 +1,149 @@
+"""Probability that a point is in collision: the paper's form, and one calibrated by a measured error (III-D)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.distance import GpdfField
+from splatctrl_cli.field.kernel import Matern12
+from splatctrl_cli.field.spheres import Spheres, checked_points
+from splatctrl_cli.kernels import field as native
+from splatctrl_cli.kernels.field import GridSpan
+from splatctrl_cli.records import Float32, Float64
+
+VARIANCE_DIVISOR = 9.0  # III-D
+LEAST_VARIANCE = 1e-6  # before the division: what float32 leaves of 1 - sum
+CERTAIN = 50.0  # log occupancy beyond which every probability is 1
+
+
+class CollisionProbability(Protocol):
+    """What a baked probability is made by."""
+
+    def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
+        """Probability (X, Y, Z) at the cells of `span`, whose chosen distance [m] is `sdf`."""
+        ...
+
+    def described(self) -> dict[str, object]:
+        """What it means, and its numbers, for a header."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibratedProbability:
+    """``Phi(-clearance / sigma)``, sigma [m] the error that was measured of the field that gives the clearance."""
+
+    sigma: float
+
+    def of(self, clearance: Float64) -> Float64:
+        """Probability of clearances of any shape [m]."""
+        from scipy.special import ndtr
+
+        return np.asarray(ndtr(-clearance / self.sigma))
+
+    def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
+        """As `CollisionProbability.baked`."""
+        return self.of(sdf.astype(np.float64)).astype(np.float32)
+
+    def described(self) -> dict[str, object]:
+        """As `CollisionProbability.described`."""
+        return {"meaning": "Phi(-sdf / sigma)", "sigma": self.sigma}
+
+
+class PaperProbability:
+    """Eq. 13 and 14 with the Matern kernel and lumped weights: a score; docs/field.md shows how far it is from one.
+
+    ``P(o >= 1 | o > 0) = Phi((o - 1) / s) / Phi(o / s)`` with o of `GpdfField` and
+    ``s^2 = (1 - sum_i w_i k(x, p_i)^2) / 9``.
+    """
+
+    def __init__(self, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> None:
+        """Raises UsageError for weights that are not lumped: eq. 13 would need a solution for each point."""
+        if config.weights == "cg":
+            raise UsageError(
+                "field.probability = paper: expected field.weights = rowsum or voxel, got cg",
+                remedy="set field.probability = calibrated, or other weights",
+            )
+        self._gpdf = GpdfField.over(spheres, config, threads=threads)
+        # k^2 is a Matern kernel too, of half the length: sum_i w_i k^2 = exp(-2 g / l), g the field of that kernel.
+        self._half = Matern12(0.5 * self._gpdf.kernel.length)
+        self._share = self._half.share(0.5 * config.truncation)
+        self._offsets = self._half.length * self._gpdf.weights.log_size
+        self._threads = threads
+
+    def of(self, points: Float64) -> Float64:
+        """Probability (Q,) at points (Q, 3) [m]."""
+        places = self._gpdf.spheres.points
+        half, _ = native.matern(
+            places.clusters,
+            places.offsets(self._offsets),
+            None,
+            self._half.length,
+            self._share,
+            places.relative(checked_points(points)),
+            threads=self._threads,
+        )
+        return self._combined(self._gpdf.query_raw(points)[0], half.astype(np.float64))
+
+    def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
+        """As `CollisionProbability.baked`; the paper's form does not depend on the chosen distance."""
+        places = self._gpdf.spheres.points
+        gpdf, half = np.zeros_like(sdf), np.zeros_like(sdf)
+        self._gpdf.bake_raw(span, gpdf, None, threads=threads)
+        native.bake_matern(
+            places.clusters,
+            places.offsets(self._offsets),
+            places.laid_out(self._offsets, spare=native.SPARE_OFFSET),
+            None,
+            self._half.length,
+            self._share,
+            span,
+            half,
+            None,
+            threads=threads,
+        )
+        return self._combined(gpdf.astype(np.float64), half.astype(np.float64)).astype(np.float32)
+
+    def described(self) -> dict[str, object]:
+        """As `CollisionProbability.described`."""
+        return {"meaning": "eq. 13 and 14 with lumped weights: a score", "variance_divisor": VARIANCE_DIVISOR}
+
+    def _combined(self, gpdf: Float64, half: Float64) -> Float64:
+        explained = np.exp(np.minimum(-half / self._half.length, 0.0))  # the sum never exceeds 1 but by rounding
+        occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, CERTAIN))
+        return probability_of_occupancy(occupancy, explained)
+
+
+def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
+    """Eq. 14 of an occupancy o > 0 whose variance is ``(1 - explained) / 9``, of any shape.
+
+    In logarithms: 1 - Phi loses what is small. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, and not zero.
+    """
+    from scipy.special import log_ndtr
+
+    deviation = np.sqrt(np.maximum(1.0 - explained, LEAST_VARIANCE) / VARIANCE_DIVISOR)
+    return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))
+
+
+_Make = Callable[[Spheres, FieldConfig, int], CollisionProbability]
+PROBABILITIES: Mapping[str, _Make] = {
+    "calibrated": lambda spheres, config, threads: CalibratedProbability(sigma=checked_error(config.error)),
+    "paper": lambda spheres, config, threads: PaperProbability(spheres, config, threads=threads),
+}
+
+
+def make_probability(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> CollisionProbability:
+    """The probability that ``config.probability`` names. Raises UsageError for a name that is not there."""
+    if config.probability not in PROBABILITIES:
+        raise UsageError(f"field.probability: expected one of {', '.join(PROBABILITIES)}, got {config.probability}")
+    return PROBABILITIES[config.probability](spheres, config, threads)
+
+
+def checked_error(error: float) -> float:
+    """sigma [m]. Raises UsageError unless it is above zero."""
+    if not 0 < error < np.inf:
+        raise UsageError(f"field.error: expected a distance above 0 m, got {error}")
+    return float(error)

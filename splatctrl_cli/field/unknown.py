@@ -1,0 +1,131 @@
+"""What never-seen space counts as: nothing, an obstacle, or no distance at all."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field.layout import HALF_DIAGONAL
+from splatctrl_cli.records import Bool, DistanceGrid, Float32, VoxelState
+
+POLICIES = ("free", "obstacle", "nan")
+BLANKED = ("sdf", "gradient", "probability")  # by nan
+ROUNDING = 1e-6  # [m] and of a distance: what float32 may raise it by
+BOUND = (
+    "no point of the cell is nearer to a splat's sphere or a never-seen cell; "
+    "bound + bound_margin is the lesser of hard and the distance to never-seen cells at its centre"
+)
+
+Channels = dict[str, NDArray[np.generic]]
+
+
+def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
+    """The grid with its never-seen cells treated by `policy`, and what that changed in its header.
+
+    ``free``: distances from the splats alone. ``nan``: no sdf, gradient or probability at a never-seen cell.
+    ``obstacle``: never-seen cells are solid cubes; sdf, its gradient and bound are those of the nearer of splats
+    and cubes, the probability at a never-seen cell is 1, and bound holds for splats and cubes. A cell that only the
+    robot was in is known (`VoxelState.SWEPT_BY_ROBOT`); what lies outside the grid is not looked at.
+
+    Raises UsageError for another policy, InputError for a grid without `observed`, NotEvaluableError where nothing
+    was ever seen.
+    """
+    if policy not in POLICIES:
+        raise UsageError(f"field.unknown: expected one of {', '.join(POLICIES)}, got {policy}")
+    header = {**grid.header, "unknown": policy}
+    if policy == "free":
+        return replace(grid, header=header)
+    if "observed" not in grid.channels:
+        raise InputError(
+            "distance grid: no channel 'observed', which field.unknown needs", remedy="bake it with that channel"
+        )
+    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
+    if is_unknown.all():
+        raise NotEvaluableError(
+            f"field.unknown = {policy}: expected a cell that some camera saw, got none of {is_unknown.size}",
+            remedy="bake a scene with an occupancy grid, check --box, or set field.unknown = free",
+        )
+    num_unknown = int(np.count_nonzero(is_unknown))
+    if policy == "nan":
+        channels, num_changed = blank(grid.channels, is_unknown), num_unknown
+    else:
+        margin = grid.header.get("bound_margin")
+        if not isinstance(margin, float):
+            raise InputError("distance grid: header: expected a bound_margin, got none", remedy="bake it again")
+        header["bound"] = BOUND
+        channels, num_changed = dict(grid.channels), 0
+        if num_unknown:
+            channels, num_changed = Cubes.of(is_unknown, grid.voxel).joined(grid.channels, margin)
+    header["unknown_cells"] = {"never_seen": num_unknown, "changed": num_changed}
+    return replace(grid, channels=channels, header=header)
+
+
+def blank(channels: Mapping[str, NDArray[np.generic]], is_unknown: Bool) -> Channels:
+    """Channels (X, Y, Z) with NaN for a distance, gradient and probability where `is_unknown`."""
+    blanked = dict(channels)
+    for name in BLANKED:
+        if name in channels:
+            where = is_unknown if channels[name].ndim == 3 else is_unknown[..., None]
+            blanked[name] = np.where(where, np.float32(np.nan), channels[name])
+    return blanked
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cubes:
+    """The never-seen cells (X, Y, Z) of a grid as solid cubes.
+
+    distance: a lower bound [m] of the signed distance to them from each cell's centre; away (..., 3): unit vectors
+    in which it grows.
+    """
+
+    is_unknown: Bool
+    distance: Float32
+    away: Float32
+
+    @classmethod
+    def of(cls, is_unknown: Bool, voxel: float) -> "Cubes":
+        """Of a grid of which some cells are unknown, and some not.
+
+        Outside, no cube is nearer than the nearest one's centre less half a diagonal, nor than the least over cubes
+        of the largest difference of a coordinate less half a cell. Inside it is minus the distance to the nearest
+        known centre, less half a cell, which the depth does not exceed.
+        """
+        from scipy.ndimage import distance_transform_cdt, distance_transform_edt
+
+        here = np.indices(is_unknown.shape, dtype=np.int32)
+        distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
+        away = (here - nearest).astype(np.float32)
+        lowest = np.maximum(distance - HALF_DIAGONAL, distance_transform_cdt(~is_unknown, "chessboard") - 0.5)
+        distance, nearest = distance_transform_edt(is_unknown, return_indices=True)
+        np.copyto(away, nearest - here, where=is_unknown, casting="same_kind")
+        lowest = np.where(is_unknown, 0.5 - distance, lowest)
+        away /= np.sqrt(np.square(away).sum(axis=0))
+        return cls(
+            is_unknown=is_unknown,
+            distance=(voxel * lowest - ROUNDING * (1.0 + voxel * np.abs(lowest))).astype(np.float32),
+            away=np.moveaxis(away, 0, -1),
+        )
+
+    def planes(self, first: int, last: int) -> "Cubes":
+        """The x-planes [first, last)."""
+        return replace(
+            self,
+            is_unknown=self.is_unknown[first:last],
+            distance=self.distance[first:last],
+            away=self.away[first:last],
+        )
+
+    def joined(self, channels: Mapping[str, NDArray[np.generic]], bound_margin: float) -> tuple[Channels, int]:
+        """Channels of the nearer of what they hold and the cubes, and the number of cells whose sdf changed."""
+        joined = dict(channels)
+        is_nearer = np.asarray(self.distance < np.asarray(channels["sdf"], dtype=np.float32))
+        joined["sdf"] = np.where(is_nearer, self.distance, channels["sdf"])
+        if "gradient" in channels:
+            joined["gradient"] = np.where(is_nearer[..., None], self.away, channels["gradient"])
+        if "bound" in channels:
+            joined["bound"] = np.minimum(channels["bound"], self.distance - np.float32(bound_margin))
+        if "probability" in channels:
+            joined["probability"] = np.where(self.is_unknown, np.float32(1.0), channels["probability"])
+        return joined, int(np.count_nonzero(is_nearer))

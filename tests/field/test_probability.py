@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.distance import make_field
+from splatctrl_cli.field.probability import (
+    CalibratedProbability,
+    PaperProbability,
+    make_probability,
+    probability_of_occupancy,
+)
+from splatctrl_cli.field.spheres import Spheres
+from splatctrl_cli.records import Box
+from tests.field.scenes import cloud, queries, splat_set
+from tests.reference import field as reference
+
+LENGTH, NOISE = FieldConfig.length_scale, FieldConfig.noise
+BOX = Box(lower=np.array([-0.41, -0.37, -0.2]), upper=np.array([0.35, 0.4, 0.33]))
+
+
+def plane(spacing: float = 0.005) -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.meshgrid(np.arange(-0.12, 0.12, spacing), np.arange(-0.12, 0.12, spacing))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.zeros(x.size)
+
+
+def test_the_papers_probability_is_that_of_its_equations() -> None:
+    centers, radii = cloud()
+    points = np.concatenate([queries(), centers[:50] + 0.004])
+    probability = PaperProbability(Spheres.of(centers, radii), FieldConfig(truncation=1e-7)).of(points)
+    occupancy = np.exp(-reference.gpdf(points, centers, radii, LENGTH, NOISE) / LENGTH)
+    variance = 1 - reference.explained(points, centers, LENGTH, NOISE)
+    np.testing.assert_allclose(probability, reference.collision_probability(occupancy, variance), atol=2e-4)
+
+
+def test_variance_falls_to_three_quarters_on_a_dense_plane_and_far_away_a_score_is_left() -> None:
+    centers, radii = plane()
+    on_plane = np.array([[0.001, 0.002, 0.0]])
+    assert 1 - reference.explained(on_plane, centers, LENGTH, NOISE)[0] == pytest.approx(0.75, abs=0.01)
+    found = PaperProbability(Spheres.of(centers, radii), FieldConfig()).of(np.array([[0.0, 0.0, 5.0], *on_plane]))
+    assert found[0] == pytest.approx(0.0027, abs=1e-4)  # Phi(-3) / Phi(0): dividing by 9 leaves a floor
+    assert found[1] == pytest.approx(0.5, abs=0.06)  # on the surface, where it should say so and the mean is right
+
+
+def test_probability_grows_towards_the_splats_and_never_leaves_its_range() -> None:
+    centers, radii = cloud(200)
+    radii[:] = 0.01
+    for length in (1e-10, 1e-6, 1e-3, 0.02, 1.0, 100.0):
+        config = FieldConfig(length_scale=length)
+        points = np.concatenate([centers[:20], queries(100), 40.0 + queries(5)])
+        found = PaperProbability(Spheres.of(centers, radii), config).of(points)
+        assert np.isfinite(found).all()
+        assert ((found >= 0) & (found <= 1)).all()
+        if length < 0.1:
+            assert found[:20].min() > 0.98 * found.max()
+            np.testing.assert_allclose(found[-5:], 0.0027, atol=1e-4)
+
+
+def test_an_occupancy_beyond_float64_is_certain() -> None:
+    assert probability_of_occupancy(np.array([1e21]), np.array([0.0]))[0] == 1.0
+    assert probability_of_occupancy(np.array([0.0]), np.array([1.0]))[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_calibrated_probability_is_a_half_on_the_surface_and_sixteen_percent_one_sigma_away() -> None:
+    probability = CalibratedProbability(sigma=0.003)
+    found = probability.of(np.array([-0.003, 0.0, 0.003, 0.1]))
+    np.testing.assert_allclose(found, [0.8413447, 0.5, 0.1586553, 0.0], atol=1e-7)
+
+
+@pytest.mark.parametrize("form", ["calibrated", "paper"])
+def test_the_baked_channel_is_the_probability_at_the_cell_centres(form: str) -> None:
+    centers, radii = cloud()
+    config = FieldConfig(voxel=0.03, probability=form)
+    grid = bake(splat_set(centers, radii), BOX, config, channels=("sdf", "probability"))
+    values = grid.channels["probability"]
+    points = grid.origin + grid.voxel * np.argwhere(np.ones(values.shape, bool))
+    if form == "paper":
+        expected = PaperProbability(Spheres.of(centers, radii), config).of(points)
+    else:
+        expected = CalibratedProbability(sigma=config.error).of(make_field(centers, radii, config).query(points)[0])
+    np.testing.assert_allclose(values.ravel(), expected, atol=3e-3)  # 2e-5 m of truncation over 3 mm
+    assert values.max() > 0.3
+    assert grid.header["probability"] == form
+    numbers = grid.header["probability_numbers"]
+    assert isinstance(numbers, dict)
+    assert (
+        numbers.get("sigma" if form == "calibrated" else "variance_divisor")
+        == {"calibrated": 0.003, "paper": 9}[form]
+    )
+
+
+def test_a_grid_without_the_channel_names_no_probability() -> None:
+    header = bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.05)).header
+    assert "probability" not in header
+    assert "weights_solved" not in header
+
+
+def test_the_header_tells_how_a_full_process_was_solved() -> None:
+    config = FieldConfig(voxel=0.05, weights="cg", distance="gpdf")
+    solved = bake(splat_set(*cloud(200)), BOX, config).header["weights_solved"]
+    assert isinstance(solved, dict)
+    assert solved["gpdf"]["residual"] < 1e-6
+
+
+def test_bad_settings_are_refused_in_words() -> None:
+    spheres = Spheres.of(*cloud(10))
+    with pytest.raises(UsageError, match=r"field.probability: expected one of calibrated, paper, got sure"):
+        make_probability(spheres, FieldConfig(probability="sure"))
+    with pytest.raises(UsageError, match=r"field.error: expected a distance above 0 m, got 0.0"):
+        make_probability(spheres, FieldConfig(error=0.0))
+    with pytest.raises(UsageError, match=r"expected field.weights = rowsum or voxel, got cg"):
+        make_probability(spheres, FieldConfig(probability="paper", weights="cg"))

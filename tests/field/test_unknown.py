@@ -1,0 +1,145 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.field.grid import GridField
+from splatctrl_cli.field.unknown import Cubes, apply_unknown
+from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, OccupancyGrid, VoxelState
+from tests.field.scenes import cloud, queries, splat_set
+
+BOX = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.4))
+CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label")
+
+
+def cube_distance(points: Float64, centers: Float64, voxel: float) -> Float64:
+    """Distance (Q,) to the nearest of cubes (M, 3) of side `voxel`, of every pair."""
+    gap = np.maximum(np.abs(points[:, None] - centers[None]) - voxel / 2, 0.0)
+    return np.asarray(np.sqrt(np.einsum("qmi,qmi->qm", gap, gap)).min(axis=1))
+
+
+def cell_centers(grid: DistanceGrid, chosen: Bool) -> Float64:
+    return np.asarray(grid.origin + grid.voxel * np.argwhere(chosen))
+
+
+@pytest.fixture(scope="module")
+def grid() -> DistanceGrid:
+    """Never seen below z = -0.2 and in a corner; a cell that only the robot was in stands in the corner."""
+    shape = (21, 21, 21)
+    states = np.full(shape, VoxelState.FREE, np.uint8)
+    states[:, :, :5] = VoxelState.NEVER_SEEN
+    states[15:, 15:, 12:] = VoxelState.NEVER_SEEN
+    states[18, 18, 16] = VoxelState.SWEPT_BY_ROBOT
+    occupancy = OccupancyGrid.from_states(BOX.lower, 0.04, states)
+    return bake(splat_set(*cloud()), BOX, FieldConfig(voxel=0.04), channels=CHANNELS, occupancy=occupancy)
+
+
+def test_free_leaves_every_channel_as_it_is(grid: DistanceGrid) -> None:
+    free = apply_unknown(grid, "free")
+    assert free.header["unknown"] == "free"
+    for name, values in grid.channels.items():
+        np.testing.assert_array_equal(free.channels[name], values)
+
+
+def test_nan_blanks_never_seen_cells_and_no_other(grid: DistanceGrid) -> None:
+    blanked = apply_unknown(grid, "nan")
+    is_unknown = grid.channels["observed"] == VoxelState.NEVER_SEEN
+    assert 0 < is_unknown.sum() < is_unknown.size
+    for name in ("sdf", "probability"):
+        np.testing.assert_array_equal(np.isnan(blanked.channels[name]), is_unknown)
+        np.testing.assert_array_equal(blanked.channels[name][~is_unknown], grid.channels[name][~is_unknown])
+    np.testing.assert_array_equal(np.isnan(blanked.channels["gradient"]).all(axis=-1), is_unknown)
+    np.testing.assert_array_equal(blanked.channels["bound"], grid.channels["bound"])
+    assert not is_unknown[18, 18, 16]
+    assert blanked.header["unknown_cells"] == {"never_seen": int(is_unknown.sum()), "changed": int(is_unknown.sum())}
+
+
+def test_an_obstacle_distance_is_never_beyond_the_nearest_never_seen_cube(grid: DistanceGrid) -> None:
+    solid = apply_unknown(grid, "obstacle")
+    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
+    cubes = cell_centers(grid, is_unknown)
+    exact = cube_distance(cell_centers(grid, ~is_unknown)[::7], cubes, grid.voxel)
+    sdf = solid.channels["sdf"][~is_unknown][::7]
+    before = grid.channels["sdf"][~is_unknown][::7]
+    assert (sdf <= np.minimum(before, exact)).all()
+    assert (sdf >= np.minimum(before, exact - 0.5 * np.sqrt(3) * grid.voxel)).all()
+    touching = exact < 0.51 * grid.voxel
+    np.testing.assert_allclose(sdf[touching], np.minimum(before, exact)[touching], atol=2e-6)
+    assert (solid.channels["sdf"][is_unknown] < 0).all()
+    assert (solid.channels["probability"][is_unknown] == 1).all()
+    changed = int((solid.channels["sdf"] != grid.channels["sdf"]).sum())
+    assert solid.header["unknown_cells"] == {"never_seen": int(is_unknown.sum()), "changed": changed}
+
+
+def test_inside_the_unknown_the_distance_is_at_least_as_deep_as_the_way_out(grid: DistanceGrid) -> None:
+    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
+    found = Cubes.of(is_unknown, grid.voxel)
+    depth = cube_distance(cell_centers(grid, is_unknown)[::3], cell_centers(grid, ~is_unknown), grid.voxel)
+    assert (found.distance[is_unknown][::3] <= -depth).all()
+    np.testing.assert_allclose(np.linalg.norm(found.away, axis=-1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(found.away[10, 10, 4], [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(found.away[10, 10, 5], [0, 0, 1], atol=1e-6)
+
+
+def test_the_bound_certifies_splats_and_never_seen_cells(grid: DistanceGrid) -> None:
+    solid = apply_unknown(grid, "obstacle")
+    points = queries(1500, extent=0.4)
+    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
+    hard, _ = SphereField(*cloud()).query(points)
+    cubes = cube_distance(points, cell_centers(grid, is_unknown), grid.voxel)
+    certified = GridField(solid).certified(points)
+    assert (certified <= np.minimum(hard, cubes)).all()
+    assert (certified < GridField(grid).certified(points) - 1e-3).any()
+    for name in CHANNELS:
+        assert solid.channels[name].dtype == grid.channels[name].dtype
+        assert np.isfinite(solid.channels[name]).all()
+
+
+def test_a_slab_of_cubes_is_what_the_whole_is_there(grid: DistanceGrid) -> None:
+    is_unknown = np.asarray(grid.channels["observed"] == VoxelState.NEVER_SEEN)
+    found = Cubes.of(is_unknown, grid.voxel)
+    whole = apply_unknown(grid, "obstacle")
+    margin = grid.header["bound_margin"]
+    assert isinstance(margin, float)
+    part, _ = found.planes(8, 16).joined({n: v[8:16] for n, v in grid.channels.items()}, margin)
+    for name, values in part.items():
+        np.testing.assert_array_equal(values, whole.channels[name][8:16])
+
+
+def test_a_grid_with_blank_cells_says_so_at_every_point_beside_one(grid: DistanceGrid) -> None:
+    field, before = GridField(apply_unknown(grid, "nan")), GridField(grid)
+    points = queries(2000, extent=0.4)
+    corner = np.floor((points - grid.origin) / grid.voxel).astype(int)
+    is_unknown = grid.channels["observed"] == VoxelState.NEVER_SEEN
+    steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(8, 3)
+    beside = np.any([is_unknown[tuple((corner + step).T)] for step in steps], axis=0)
+    assert 0 < beside.sum() < len(points)
+    for got, free in (
+        (field.query(points)[0], before.query(points)[0]),
+        (field.certified(points), before.certified(points)),
+    ):
+        np.testing.assert_array_equal(np.isnan(got), beside)
+        np.testing.assert_array_equal(got[~beside], free[~beside])
+
+
+def test_what_cannot_be_applied_is_refused_in_words(grid: DistanceGrid) -> None:
+    with pytest.raises(UsageError, match=r"field.unknown: expected one of free, obstacle, nan, got air"):
+        apply_unknown(grid, "air")
+    bare = replace(grid, channels={"sdf": grid.channels["sdf"]})
+    with pytest.raises(InputError, match="no channel 'observed'"):
+        apply_unknown(bare, "nan")
+    never = {**grid.channels, "observed": np.zeros_like(grid.channels["observed"])}
+    with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw, got none of 9261"):
+        apply_unknown(replace(grid, channels=never), "obstacle")
+
+
+def test_where_all_was_seen_nothing_changes(grid: DistanceGrid) -> None:
+    seen = {**grid.channels, "observed": np.ones_like(grid.channels["observed"])}
+    for policy in ("obstacle", "nan"):
+        after = apply_unknown(replace(grid, channels=seen), policy)
+        assert after.header["unknown_cells"] == {"never_seen": 0, "changed": 0}
+        np.testing.assert_array_equal(after.channels["sdf"], grid.channels["sdf"])
