@@ -1,8 +1,7 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -106,7 +105,7 @@ def _fit(
 ) -> dict[str, object]:
     """Reconstruct into the output folder, or go on with what an interrupted run left of it; returns the metrics."""
     from splatctrl_cli.cli.reconstruction import Reconstruction
-    from splatctrl_cli.cli.resume import checkpoint_to_go_on_from, identity
+    from splatctrl_cli.cli.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
     from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
     from splatctrl_cli.io.scene_writer import CHECKPOINT
 
@@ -120,7 +119,7 @@ def _fit(
             f"warning: {partial_path(out)}: an interrupted run is replaced; --resume would have gone on with it"
         )
     with (
-        _told_how_to_go_on(checkpoint_file),
+        told_how_to_go_on(checkpoint_file),
         output_path(out, force=args.force, is_folder=True, checkpoint=CHECKPOINT, resume=args.resume) as partial,
     ):
         inputs = source.digests()
@@ -181,19 +180,6 @@ def _lines(
     if loss.invalid_depth:
         lines.append(f"note: {loss.invalid_depth} pixels of depth NaN, infinite or negative: taken as none")
     return lines + [f"note: {note}" for note in loss.notes]
-
-
-@contextmanager
-def _told_how_to_go_on(checkpoint: Path) -> Iterator[None]:
-    """Says after Ctrl-C what was kept."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        if not checkpoint.is_file():
-            raise
-        raise KeyboardInterrupt(
-            f"interrupted: {checkpoint.parent.parent} is kept; go on with the same command and --resume"
-        ) from None
 
 
 def _box(args: argparse.Namespace) -> "Box | None":

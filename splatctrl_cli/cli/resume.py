@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,15 +26,11 @@ def identity(args: argparse.Namespace, config: "Config", inputs: Mapping[str, st
 
     inputs: sha256 of the recording's files, by name.
     """
-    from splatctrl_cli import __version__
     from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.kernels import native
 
     files = [name for name in ("urdf", "spheres", "points") if getattr(args, name)]
     values = {
-        "splatctrl": __version__,
-        "kernels": native.__name__.rpartition(".")[2],
-        **{name: metadata.version(name) for name in DECIDING_PACKAGES},
+        **deciding_versions(),
         "--seed": args.seed,
         **{f"--{name.replace('_', '-')}": getattr(args, name) for name in DECIDING_OPTIONS},
         **{f"--{name}": sha256(getattr(args, name)) for name in files},
@@ -42,6 +39,31 @@ def identity(args: argparse.Namespace, config: "Config", inputs: Mapping[str, st
     }
     plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
     return plain
+
+
+def deciding_versions() -> dict[str, str]:
+    """What of this program, its kernels and its packages may change a bit."""
+    from splatctrl_cli import __version__
+    from splatctrl_cli.kernels import native
+
+    return {
+        "splatctrl": __version__,
+        "kernels": native.__name__.rpartition(".")[2],
+        **{name: metadata.version(name) for name in DECIDING_PACKAGES},
+    }
+
+
+@contextmanager
+def told_how_to_go_on(checkpoint: Path) -> Iterator[None]:
+    """Says after Ctrl-C what was kept: the folder above that of the checkpoint."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not checkpoint.is_file():
+            raise
+        raise KeyboardInterrupt(
+            f"interrupted: {checkpoint.parent.parent} is kept; go on with the same command and --resume"
+        ) from None
 
 
 def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> "Checkpoint":

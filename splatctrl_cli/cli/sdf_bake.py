@@ -1,240 +1,294 @@
 """``splatctrl sdf-bake``: a scene's splats as a distance grid, and its accuracy where the truth is known."""
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.cli.common import (
-    Console,
-    Subparsers,
-    add_command,
-    add_config,
-    add_gates,
-    add_output,
-    check_gate_names,
-    check_gates,
-    configured,
-    table,
+from splatctrl_cli.cli.bake_options import (
+    DEFAULT_CHANNELS,
+    FORMATS,
+    add_options,
+    box_of,
+    channels_of,
+    labels_of,
+    names_of,
+    with_options,
 )
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, check_gate_names, check_gates, configured
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.config import FieldConfig
-    from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
-
-FORMATS = ("npz", "vti")
-SUMMARY_METRICS = (
-    *("num_splats", "num_splats_left_out", "num_cells", "voxel", "length_scale", "median_radius", "median_spacing"),
-    *("never_seen_share", "num_warnings"),
-)
+    from splatctrl_cli.cli.bake_report import FieldReport
+    from splatctrl_cli.cli.bake_run import BakeTask
+    from splatctrl_cli.cli.bake_source import BakeSource
+    from splatctrl_cli.cli.bake_update import Previous
+    from splatctrl_cli.config import Config
+    from splatctrl_cli.field.baker import Baker
+    from splatctrl_cli.field.incremental import Changes
+    from splatctrl_cli.field.slabs import UnknownSpace
+    from splatctrl_cli.io.output import Stopwatch
+    from splatctrl_cli.records import DistanceGrid, Label, SplatSet
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(
-        subparsers, "sdf-bake", run, summary="bake a scene's splats into a distance grid with gradient"
+    add_options(
+        add_command(subparsers, "sdf-bake", run, summary="bake a scene's splats into a distance grid with gradient")
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="a folder that reconstruct wrote, or a splats.ply")
-    add_output(parser, default="field", what="folder to write: field.npz, field.vti, field.json, run.json")
-    parser.add_argument("--formats", default="npz,vti", metavar="NAME,...", help="npz, vti (default: both)")
-    parser.add_argument("--at", type=float, metavar="SECONDS", help="the scene as known that long after its start")
-    parser.add_argument(
-        "--include",
-        default="human",
-        metavar="NAME,...",
-        help="labels in the field beside object: robot, human, or none (default: human; the robot is left out)",
-    )
-    parser.add_argument(
-        "--box", metavar="X0,Y0,Z0,X1,Y1,Z1", help="what the grid covers [m]; write --box=-1,... for a negative start"
-    )
-    parser.add_argument("--urdf", type=Path, help="cover the reach of this robot around its base, without --box")
-    parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its spheres (default: the URDF's own)")
-    parser.add_argument("--voxel", type=float, metavar="M", help="cell size (field.voxel)")
-    parser.add_argument("--length-scale", type=float, metavar="M", help="l of the kernel (field.length_scale)")
-    parser.add_argument("--truth", type=Path, metavar="truth.json", help="measure the field against this truth")
-    parser.add_argument(
-        "--seen-by", type=Path, metavar="LOG", help="the log or capture whose cameras saw the scene, for --truth"
-    )
-    add_config(parser)
-    add_gates(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.cli.bake_source import read_bake_source
-    from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
-    from splatctrl_cli.field.bake import bake
-    from splatctrl_cli.io.output import Stopwatch, output_path, write_json, write_run
+    from splatctrl_cli.cli.bake_report import metric_names, metrics
+    from splatctrl_cli.cli.bake_run import CHECKPOINT, FOLDER, clear_leftovers
+    from splatctrl_cli.cli.resume import told_how_to_go_on
+    from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
 
-    console, stopwatch = Console(args), Stopwatch()
-    formats, labels = _names(args.formats, FORMATS, "--formats"), _labels(args.include)
-    if (args.truth is None) != (args.seen_by is None):
-        raise UsageError("--truth and --seen-by: expected both or neither")
-    check_gate_names(args.require, _metric_names(with_truth=args.truth is not None))
-    config = configured(args)
-    config = replace(config, field=_field_config(config.field, args))
+    console, stopwatch, config = Console(args), Stopwatch(), with_options(configured(args), args)
+    formats, labels = names_of(args.formats, FORMATS, "--formats"), labels_of(args.include)
+    _check_options(args)
+    check_gate_names(args.require, metric_names(with_truth=args.truth is not None))
     out = args.out or Path("field")
-    with output_path(out, force=args.force, is_folder=True) as partial:
-        with stopwatch.stage("read"):
-            source = read_bake_source(args.scene, args.at)
-        box = _box(args, source.splats, labels, config.field.padding)
-        with stopwatch.stage("bake"):
-            grid = bake(
-                source.splats,
-                box,
-                config.field,
-                occupancy=source.occupancy,
-                thresholds=config.occupancy,
-                labels=labels,
-                threads=args.threads,
-            )
-        grid.header["digests"] = source.digests
-        grid.header["stamp_ns"] = source.stamp_ns
-        warnings = _warnings(grid, has_occupancy=source.occupancy is not None)
-        for warning in warnings:
-            console.log(f"warning: {warning}")
-        with stopwatch.stage("write"):
-            _write(partial, grid, formats)
-        result = _summary(grid, len(warnings))
-        lines = table(("field", ""), [(name.replace("_", " "), _shown(value)) for name, value in result.items()])
-        if args.truth is not None:
-            with stopwatch.stage("accuracy"):
-                compared = compare_with_truth(grid, source, args.truth, args.seen_by, seed=args.seed)
-            write_json(partial / "accuracy.json", compared.as_dict())
-            result["accuracy"] = compared.as_dict()
-            lines += ["", *accuracy_lines(compared)]
-        metrics = _metrics(result)
+    checkpoint = partial_path(out) / CHECKPOINT
+    _tell_of_partial(args, checkpoint, console)
+    with (
+        told_how_to_go_on(checkpoint),
+        output_path(out, force=args.force, is_folder=True, checkpoint=CHECKPOINT, resume=args.resume) as partial,
+    ):
+        job = _read(args, config, formats, labels, stopwatch)
+        clear_leftovers(partial)
+        report, lines = _bake(job, args, partial, console, stopwatch)
+        result = report.summary() | ({"accuracy": report.accuracy} if report.accuracy else {})
+        truth = None if report.accuracy is None else report.accuracy.get("truth")
+        figures = metrics(result, truth)
         write_run(
             partial,
             command="sdf-bake",
             config=config.as_dict(),
-            inputs=source.digests,
-            metrics=metrics,
+            inputs=job.source.digests | ({} if job.previous is None else job.previous.digests),
+            metrics=figures,
             stopwatch=stopwatch,
             seed=args.seed,
         )
+        _remove(partial / FOLDER)
     console.log(f"baked in {stopwatch.seconds['bake']:.2f} s; wrote {out}")
     console.result(result, lines)
-    check_gates(args.require, metrics)
+    check_gates(args.require, figures)
     return 0
 
 
-def _names(text: str, choices: tuple[str, ...], option: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
-    unknown = [name for name in names if name not in choices]
-    if unknown or not names:
-        raise UsageError(f"{option} {text}: expected some of: {', '.join(choices)}")
-    return names
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """What was read, and what is to be made of it; chosen: the splats of the field."""
+
+    config: "Config"
+    source: "BakeSource"
+    previous: "Previous | None"
+    chosen: "SplatSet"
+    labels: "frozenset[Label]"
+    formats: tuple[str, ...]
+    baker: "Baker"
+
+    @property
+    def label_names(self) -> list[str]:
+        """As the header has them."""
+        return sorted(label.name.lower() for label in self.labels)
 
 
-def _labels(text: str) -> "frozenset[Label]":
-    from splatctrl_cli.records import Label
-
-    if text.strip() == "none":
-        return frozenset({Label.OBJECT})
-    names = _names(text, ("robot", "human"), "--include")
-    return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
+def _check_options(args: argparse.Namespace) -> None:
+    if (args.truth is None) != (args.seen_by is None):
+        raise UsageError("--truth and --seen-by: expected both or neither")
+    if args.previous_scene is not None and args.update is None:
+        raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
 
 
-def _field_config(config: "FieldConfig", args: argparse.Namespace) -> "FieldConfig":
-    given = {"voxel": args.voxel, "length_scale": args.length_scale}
-    return replace(config, **{name: value for name, value in given.items() if value is not None})
+def _tell_of_partial(args: argparse.Namespace, checkpoint: Path, console: Console) -> None:
+    partial = checkpoint.parent.parent
+    if args.resume and not checkpoint.is_file():
+        console.log(f"{partial}: nothing to go on from; starts at the beginning")
+    elif checkpoint.is_file() and not args.resume:
+        console.log(f"warning: {partial}: an interrupted bake is replaced; --resume would have gone on with it")
 
 
-def _box(args: argparse.Namespace, splats: "SplatSet", labels: "frozenset[Label]", padding: float) -> "Box":
-    import numpy as np
-
-    from splatctrl_cli.field.layout import bounding_box
+def _read(
+    args: argparse.Namespace,
+    config: "Config",
+    formats: tuple[str, ...],
+    labels: "frozenset[Label]",
+    stopwatch: "Stopwatch",
+) -> _Job:
+    """Read the splats, and check that the field can be made of them and written."""
+    from splatctrl_cli.cli.bake_source import read_bake_source
+    from splatctrl_cli.cli.bake_update import check_same, read_previous
+    from splatctrl_cli.field.baker import Baker
+    from splatctrl_cli.field.layout import GridLayout
     from splatctrl_cli.field.selection import field_splats
-    from splatctrl_cli.records import Box
+    from splatctrl_cli.io.grid_formats import check_formats
 
-    if args.box is not None:
-        try:
-            numbers = np.array([float(text) for text in args.box.split(",")])
-        except ValueError:
-            raise UsageError(f"--box {args.box}: expected six numbers x0,y0,z0,x1,y1,z1") from None
-        if numbers.shape != (6,):
-            raise UsageError(f"--box {args.box}: expected six numbers x0,y0,z0,x1,y1,z1, got {len(numbers)}")
-        if not (np.isfinite(numbers).all() and (numbers[:3] < numbers[3:]).all()):
-            raise UsageError(
-                f"--box {args.box}: expected x0 < x1, y0 < y1, z0 < z1", remedy="give the lower corner first"
-            )
-        return Box(lower=numbers[:3], upper=numbers[3:])
-    if args.urdf is not None:
-        from splatctrl_cli.robot.model import RobotModel
+    with stopwatch.stage("read"):
+        source = read_bake_source(args.scene, args.at)
+        previous = None if args.update is None else read_previous(args.update, args.previous_scene or args.scene)
+    chosen = field_splats(source.splats, labels)
+    channels = channels_of(
+        args, DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels), config.field.unknown
+    )
+    check_formats(formats, channels, unknown=config.field.unknown)
+    has_box = previous is None or args.box is not None or args.urdf is not None
+    box = box_of(args, source.splats, labels, config.field.padding) if has_box or previous is None else previous.box
+    layout = GridLayout.over(box, config.field.voxel)
+    if previous is not None:
+        check_same(previous, layout, config.field, channels, sorted(label.name.lower() for label in labels))
+    with stopwatch.stage("bake"):
+        baker = Baker(
+            chosen,
+            layout,
+            config.field,
+            channels=channels,
+            occupancy=source.occupancy,
+            thresholds=config.occupancy,
+            threads=args.threads,
+        )
+    return _Job(
+        config=config,
+        source=source,
+        previous=previous,
+        chosen=chosen,
+        labels=labels,
+        formats=formats,
+        baker=baker,
+    )
 
-        robot = RobotModel.from_urdf(args.urdf, args.spheres)
-        return Box(lower=robot.base_position - robot.reach(), upper=robot.base_position + robot.reach())
-    return bounding_box(field_splats(splats, labels), padding)
 
-
-def _write(folder: Path, grid: "DistanceGrid", formats: tuple[str, ...]) -> None:
-    from splatctrl_cli.io.grid import write_npz, write_vti
+def _bake(
+    job: _Job, args: argparse.Namespace, partial: Path, console: Console, stopwatch: "Stopwatch"
+) -> tuple["FieldReport", list[str]]:
+    """Bake, compare, and write all but ``run.json``; returns the report and what is printed."""
+    from splatctrl_cli.cli.bake_report import FieldReport, summary_lines, warnings_of, write_pictures
+    from splatctrl_cli.field.report import grid_statistics
+    from splatctrl_cli.io.grid_formats import write_grid
     from splatctrl_cli.io.output import write_json
 
-    if "npz" in formats:
-        write_npz(folder / "field.npz", grid)
-    if "vti" in formats:
-        write_vti(folder / "field.vti", grid)
-    place = {"shape": grid.channels["sdf"].shape, "first_cell": grid.origin, "voxel": grid.voxel}
-    write_json(folder / "field.json", {**grid.header, **place})
+    with stopwatch.stage("bake"):
+        grid, changes = _baked(job, args, partial, console)
+    with stopwatch.stage("report"):
+        statistics = grid_statistics(grid)
+        warnings = warnings_of(grid.header, statistics, has_occupancy=job.source.occupancy is not None)
+        for warning in warnings:
+            console.log(f"warning: {warning}")
+    with stopwatch.stage("write"):
+        write_grid(partial, grid, job.formats)
+    report = FieldReport(grid=grid, statistics=statistics, warnings=warnings, changes=changes)
+    lines = summary_lines(report.summary())
+    with stopwatch.stage("accuracy"):
+        accuracy, compared_lines = _compared(grid, job, args)
+    report, lines = replace(report, accuracy=accuracy), lines + compared_lines
+    with stopwatch.stage("report"):
+        write_json(partial / "field.json", report.as_dict())
+        if not args.no_report:
+            write_pictures(partial, report, _middle(job))
+    return report, lines
 
 
-def _warnings(grid: "DistanceGrid", *, has_occupancy: bool) -> tuple[str, ...]:
-    health = grid.header["health"]
-    assert isinstance(health, dict)
-    if has_occupancy and not grid.channels["observed"].any():
-        return (*health["warnings"], "no cell of the grid was ever seen by a camera; check --box")
-    return tuple(health["warnings"])
+def _baked(
+    job: _Job, args: argparse.Namespace, partial: Path, console: Console
+) -> tuple["DistanceGrid", "Changes | None"]:
+    """The grid, its channels on disk."""
+    from splatctrl_cli.cli.bake_run import bake_to_disk
+    from splatctrl_cli.field.header import field_header
+    from splatctrl_cli.field.incremental import counts_after
+    from splatctrl_cli.field.slabs import slabs
+
+    baker = job.baker
+    task, changes, old = _task(job, args)
+    store = bake_to_disk(task, partial, console, resume=args.resume)
+    if task.kept is not None and old is not None and job.previous is not None:
+        counts: Any = job.previous.grid.header["cells_without_value"]
+        ranges = list(slabs(baker.layout, baker.channels))
+        baker.num_without_value = counts_after(counts, old, baker, task.kept.mask, ranges)
+    header = field_header(
+        job.source.splats, job.chosen, job.labels, baker, has_occupancy=job.source.occupancy is not None
+    )
+    treated = {} if task.unknown is None else task.unknown.header()
+    place = {"digests": job.source.digests, "stamp_ns": job.source.stamp_ns}
+    return store.grid({**header, **treated, **place}), changes
 
 
-def _summary(grid: "DistanceGrid", num_warnings: int) -> dict[str, Any]:
+def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | None", "Baker | None"]:
+    """What has to be baked; with --update also what changed, and the baker of the splats before."""
+    from splatctrl_cli.cli.bake_run import BakeTask
+    from splatctrl_cli.cli.resume import deciding_versions
+    from splatctrl_cli.field.baker import Baker
+    from splatctrl_cli.field.incremental import changed_blocks
+    from splatctrl_cli.field.selection import field_splats
+    from splatctrl_cli.field.slabs import Kept
+
+    settings = {
+        **deciding_versions(),
+        **{f"field.{name}": value for name, value in asdict(job.config.field).items()},
+        **{f"occupancy.{name}": value for name, value in asdict(job.config.occupancy).items()},
+        **{f"sha256 of {name}": value for name, value in job.source.digests.items()},
+        "labels": ",".join(job.label_names),
+    }
+    if job.previous is None:
+        task = BakeTask(baker=job.baker, settings=settings, unknown=_unknown(job), formats=job.formats)
+        return task, None, None
+    settings |= {f"sha256 of {name}": value for name, value in job.previous.digests.items()}
+    before = field_splats(job.previous.source.splats, job.labels)
+    old = Baker(before, job.baker.layout, job.config.field, channels=job.baker.channels, threads=args.threads)
+    changes = changed_blocks(before, old, job.chosen, job.baker)
+    kept = None
+    if changes.mask is not None:
+        kept = Kept(
+            grid=job.previous.grid,
+            mask=changes.mask,
+            occupancy=job.source.occupancy,
+            thresholds=job.config.occupancy,
+        )
+    task = BakeTask(baker=job.baker, settings=settings, kept=kept, unknown=_unknown(job), formats=job.formats)
+    return task, changes, old
+
+
+def _unknown(job: _Job) -> "UnknownSpace | None":
+    from splatctrl_cli.field.slabs import UnknownSpace
+
+    if job.config.field.unknown == "free":
+        return None
+    return UnknownSpace(job.baker.layout, job.config.field, job.source.occupancy, job.config.occupancy)
+
+
+def _compared(grid: "DistanceGrid", job: _Job, args: argparse.Namespace) -> tuple[dict[str, Any] | None, list[str]]:
+    """What the field was compared with, as plain values by name, and the tables of it."""
+    from splatctrl_cli.cli.bake_report import reference_lines
+
+    found: dict[str, Any] = {}
+    lines: list[str] = []
+    if args.truth is not None:
+        from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
+
+        compared = compare_with_truth(grid, job.source, args.truth, args.seen_by, seed=args.seed)
+        found["truth"] = compared.as_dict()
+        lines += ["", *accuracy_lines(compared)]
+    if args.reference_mesh is not None:
+        from splatctrl_cli.evaluate.reference_mesh import compare_with_mesh
+
+        mesh = compare_with_mesh(grid, args.reference_mesh, seed=args.seed)
+        found["reference_mesh"] = {"file": args.reference_mesh.name, **mesh.as_dict()}
+        lines += ["", *reference_lines(mesh.accuracy, "mesh")]
+    return found or None, lines
+
+
+def _middle(job: _Job) -> list[float]:
+    """Where slices are shown: the median of the splats in the grid, or the grid's middle [m]."""
     import numpy as np
 
-    observed, used = grid.channels["observed"], grid.header["splats_used"]
-    health = grid.header["health"]
-    assert isinstance(used, dict) and isinstance(health, dict)
-    return {
-        "num_splats": sum(used.values()),
-        "num_splats_left_out": sum(dict(grid.header["splats_given"]).values()) - sum(used.values()),  # type: ignore[call-overload]
-        "shape": list(observed.shape),
-        "num_cells": observed.size,
-        "voxel": grid.voxel,
-        "length_scale": grid.header["length_scale"],
-        "median_radius": health["radius"],
-        "median_spacing": health["spacing"],
-        "never_seen_share": float(np.mean(observed == 0)),
-        "num_warnings": num_warnings,
-    }
+    box = job.baker.layout.box
+    inside = job.chosen.centers[box.contains(job.chosen.centers)]
+    middle = np.median(inside, axis=0) if len(inside) else 0.5 * (box.lower + box.upper)
+    return [float(value) for value in middle]
 
 
-def _shown(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return " x ".join(map(str, value)) if isinstance(value, list) else str(value)
+def _remove(folder: Path) -> None:
+    import shutil
 
-
-def _metric_names(*, with_truth: bool) -> tuple[str, ...]:
-    """The names of `_metrics`, known before anything is baked."""
-    from splatctrl_cli.cli.field_truth import FIELDS
-    from splatctrl_cli.evaluate.field_accuracy import metric_names
-
-    return (*SUMMARY_METRICS, *(metric_names(FIELDS) if with_truth else ()))
-
-
-def _metrics(result: Mapping[str, Any]) -> dict[str, float | None]:
-    """Numbers a gate can name: those of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``."""
-    from splatctrl_cli.evaluate.field_accuracy import band_name
-
-    metrics: dict[str, float | None] = {name: result[name] for name in SUMMARY_METRICS}
-    accuracy = result.get("accuracy")
-    if accuracy is None:
-        return metrics
-    for where in ("everywhere", "seen"):
-        for field, bands in accuracy[where].items():
-            for band in bands:
-                place = f"{where}.{field}.{band_name(band['lower'], band['upper'])}"
-                metrics |= {f"{place}.{name}": band[name] for name in band if name not in {"lower", "upper"}}
-    return metrics | {f"over_estimate.{name}": value for name, value in accuracy["over_estimate"].items()}
+    shutil.rmtree(folder)

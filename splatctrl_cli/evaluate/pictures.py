@@ -65,13 +65,13 @@ def comparison_picture(path: Path, rows: Sequence[ComparisonRow]) -> None:
         raise NotEvaluableError(f"{path}: no view to draw: expected at least one, got 0")
     height, width = rows[0].photo.shape[:2]
     row_height = (WIDTH - 1.2) / 3 * height / width + 0.42
-    with _figure(len(rows) * row_height + 0.15) as figure:
+    with drawn_figure(len(rows) * row_height + 0.15) as figure:
         grid = figure.subplots(
             len(rows), 4, squeeze=False, gridspec_kw={"width_ratios": [1, 1, 1, 0.035], "wspace": 0.04}
         )
         for row, axes in zip(rows, grid, strict=True):
             _draw_comparison(figure, axes, row)
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 def field_slice_picture(
@@ -100,18 +100,19 @@ def field_slice_picture(
     coordinates = [grid.origin[i] + grid.voxel * np.arange(grid.channels["sdf"].shape[i]) for i in (first, second)]
     spans = [float(np.ptp(c)) + grid.voxel for c in coordinates]
     height = float(np.clip((WIDTH - 2.6) * spans[1] / spans[0] + 1.5, 4.5, 12.0))
-    with _figure(height) as figure:
+    with drawn_figure(height) as figure:
         axes = figure.subplots()
-        _draw_distance(figure, axes, coordinates, distance, grid.voxel)
+        image = draw_distance(axes, coordinates, distance, grid.voxel)
+        figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
         if "observed" in grid.channels:
             never_seen = np.take(grid.channels["observed"], index, axis=axis).T == NEVER_SEEN
-            _hatch(axes, coordinates, never_seen, grid.voxel)
+            draw_never_seen(axes, coordinates, never_seen, grid.voxel)
         if spheres is not None:
             _draw_cut_spheres(axes, spheres, axis, plane)
         _explain(axes, has_spheres=spheres is not None, has_observed="observed" in grid.channels)
         axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]", aspect="equal")
         axes.set_title(f"{title or 'Distance field'}   {'xyz'[axis]} = {plane:.2f} m", pad=12)
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 def clearance_picture(
@@ -128,7 +129,7 @@ def clearance_picture(
     Gaps (nan) stay gaps; below the margin is shaded, and each curve's smallest value is marked. `events` are named
     moments [s], drawn as thin vertical lines.
     """
-    with _figure(5.2) as figure:
+    with drawn_figure(5.2) as figure:
         axes = figure.subplots()
         lowest = 0.0
         for color, (name, values) in zip(cycle(CURVE_COLORS), curves.items(), strict=False):
@@ -174,11 +175,11 @@ def clearance_picture(
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(len(curves), 3))
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 @contextmanager
-def _figure(height: float) -> Iterator["Figure"]:
+def drawn_figure(height: float) -> Iterator["Figure"]:
     """A figure of the house style, 1200 pixels wide."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -191,7 +192,8 @@ def _figure(height: float) -> Iterator["Figure"]:
         yield figure
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write the figure without the clock in it."""
     figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": "splatctrl"})
 
 
@@ -212,22 +214,19 @@ def _draw_comparison(figure: "Figure", axes: Sequence[Any], row: ComparisonRow) 
         panel.spines[:].set_visible(False)
 
 
-def _draw_distance(
-    figure: "Figure", axes: Any, coordinates: Sequence[Float64], distance: Float64, voxel: float
-) -> None:
-    """The distance as colour, [cm], and its contour lines."""
+def draw_distance(axes: Any, coordinates: Sequence[Float64], distance: Float64, voxel: float) -> Any:
+    """Draw a distance as colour, [cm], and its contour lines; returns the image, for a colour bar."""
     finite = distance[np.isfinite(distance)]
     limit = 100.0 * MAX_DISTANCE
     image = axes.imshow(
         100.0 * distance,
         origin="lower",
-        extent=_extent(coordinates, voxel),
-        cmap=_pale_red_to_blue(),
+        extent=extent_of(coordinates, voxel),
+        cmap=pale_red_to_blue(),
         vmin=-limit,
         vmax=limit,
         interpolation="nearest",
     )
-    figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
     with_lines = [level for level in CONTOURS if finite.size and finite.min() < level < finite.max()]
     if with_lines and min(distance.shape) > 1:
         lines = axes.contour(
@@ -239,9 +238,10 @@ def _draw_distance(
             linestyles="solid",
         )
         axes.clabel(lines, fmt=lambda level: f"{100 * level:g} cm", fontsize=9)
+    return image
 
 
-def _pale_red_to_blue() -> Any:
+def pale_red_to_blue() -> Any:
     """Red inside, blue outside, white on the surface, pale enough for lines and circles on top."""
     from matplotlib import colormaps
     from matplotlib.colors import LinearSegmentedColormap
@@ -249,12 +249,13 @@ def _pale_red_to_blue() -> Any:
     return LinearSegmentedColormap.from_list("pale_red_blue", colormaps["RdBu"](np.linspace(0.18, 0.80, 63)))
 
 
-def _hatch(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
+def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
+    """Veil and hatch the cells that no camera saw."""
     if not never_seen.any():
         return
     veil = np.zeros((*never_seen.shape, 4))
     veil[never_seen] = (0.93, 0.93, 0.93, 0.72)
-    axes.imshow(veil, origin="lower", extent=_extent(coordinates, voxel), interpolation="nearest")
+    axes.imshow(veil, origin="lower", extent=extent_of(coordinates, voxel), interpolation="nearest")
     if min(never_seen.shape) > 1:
         axes.contourf(*coordinates, never_seen.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
@@ -285,6 +286,7 @@ def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, pl
         )
 
 
-def _extent(coordinates: Sequence[Float64], voxel: float) -> tuple[float, float, float, float]:
+def extent_of(coordinates: Sequence[Float64], voxel: float) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top [m] of cells with these centres."""
     (left, right), (bottom, top) = ((c[0] - voxel / 2, c[-1] + voxel / 2) for c in coordinates)
     return float(left), float(right), float(bottom), float(top)

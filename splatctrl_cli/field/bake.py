@@ -3,10 +3,11 @@
 from collections.abc import Collection
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
-from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker
+from splatctrl_cli.field.baker import DEFAULT_CHANNELS, Baker
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.layout import GridLayout, check_memory
 from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats
+from splatctrl_cli.field.slabs import bytes_per_cell
 from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.records import Box, DistanceGrid, Label, OccupancyGrid, SplatSet
 
@@ -40,8 +41,3 @@ def bake(
     header = field_header(splats, chosen, labels, baker, has_occupancy=occupancy is not None)
     grid = DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=arrays, header=header)
     return apply_unknown(grid, config.unknown)
-
-
-def bytes_per_cell(channels: Collection[str]) -> int:
-    """Of the channels in memory."""
-    return sum(int(CHANNELS[name][0][-1]) * CHANNELS[name][1] for name in channels if name in CHANNELS)

@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.cli import bake_options
+from splatctrl_cli.cli.bake_report import SUMMARY_METRICS
 from splatctrl_cli.cli.field_truth import FIELDS
-from splatctrl_cli.cli.sdf_bake import SUMMARY_METRICS
 from splatctrl_cli.evaluate.field_accuracy import metric_names
+from splatctrl_cli.field import baker, distance, probability, unknown, weights
 from splatctrl_cli.field.grid import exact_channel
+from splatctrl_cli.io import grid_formats
 from splatctrl_cli.io.grid import read_npz
 from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.io.splats import write_ply
@@ -43,7 +46,10 @@ def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> 
     out = tmp_path / "field"
     result = sdf_bake(splats, "-o", out, "--json", "--voxel", 0.05, "--require", "num_cells>=1000")
     assert (result.returncode, result.stderr.count("\n")) == (0, 1 + result.stderr.count("warning"))
-    assert sorted(path.name for path in out.iterdir()) == ["field.json", "field.npz", "field.vti", "run.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        *("field.json", "field.npz", "field.vti", "report", "run.json")
+    ]
+    assert sorted(path.name for path in (out / "report").iterdir()) == ["gradient.png", "slices.png"]
     grid, header = read_npz(out / "field.npz"), json.loads((out / "field.json").read_text())
     assert json.loads(result.stdout)["shape"] == list(grid.channels["sdf"].shape) == header["shape"]
     assert len(header["digests"]["splats.ply"]) == 64
@@ -68,16 +74,28 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["--box=1,2"], 2, "expected six numbers"),
-        (["--box=a,b,c,d,e,f"], 2, "expected six numbers"),
-        (["--box=0,0,0,1,1,0"], 2, "--box 0,0,0,1,1,0: expected x0 < x1, y0 < y1, z0 < z1; give the lower"),
-        (["--box=0,0,0,1,1,nan"], 2, "--box 0,0,0,1,1,nan: expected x0 < x1"),
+        (["--box=1,2"], 2, "--box 1,2: expected finite x0,y0,z0,x1,y1,z1"),
+        (["--box=a,b,c,d,e,f"], 2, "--box a,b,c,d,e,f: expected finite"),
+        (["--box=0,0,0,1,1,0"], 2, "--box 0,0,0,1,1,0: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1"),
+        (["--box=0,0,0,1,1,nan"], 2, "--box 0,0,0,1,1,nan: expected finite"),
         (["--require", "num_cell>1"], 2, "unknown metric; did you mean num_cells?"),
         (["--require", "seen.hard.0_2cm.rmse<1"], 2, "unknown metric; known here: num_splats"),
         (["--require", "num_cells=1"], 2, "expected METRIC>=NUMBER (or <=, >, <); quote it for the shell"),
-        (["--formats", "obj"], 2, "--formats obj: expected some of: npz, vti"),
+        (
+            ["--formats", "off"],
+            2,
+            "--formats off: expected some of: npz, vti, nrrd, vdb, curobo, moveit, ply",
+        ),
+        (["--channels", "sdf,colour"], 2, "--channels sdf,colour: expected some of: sdf, gradient, bound"),
+        (["--channels", "sdf", "--formats", "moveit"], 2, "expected one of the channels bound, hard, got sdf"),
+        (["--distance", "tsdf"], 2, "invalid choice: 'tsdf' (choose from"),
+        (["--weights", "mean"], 2, "invalid choice: 'mean' (choose from"),
+        (["--unknown", "wall"], 2, "invalid choice: 'wall' (choose from"),
+        (["--channels", "sdf", "--reference-mesh", "a.ply"], 2, "--reference-mesh: compares with the exact distance"),
+        (["--previous-scene", "scene"], 2, "belongs to --update"),
+        (["--update", "nowhere"], 4, "--update nowhere: no such folder"),
         (["--include", "cat"], 2, "--include cat: expected some of: robot, human"),
-        (["--voxel", "0.0001"], 2, "is free; give a larger --voxel"),
+        (["--voxel", "0.00001"], 2, "GiB of memory"),
         (["--voxel", "nan"], 2, "voxel: expected a size above 0"),
         (["--length-scale", "-1"], 2, "length_scale: expected a length above 0"),
         (["--at", "3"], 2, "is one splat set"),
@@ -121,7 +139,7 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
         *("--require", "over_estimate.count_beyond<=0", "--require", "seen.hard.0_2cm.rmse<0.006"),
     )
     assert result.returncode == 0, result.stderr
-    accuracy = json.loads((tmp_path / "field" / "accuracy.json").read_text())
+    accuracy = json.loads((tmp_path / "field" / "field.json").read_text())["accuracy"]["truth"]
     metrics = json.loads((tmp_path / "field" / "run.json").read_text())["metrics"]
     assert sorted(metrics) == sorted((*SUMMARY_METRICS, *metric_names(FIELDS))), "as checked before baking"
     assert accuracy["num_seen"] > 50
@@ -184,3 +202,13 @@ def test_a_time_before_the_scene_was_known_is_refused(tmp_path: Path, scene: Pat
     result = sdf_bake(scene, "-o", tmp_path / "field", "--at", -1)
     assert result.returncode == 5
     assert "no snapshot at or before" in result.stderr
+
+
+def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
+    assert tuple(distance.DISTANCES) == bake_options.DISTANCES
+    assert tuple(weights.METHODS) == bake_options.WEIGHTS
+    assert tuple(probability.PROBABILITIES) == bake_options.PROBABILITIES
+    assert unknown.POLICIES == bake_options.UNKNOWN
+    assert tuple(baker.CHANNELS) == bake_options.CHANNELS
+    assert baker.DEFAULT_CHANNELS == bake_options.DEFAULT_CHANNELS
+    assert tuple(grid_formats.FORMATS) == bake_options.FORMATS

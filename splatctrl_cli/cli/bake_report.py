@@ -1,0 +1,150 @@
+"""What ``sdf-bake`` says of a field: the summary, ``field.json``, the figures that a gate can name, the pictures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.common import table
+
+if TYPE_CHECKING:
+    from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy
+    from splatctrl_cli.field.incremental import Changes
+    from splatctrl_cli.field.report import GridStatistics
+    from splatctrl_cli.records import DistanceGrid
+
+SUMMARY_METRICS = (
+    *("num_splats", "num_splats_left_out", "num_cells", "voxel", "length_scale", "median_radius", "median_spacing"),
+    *("never_seen_share", "num_warnings"),
+)
+FAR = 1.0  # [m] a grid whose every cell is farther from the splats than this is warned about
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldReport:
+    """A baked grid with its statistics, what it was compared with (plain values by name), and the warnings."""
+
+    grid: "DistanceGrid"
+    statistics: "GridStatistics"
+    warnings: tuple[str, ...]
+    changes: "Changes | None" = None
+    accuracy: Mapping[str, Any] | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as written to ``field.json``: the grid's header and place first."""
+        grid = self.grid
+        place = {"shape": grid.channels["sdf"].shape, "first_cell": grid.origin, "voxel": grid.voxel}
+        update = None if self.changes is None else _update(self.changes)
+        return {
+            **grid.header,
+            **place,
+            "channels": list(grid.channels),
+            "statistics": self.statistics.as_dict(),
+            "warnings": self.warnings,
+            **({} if update is None else {"update": update}),
+            **({} if not self.accuracy else {"accuracy": self.accuracy}),
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """What is printed, and what --json has beside the accuracy."""
+        header, used = self.grid.header, self.grid.header["splats_used"]
+        health, given = header["health"], header["splats_given"]
+        assert isinstance(used, dict) and isinstance(health, dict) and isinstance(given, dict)
+        summary = {
+            "num_splats": sum(used.values()),
+            "num_splats_left_out": sum(given.values()) - sum(used.values()),
+            "shape": list(self.grid.channels["sdf"].shape),
+            "num_cells": self.statistics.num_cells,
+            "voxel": self.grid.voxel,
+            "distance": header["distance"],
+            "length_scale": header["length_scale"],
+            "median_radius": health["radius"],
+            "median_spacing": health["spacing"],
+            "never_seen_share": self.statistics.never_seen_share,
+            "num_warnings": len(self.warnings),
+        }
+        if self.changes is not None:
+            summary["blocks_baked"] = f"{self.changes.num_baked} of {self.changes.num_blocks}"
+        return summary
+
+
+def summary_lines(summary: Mapping[str, Any]) -> list[str]:
+    """The summary as a table."""
+    return table(("field", ""), [(name.replace("_", " "), _shown(value)) for name, value in summary.items()])
+
+
+def warnings_of(header: Mapping[str, Any], statistics: "GridStatistics", *, has_occupancy: bool) -> tuple[str, ...]:
+    """Those on the splats' health, on a box that no camera saw, and on one that no splat is near."""
+    found = list(header["health"]["warnings"])
+    seen = statistics.observed
+    if has_occupancy and seen is not None and seen["never_seen"] == statistics.num_cells:
+        found.append("no cell of the grid was ever seen by a camera; check --box")
+    if statistics.lowest is not None and statistics.lowest > FAR:
+        found.append(f"the box holds no splat: the nearest is {statistics.lowest:.3g} m from every cell; check --box")
+    return tuple(found)
+
+
+def metric_names(*, with_truth: bool) -> tuple[str, ...]:
+    """The names of `metrics`, known before anything is baked."""
+    from splatctrl_cli.cli.field_truth import FIELDS
+    from splatctrl_cli.evaluate.field_accuracy import metric_names
+
+    return (*SUMMARY_METRICS, *(metric_names(FIELDS) if with_truth else ()))
+
+
+def metrics(summary: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> dict[str, float | None]:
+    """Numbers a gate can name: those of the summary, ``seen.hard.0_2cm.rmse`` and so on, ``over_estimate.*``.
+
+    accuracy: of the comparison with the truth, None without one.
+    """
+    from splatctrl_cli.evaluate.field_accuracy import band_name
+
+    figures: dict[str, float | None] = {name: summary[name] for name in SUMMARY_METRICS}
+    if accuracy is None:
+        return figures
+    for where in ("everywhere", "seen"):
+        for name, bands in accuracy[where].items():
+            for band in bands:
+                place = f"{where}.{name}.{band_name(band['lower'], band['upper'])}"
+                figures |= {f"{place}.{key}": band[key] for key in band if key not in {"lower", "upper"}}
+    return figures | {f"over_estimate.{name}": value for name, value in accuracy["over_estimate"].items()}
+
+
+def reference_lines(accuracy: "FieldAccuracy", what: str) -> list[str]:
+    """A short table of the errors against `what`, everywhere."""
+    header = ("field", f"from {what} cm", "count", "mean mm", "rmse mm", "95 % mm", "max mm")
+    rows: list[Sequence[object]] = []
+    for name, bands in accuracy.everywhere.items():
+        for band in bands:
+            values = (band.mean, band.rmse, band.over_95, band.over_max)
+            shown = ["-" if value is None else f"{value * 1e3:.1f}" for value in values]
+            rows.append((name, f"{band.lower * 100:g}-{band.upper * 100:g}", band.count, *shown))
+    return table(header, rows)
+
+
+def write_pictures(folder: Path, report: FieldReport, point: Sequence[float]) -> None:
+    """Slices through `point` [m], the gradient, and what else the grid has, into ``folder/report``."""
+    from splatctrl_cli.evaluate.field_pictures import gradient_picture, probability_picture, slices_picture
+
+    pictures = folder / "report"
+    pictures.mkdir()
+    grid = report.grid
+    slices_picture(pictures / "slices.png", grid, point)
+    lengths = report.statistics.gradient
+    if lengths is not None:
+        gradient_picture(pictures / "gradient.png", grid, lengths.histogram, lengths.bin_width, point)
+    if "probability" in grid.channels:
+        probability_picture(pictures / "probability.png", grid, point)
+
+
+def _update(changes: "Changes") -> dict[str, Any]:
+    said = {"blocks_baked": changes.num_baked, "blocks": changes.num_blocks}
+    return said | ({"why_all": changes.reason} if changes.reason else {})
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return " x ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,127 @@
+"""The bake itself: slab by slab onto the disk, so that it can be larger than memory, and be gone on with."""
+
+import json
+import shutil
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.common import Console
+from splatctrl_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.field.baker import Baker
+    from splatctrl_cli.field.layout import GridLayout
+    from splatctrl_cli.field.slabs import Kept, UnknownSpace
+    from splatctrl_cli.io.grid_slabs import GridSlabs
+
+FOLDER = "channels"
+CHECKPOINT = f"{FOLDER}/progress.json"
+COUNTS = "counts.json"
+SPARE = 1 << 26  # [bytes] for what is small
+WHOLE_FORMATS = ("npz", "vti", "nrrd", "vdb")  # hold every channel as it is, or less
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeTask:
+    """What is baked; `settings`: all that decides the bytes, as plain values; `kept` is what an update keeps;
+    `unknown` is what is done with unknown space (None: nothing).
+    """
+
+    baker: "Baker"
+    settings: Mapping[str, Any]
+    kept: "Kept | None" = None
+    unknown: "UnknownSpace | None" = None
+    formats: tuple[str, ...] = field(default=())
+
+
+def bake_to_disk(task: BakeTask, partial: Path, console: Console, *, resume: bool) -> "GridSlabs":
+    """The channels in ``partial/channels``; the baker's counts are then those of all that was baked.
+
+    With `resume` it goes on after the last slab that an interrupted bake of the same settings left. Raises UsageError
+    for one of other settings, and where the disk or the memory has no room.
+    """
+    from tqdm import tqdm
+
+    from splatctrl_cli.field.slabs import baked_planes, check_slab_memory, slabs
+    from splatctrl_cli.io.grid_slabs import SlabPlan, resume_slabs, start_slabs
+
+    baker, folder = task.baker, partial / FOLDER
+    layout = baker.layout
+    check_slab_memory(layout, baker.channels)
+    plan = SlabPlan(
+        origin=(float(layout.origin[0]), float(layout.origin[1]), float(layout.origin[2])),
+        voxel=layout.voxel,
+        shape=layout.shape,
+        channels=baker.channels,
+        settings=task.settings,
+    )
+    if not (folder / "progress.json").is_file():
+        check_disk(partial, layout, baker.channels, task.formats)
+    store = resume_slabs(folder, plan) if resume else start_slabs(folder, plan)
+    counts = _counts(folder)
+    if store.num_layers:
+        console.log(f"{partial}: goes on after {store.num_layers} of {layout.shape[0]} planes")
+        _set_counts(task, counts[str(store.num_layers)])
+    hidden = True if console.is_quiet else None
+    with tqdm(total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=hidden) as bar:
+        for first, last in slabs(layout, baker.channels, store.num_layers):
+            planes = baked_planes(baker, first, last, task.kept)
+            if task.unknown is not None:
+                planes = task.unknown.apply(planes, first, last, baker.bound_margin)
+            counts[str(last)] = _counts_now(task)
+            _write_counts(folder, counts)
+            store.write(planes)
+            bar.update(last - first)
+    return store
+
+
+def clear_leftovers(partial: Path) -> None:
+    """Remove what an interrupted run had written beside the channels: all of it is written again."""
+    for path in partial.iterdir():
+        if path.name != FOLDER:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def check_disk(folder: Path, layout: "GridLayout", channels: Collection[str], formats: Collection[str]) -> None:
+    """Raise UsageError where the channels and the files made of them do not fit the disk."""
+    from splatctrl_cli.field.slabs import bytes_per_cell
+
+    per_cell = bytes_per_cell(channels)
+    copies = per_cell * sum(name in WHOLE_FORMATS for name in formats) + 4 * ("curobo" in formats)
+    needed = (per_cell + copies) * layout.num_cells + SPARE
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        size = " x ".join(str(n) for n in layout.shape)
+        raise UsageError(
+            f"grid of {size} cells: needs {needed / 2**30:.1f} GiB of disk ({needed} bytes), "
+            f"{free / 2**30:.1f} GiB ({free} bytes) is free at {folder.parent}",
+            remedy="give a larger --voxel, a smaller --box, fewer --channels or --formats, or another --out",
+        )
+
+
+def _counts_now(task: BakeTask) -> dict[str, int]:
+    """What was counted so far."""
+    unknown = task.unknown
+    treated = {} if unknown is None else {"never_seen": unknown.num_never_seen, "changed": unknown.num_changed}
+    return {**task.baker.num_without_value, **treated}
+
+
+def _set_counts(task: BakeTask, counts: Mapping[str, int]) -> None:
+    task.baker.num_without_value = {name: counts[name] for name in task.baker.num_without_value}
+    if task.unknown is not None:
+        task.unknown.num_never_seen, task.unknown.num_changed = counts["never_seen"], counts["changed"]
+
+
+def _counts(folder: Path) -> dict[str, dict[str, int]]:
+    """What was counted up to each plane where a slab ended."""
+    path = folder / COUNTS
+    counts: dict[str, dict[str, int]] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return counts
+
+
+def _write_counts(folder: Path, counts: Mapping[str, Mapping[str, int]]) -> None:
+    from splatctrl_cli.io.output import write_durably, write_json
+
+    write_durably(folder / COUNTS, lambda path: write_json(path, counts))

@@ -1,0 +1,152 @@
+"""Which blocks of a grid an edit of the splats can have changed: the others keep what an earlier bake gave them."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.field.baker import Baker, Planes
+from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.kernels import field as native
+from splatctrl_cli.kernels.field import BLOCK, GridSpan
+from splatctrl_cli.records import Bool, SplatSet, UInt8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """mask (blocks of the grid) uint8, 1 where a block has to be baked anew; None: all of them, for `reason`."""
+
+    mask: UInt8 | None
+    num_blocks: int
+    reason: str = ""
+
+    @property
+    def num_baked(self) -> int:
+        """Blocks that are baked anew."""
+        return self.num_blocks if self.mask is None else int(np.count_nonzero(self.mask))
+
+
+def changed_blocks(before: SplatSet, old: Baker, after: SplatSet, new: Baker) -> Changes:
+    """The blocks where a bake of `after` by `new` can differ by a bit from that of `before` by `old`.
+
+    Both are of the same layout and configuration, `before` and `after` the splats of the field. A block can differ
+    where a splat that is in one set alone can matter in it, by the bounds by which the bake itself leaves splats out.
+    Weights are compared, too: those of a splat's neighbours change when it comes or goes. `observed` is left out.
+    """
+    shape = blocks_of(new.layout)
+    num_blocks = int(np.prod(shape))
+    reason = _reason_for_all(old, new)
+    if reason:
+        return Changes(mask=None, num_blocks=num_blocks, reason=reason)
+    mask = np.zeros(shape, np.uint8)
+    span = whole_span(new)
+    for changed, baker in zip(_changed((before, after), (old, new), with_weights=False), (old, new), strict=True):
+        _touch(baker.spheres.points.clusters, baker.exact.radii, changed, None, span, mask, baker.threads)
+    if new.se is not None:
+        for changed, baker in zip(_changed((before, after), (old, new), with_weights=True), (old, new), strict=True):
+            assert baker.se is not None
+            offsets = baker.spheres.points.offsets(baker.se.unit * baker.se.weights.log_size)
+            length = baker.se.kernel.length
+            _touch(baker.spheres.points.clusters, offsets, changed, length, span, mask, baker.threads)
+    return Changes(mask=mask, num_blocks=num_blocks)
+
+
+def blocks_of(layout: GridLayout) -> tuple[int, int, int]:
+    """Blocks along x, y and z."""
+    x, y, z = (-(-cells // BLOCK) for cells in layout.shape)
+    return (x, y, z)
+
+
+def whole_span(baker: Baker) -> GridSpan:
+    """All cells of a baker's grid, in the frame of its spheres."""
+    layout = baker.layout
+    return GridSpan(
+        origin=layout.origin - baker.spheres.points.anchor,
+        voxel=layout.voxel,
+        shape=layout.shape,
+        first=0,
+        last=layout.shape[0],
+    )
+
+
+def counts_after(
+    counts: Mapping[str, int], old: Baker, new: Baker, mask: UInt8, slabs: Sequence[tuple[int, int]]
+) -> dict[str, int]:
+    """The cells without a kernel value of the whole grid: `counts` of the bake before, less what the blocks of `mask`
+    had then, plus what `new` counted when it baked them. `old` bakes them once more for it.
+    """
+    if not old.num_without_value:
+        return {}
+    old.num_without_value = dict.fromkeys(old.num_without_value, 0)
+    for first, last in slabs:
+        if mask[first // BLOCK : -(-last // BLOCK)].any():
+            scratch: Planes = old.allocate(last - first)
+            old.bake(first, last, scratch, mask)
+    then, now = old.num_without_value, new.num_without_value
+    return {name: counts[name] - then[name] + now[name] for name in now}
+
+
+def _reason_for_all(old: Baker, new: Baker) -> str:
+    """Why no block can keep what it has; empty where some can."""
+    if new.gpdf is not None:
+        return "every splat reaches every cell of gpdf"
+    if new.probability is not None and new.config.probability == "paper":
+        return "every splat reaches every cell of the paper's probability"
+    if new.config.unknown != "free":
+        return f"field.unknown = {new.config.unknown} changes the field where no splat does"
+    if "bound" in new.channels and old.bound_margin != new.bound_margin:
+        return "the farthest splat moved, and bound's margin with it"
+    return ""
+
+
+def _touch(
+    clusters: native.Clusters,
+    offsets: native.Offsets,
+    changed: UInt8,
+    length: float | None,
+    span: GridSpan,
+    mask: UInt8,
+    threads: int,
+) -> None:
+    if changed.any():
+        native.touched_blocks(clusters, offsets, changed, length, span, mask, threads=threads)
+
+
+def _changed(
+    splats: tuple[SplatSet, SplatSet], bakers: tuple[Baker, Baker], *, with_weights: bool
+) -> tuple[UInt8, UInt8]:
+    """The entries (16 C,) of each set that are not in the other, to the bit."""
+    rows = [_rows(s, b, with_weights=with_weights) for s, b in zip(splats, bakers, strict=True)]
+    laid_out = []
+    for here, there, baker in zip(rows, reversed(rows), bakers, strict=True):
+        others = set(there)
+        is_new: Bool = np.fromiter((row not in others for row in here), np.bool_, len(here))
+        changed = np.zeros(len(baker.spheres.points.source), np.uint8)
+        changed[np.flatnonzero(baker.spheres.points.is_point)] = is_new
+        laid_out.append(changed)
+    return laid_out[0], laid_out[1]
+
+
+def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> list[bytes]:
+    """Each splat, in the order of the clusters, as bytes: equal ones do the same to a field.
+
+    Splats of one centre are told apart by their rank, as their order is that of the set and can decide the last bit.
+    """
+    order = baker.spheres.points.source[baker.spheres.points.is_point.view(np.bool_)]
+    centers = np.ascontiguousarray(splats.centers.astype(np.float64)[order] + 0.0)  # no -0, which is equal to 0
+    values: list[NDArray[np.float64]] = [splats.radii.astype(np.float64), splats.labels.astype(np.float64)]
+    if with_weights:
+        assert baker.se is not None
+        values.append(baker.se.weights.log_size)
+        if baker.se.weights.sign is not None:
+            values.append(baker.se.weights.sign.astype(np.float64))
+    table = np.stack(values, axis=1)[order]
+    seen: Counter[bytes] = Counter()
+    rows = []
+    for center, row in zip(centers, table, strict=True):
+        place = center.tobytes()
+        rows.append(place + row.tobytes() + seen[place].to_bytes(4, "little"))
+        seen[place] += 1
+    return rows

@@ -1,0 +1,173 @@
+"""What a baked grid holds, in numbers: how much of it is known, and how far its gradient is from a distance's."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.field.grid import exact_channel
+from splatctrl_cli.records import DistanceGrid, Float32, VoxelState
+
+CHUNK_CELLS = 1 << 20  # that are looked at together
+BIN = 0.05  # of the histogram of the gradient's length: bin k is about k times this
+NUM_BINS = 41  # about 0 to 2; the last one holds what is longer, too
+NEAR_ONE = 0.05
+RESOLUTION = 2e-6  # [m] float32 distances nearer than this are the same
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradientLengths:
+    """How long the gradients are: 1 for a distance (Eikonal equation), less where a kernel field is flat.
+
+    histogram: cells by length, bin k within half a `bin_width` of k times that; share_near_one: within 0.05 of 1.
+    """
+
+    histogram: tuple[int, ...]
+    bin_width: float
+    largest: float
+    mean: float
+    share_near_one: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excess:
+    """By how much a kernel field over-estimates: it exceeds the exact distance to the spheres at `count` cells."""
+
+    count: int
+    share: float
+    largest: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridStatistics:
+    """num_blank: cells whose sdf is NaN; num_inside: whose sdf is 0 or less; lowest, highest of sdf [m].
+
+    observed: cells by state. hard_share: of cells where sdf is the exact distance. excess: by kernel field, of cells
+    where it has a value of its own or stands in. Each None or empty where the grid has not the channels for it.
+    """
+
+    num_cells: int
+    num_blank: int
+    num_inside: int
+    lowest: float | None
+    highest: float | None
+    observed: Mapping[str, int] | None
+    hard_share: float | None
+    excess: Mapping[str, Excess]
+    gradient: GradientLengths | None
+
+    @property
+    def never_seen_share(self) -> float | None:
+        """Of the cells, by state: those that no camera saw, and that the robot was not in."""
+        return None if self.observed is None else self.observed["never_seen"] / self.num_cells
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values, as written to ``field.json``."""
+        return {**asdict(self), "never_seen_share": self.never_seen_share}
+
+
+def grid_statistics(grid: DistanceGrid) -> GridStatistics:
+    """The statistics of a grid, whose channels may be memory maps: a few planes are held at a time."""
+    totals = _Totals()
+    for part in _parts(grid):
+        totals.add(part)
+    return totals.statistics()
+
+
+class _Totals:
+    """Sums over parts of a grid."""
+
+    def __init__(self) -> None:
+        self.num_cells = self.num_blank = self.num_inside = self.num_hard = 0
+        self.lowest, self.highest = np.inf, -np.inf
+        self.states: NDArray[np.int64] | None = None
+        self.has_exact = False
+        self.excess: dict[str, tuple[int, float]] = {}
+        self.lengths: NDArray[np.int64] | None = None
+        self.longest = self.length_sum = 0.0
+        self.num_near_one = 0
+
+    def add(self, part: DistanceGrid) -> None:
+        sdf = part.channels["sdf"]
+        known = sdf[np.isfinite(sdf)]
+        self.num_cells += sdf.size
+        self.num_blank += sdf.size - known.size
+        self.num_inside += int(np.count_nonzero(known <= 0))
+        if known.size:
+            self.lowest, self.highest = min(self.lowest, float(known.min())), max(self.highest, float(known.max()))
+        if "observed" in part.channels:
+            counts = np.bincount(part.channels["observed"].ravel(), minlength=len(VoxelState))
+            self.states = counts if self.states is None else self.states + counts
+        self._add_exact(part)
+        if "gradient" in part.channels:
+            self._add_gradient(_floats(part, "gradient"))
+
+    def _add_exact(self, part: DistanceGrid) -> None:
+        if part.header.get("unknown") == "obstacle" and "hard" not in part.channels:
+            return  # bound is then of unknown space, too
+        try:
+            exact = exact_channel(part)
+        except InputError:  # the grid has it not
+            return
+        self.has_exact = True
+        self.num_hard += int(np.count_nonzero(np.abs(_floats(part, "sdf") - exact) <= RESOLUTION))
+        for name in ("se", "gpdf"):
+            if name in part.channels:
+                over = _floats(part, name) - exact
+                count, largest = self.excess.get(name, (0, 0.0))
+                self.excess[name] = (
+                    count + int(np.count_nonzero(over > RESOLUTION)),
+                    max(largest, float(over.max())),
+                )
+
+    def _add_gradient(self, gradient: Float32) -> None:
+        lengths = np.sqrt(np.einsum("...i,...i->...", gradient, gradient)).ravel()
+        lengths = lengths[np.isfinite(lengths)]
+        bins = np.minimum((lengths / BIN + 0.5).astype(np.int64), NUM_BINS - 1)
+        counts = np.bincount(bins, minlength=NUM_BINS)
+        self.lengths = counts if self.lengths is None else self.lengths + counts
+        self.longest = max(self.longest, float(lengths.max(initial=0.0)))
+        self.length_sum += float(lengths.sum(dtype=np.float64))
+        self.num_near_one += int(np.count_nonzero(np.abs(lengths - 1.0) <= NEAR_ONE))
+
+    def statistics(self) -> GridStatistics:
+        is_known = self.num_blank < self.num_cells
+        num_lengths = 0 if self.lengths is None else int(self.lengths.sum())
+        return GridStatistics(
+            num_cells=self.num_cells,
+            num_blank=self.num_blank,
+            num_inside=self.num_inside,
+            lowest=self.lowest if is_known else None,
+            highest=self.highest if is_known else None,
+            observed=None
+            if self.states is None
+            else {state.name.lower(): int(self.states[state]) for state in VoxelState},
+            hard_share=self.num_hard / self.num_cells if self.has_exact else None,
+            excess={
+                name: Excess(count=count, share=count / self.num_cells, largest=largest)
+                for name, (count, largest) in self.excess.items()
+            },
+            gradient=None
+            if self.lengths is None or not num_lengths
+            else GradientLengths(
+                histogram=tuple(int(count) for count in self.lengths),
+                bin_width=BIN,
+                largest=self.longest,
+                mean=self.length_sum / num_lengths,
+                share_near_one=self.num_near_one / num_lengths,
+            ),
+        )
+
+
+def _floats(part: DistanceGrid, channel: str) -> Float32:
+    return np.asarray(part.channels[channel], np.float32)
+
+
+def _parts(grid: DistanceGrid) -> Iterator[DistanceGrid]:
+    num_planes, *rest = grid.channels["sdf"].shape
+    step = max(1, CHUNK_CELLS // int(np.prod(rest)))
+    for first in range(0, num_planes, step):
+        channels = {name: values[first : first + step] for name, values in grid.channels.items()}
+        yield DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header)

@@ -1,0 +1,126 @@
+"""A grid cut into slabs of x-planes, so that memory need not hold it: which ones, and one at a time."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.config import FieldConfig, OccupancyConfig
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.field.baker import CHANNELS, Baker, Planes
+from splatctrl_cli.field.layout import GridLayout, available_memory
+from splatctrl_cli.field.observed import observed_planes
+from splatctrl_cli.field.unknown import BOUND, Cubes, blank
+from splatctrl_cli.kernels.field import BLOCK
+from splatctrl_cli.records import Bool, DistanceGrid, OccupancyGrid, UInt8, VoxelState
+
+SLAB_BYTES = 48 << 20  # of the channels of a slab, or what a block's planes take
+_CUBES = 64  # bytes of a cell that finding the nearest never-seen one takes, of the whole grid
+_BESIDE = 64  # bytes of a cell that baking takes beside its channels, in at most 64 MiB or a block's planes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """What an update keeps: the grid of the bake before, where `mask` (blocks) is zero; what cameras saw is anew."""
+
+    grid: DistanceGrid
+    mask: UInt8
+    occupancy: OccupancyGrid | None
+    thresholds: OccupancyConfig
+
+
+def bytes_per_cell(channels: Collection[str]) -> int:
+    """Of the channels."""
+    return sum(np.dtype(CHANNELS[name][0]).itemsize * CHANNELS[name][1] for name in channels if name in CHANNELS)
+
+
+def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iterator[tuple[int, int]]:
+    """The x-planes [first, last) of each slab from plane `begin` on: whole blocks of planes."""
+    per_plane = bytes_per_cell(channels) * layout.shape[1] * layout.shape[2]
+    step = BLOCK * max(1, SLAB_BYTES // (BLOCK * per_plane))
+    for first in range(begin, layout.shape[0], step):
+        yield first, min(first + step, layout.shape[0])
+
+
+def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
+    """Raise UsageError where not even the planes of one block fit the memory."""
+    planes = min(BLOCK, layout.shape[0])
+    needed = planes * layout.shape[1] * layout.shape[2] * (bytes_per_cell(channels) + _BESIDE)
+    free = available_memory()
+    if needed > free:
+        size = " x ".join(str(n) for n in (planes, *layout.shape[1:]))
+        raise UsageError(
+            f"slab of {size} cells: needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free",
+            remedy="give a larger --voxel, fewer --channels, or a --box that is shorter along y and z",
+        )
+
+
+class UnknownSpace:
+    """`apply_unknown` for a grid that is baked in slabs: what is never seen is known before anything is baked.
+
+    num_never_seen and num_changed count the cells that were treated: never seen, and of those or near them, changed.
+    """
+
+    def __init__(
+        self, layout: GridLayout, config: FieldConfig, occupancy: OccupancyGrid | None, thresholds: OccupancyConfig
+    ) -> None:
+        """Raises NotEvaluableError where nothing was ever seen, UsageError where obstacles do not fit the memory."""
+        self.policy = config.unknown
+        self.num_never_seen = self.num_changed = 0
+        self._is_unknown: Bool = np.concatenate(
+            [
+                observed_planes(occupancy, layout, thresholds, first, last) == VoxelState.NEVER_SEEN
+                for first, last in slabs(layout, ["gradient"])
+            ]
+        )
+        if self._is_unknown.all():
+            raise NotEvaluableError(
+                f"field.unknown = {self.policy}: expected a cell that a camera saw, got none of {layout.num_cells}",
+                remedy="bake a scene with an occupancy grid, check --box, or set field.unknown = free",
+            )
+        self._cubes: Cubes | None = None
+        if self.policy == "obstacle" and self._is_unknown.any():
+            needed, free = _CUBES * layout.num_cells / 2**30, available_memory() / 2**30
+            if needed > free:
+                raise UsageError(
+                    f"field.unknown = obstacle: needs {needed:.1f} GiB of memory, {free:.1f} GiB is free",
+                    remedy="give a larger --voxel, a smaller --box, or --unknown nan, which needs less",
+                )
+            self._cubes = Cubes.of(self._is_unknown, layout.voxel)
+
+    def apply(self, planes: Planes, first: int, last: int, bound_margin: float) -> Planes:
+        """The channels of the x-planes [first, last), treated by the policy."""
+        is_unknown = self._is_unknown[first:last]
+        num_unknown = int(np.count_nonzero(is_unknown))
+        self.num_never_seen += num_unknown
+        if self.policy == "nan":
+            self.num_changed += num_unknown
+            return blank(planes, is_unknown)
+        if self._cubes is None:
+            return planes
+        treated, num_changed = self._cubes.planes(first, last).joined(planes, bound_margin)
+        self.num_changed += num_changed
+        return treated
+
+    def header(self) -> dict[str, object]:
+        """What it changes in a header, as `apply_unknown` does."""
+        counts = {"never_seen": self.num_never_seen, "changed": self.num_changed}
+        bound = {"bound": BOUND} if self.policy == "obstacle" else {}
+        return {**bound, "unknown": self.policy, "unknown_cells": counts}
+
+
+def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) -> Planes:
+    """The channels of the x-planes [first, last), (last - first, Y, Z), before unknown space is treated; with `kept`,
+    only what it does not keep is baked.
+    """
+    planes = baker.allocate(last - first)
+    if kept is None:
+        baker.bake(first, last, planes)
+        return planes
+    for name, values in planes.items():
+        values[...] = kept.grid.channels[name][first:last]
+    if kept.mask[first // BLOCK : -(-last // BLOCK)].any():
+        baker.bake(first, last, planes, kept.mask)
+    if "observed" in planes:
+        planes["observed"] = observed_planes(kept.occupancy, baker.layout, kept.thresholds, first, last)
+    return planes

@@ -1,0 +1,119 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.incremental import changed_blocks, counts_after
+from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.records import Box, Label, SplatSet
+from tests.field.scenes import cloud, splat_set
+
+BOX = Box(lower=np.array([-0.61, -0.57, -0.4]), upper=np.array([0.55, 0.6, 0.43]))
+CONFIG = FieldConfig(voxel=0.025, distance="safe")
+LAYOUT = GridLayout.over(BOX, CONFIG.voxel)
+CHANNELS = ("sdf", "gradient", "bound", "observed", "label", "hard", "se")
+EDITS = ("add", "remove", "move", "radius", "label", "duplicate", "order")
+
+
+def lattice() -> SplatSet:
+    """Splats on a lattice whose points lie between cells: ties of the nearest everywhere."""
+    x, y = np.meshgrid(np.arange(-0.3, 0.31, 0.05), np.arange(-0.3, 0.31, 0.05))
+    centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    splats = splat_set(centers, np.full(len(centers), 0.01))
+    labels = np.where(np.arange(len(centers)) % 3 == 0, Label.HUMAN, Label.OBJECT).astype(np.uint8)
+    return replace(splats, labels=labels)
+
+
+def joined(first: SplatSet, second: SplatSet) -> SplatSet:
+    return SplatSet(**{name: np.concatenate([values, vars(second)[name]]) for name, values in vars(first).items()})
+
+
+def edited(splats: SplatSet, kind: str, rng: np.random.Generator, num: int = 4) -> SplatSet:
+    """The splats with a few of them changed, near each other."""
+    chosen = np.argsort(np.linalg.norm(splats.centers - splats.centers[rng.integers(len(splats))], axis=1))[:num]
+    kept = np.ones(len(splats), bool)
+    centers, radii, labels = splats.centers.copy(), splats.radii.copy(), splats.labels.copy()
+    if kind == "remove":
+        kept[chosen] = False
+        return splats.select(kept)
+    if kind in ("add", "duplicate"):
+        only = np.zeros(len(splats), bool)
+        only[chosen] = True
+        shift = 0.0 if kind == "duplicate" else rng.normal(0.0, 0.02, (num, 3)).astype(np.float32)
+        more = splats.select(only)
+        return joined(replace(more, centers=(more.centers + shift).astype(np.float32)), splats)
+    if kind == "order":
+        order = rng.permutation(len(splats))
+        return SplatSet(**{name: values[order] for name, values in vars(splats).items()})
+    if kind == "move":
+        centers[chosen] += rng.normal(0.0, 0.01, (num, 3)).astype(np.float32)
+    elif kind == "radius":
+        radii[chosen] *= np.float32(1.3)
+    else:
+        labels[chosen] = Label.HUMAN - labels[chosen]
+    return replace(splats, centers=centers, radii=radii, labels=labels)
+
+
+def whole(baker: Baker) -> dict[str, np.ndarray]:
+    arrays = baker.allocate(LAYOUT.shape[0])
+    baker.bake(0, LAYOUT.shape[0], arrays)
+    return arrays
+
+
+@pytest.mark.parametrize("kind", EDITS)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("distance", ["safe", "se", "hard"])
+def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distance: str) -> None:
+    rng = np.random.default_rng(seed)
+    before = lattice() if seed % 2 else splat_set(*cloud(400, seed))
+    after = edited(before, kind, rng)
+    config = replace(CONFIG, distance=distance)
+    channels = [name for name in CHANNELS if name != "se" or distance != "hard"]
+    old, new = (Baker(splats, LAYOUT, config, channels=channels, threads=2) for splats in (before, after))
+    arrays = whole(old)
+    counts = dict(old.num_without_value)
+    changes = changed_blocks(before, old, after, new)
+    assert changes.mask is not None
+    new.bake(0, LAYOUT.shape[0], arrays, changes.mask)
+    counts = counts_after(counts, old, new, changes.mask, [(0, 16), (16, LAYOUT.shape[0])])
+    full = Baker(after, LAYOUT, config, channels=channels)
+    for name, values in whole(full).items():
+        assert arrays[name].tobytes() == values.tobytes(), name
+    assert counts == full.num_without_value
+    assert changes.num_baked < 0.8 * changes.num_blocks
+    if kind != "order" or not seed % 2:
+        assert (changes.num_baked > 0) == (kind != "order")
+
+
+def test_a_far_edit_of_many_bakes_everything_it_must() -> None:
+    before = splat_set(*cloud(300))
+    after = replace(before, centers=(before.centers + np.float32(0.07)).astype(np.float32))
+    old, new = (Baker(splats, LAYOUT, CONFIG, channels=("sdf", "hard")) for splats in (before, after))
+    arrays = whole(old)
+    changes = changed_blocks(before, old, after, new)
+    assert changes.mask is not None
+    new.bake(0, LAYOUT.shape[0], arrays, changes.mask)
+    for name, values in whole(Baker(after, LAYOUT, CONFIG, channels=("sdf", "hard"))).items():
+        assert arrays[name].tobytes() == values.tobytes(), name
+
+
+def test_the_same_splats_change_no_block() -> None:
+    splats = splat_set(*cloud(300))
+    old, new = (Baker(splats, LAYOUT, CONFIG) for _ in range(2))
+    changes = changed_blocks(splats, old, splats, new)
+    assert (changes.num_baked, changes.reason) == (0, "")
+
+
+def test_what_reaches_every_cell_bakes_everything_and_says_why() -> None:
+    before = splat_set(*cloud(100))
+    after = edited(before, "remove", np.random.default_rng(0))
+    config = replace(CONFIG, distance="safe_gpdf")
+    old, new = (Baker(splats, LAYOUT, config) for splats in (before, after))
+    changes = changed_blocks(before, old, after, new)
+    assert changes.num_baked == changes.num_blocks
+    assert "gpdf" in changes.reason
+    moved = replace(before, centers=before.centers * np.float32(1.5))
+    old, new = (Baker(splats, LAYOUT, CONFIG) for splats in (before, moved))
+    assert "bound's margin" in changed_blocks(before, old, moved, new).reason
