@@ -1,7 +1,11 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.field.health import field_health, median_spacing
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.field.health import field_health, lumping_overestimate, median_spacing
+from tests.field.scenes import cloud, queries
+from tests.reference import field as reference
 
 
 def square_lattice(spacing: float) -> np.ndarray:
@@ -25,3 +29,46 @@ def test_each_ratio_out_of_range_has_its_warning() -> None:
     short = field_health(square_lattice(0.01), np.full(100, 0.008), 0.009)
     assert [w.split(":")[0][:7] for w in short.warnings] == ["spacing", "the ker"]
     assert short.radius_per_spacing == pytest.approx(0.8)
+
+
+def warnings_of(centers: np.ndarray, radii: np.ndarray, length: float) -> str:
+    return "; ".join(field_health(centers, radii, length).warnings)
+
+
+def test_a_length_scale_beyond_the_scene_is_warned_of() -> None:
+    lattice, radii = square_lattice(0.01), np.full(100, 0.01)
+    assert "exceeds the extent of the splats, 0.09 m" in warnings_of(lattice, radii, 0.1)
+    assert "extent" not in warnings_of(lattice, radii, 0.08)
+    assert "rounding" in warnings_of(square_lattice(5.0), np.full(100, 5.0), 10.0)
+    assert "rounding" not in warnings_of(square_lattice(5.0), np.full(100, 5.0), 9.9)
+
+
+def test_radii_that_differ_thirtyfold_are_warned_of() -> None:
+    radii = np.full(100, 0.01)
+    radii[3] = 0.0
+    assert "in one set" not in warnings_of(square_lattice(0.01), radii, 0.02)
+    radii[4] = 0.00033
+    assert "radii from 0.33 to 10 mm in one set" in warnings_of(square_lattice(0.01), radii, 0.02)
+
+
+def test_splats_at_one_place_are_warned_of_and_a_single_one_is_not() -> None:
+    assert "all 5 splats stand at one place" in warnings_of(np.ones((5, 3)), np.full(5, 0.01), 0.02)
+    assert warnings_of(np.ones((1, 3)), np.full(1, 0.01), 0.02) == ""
+
+
+def test_over_estimate_is_the_share_of_points_beyond_the_exact_distance() -> None:
+    centers, radii = cloud()
+    points = queries(2000)
+    found = lumping_overestimate(centers, radii, points, FieldConfig())
+    hard = reference.hard(points, centers, radii)
+    kernels = {
+        "se": reference.se(points, centers, radii, 0.02, 1e-6)[0],
+        "gpdf": reference.gpdf(points, centers, radii, 0.02, 1e-6),
+    }
+    for name, distance in kernels.items():
+        over = distance - hard
+        assert found[name].share == pytest.approx(np.mean(over > 2e-6), abs=2e-3), name
+        assert found[name].largest == pytest.approx(max(np.nanmax(over), 0.0), abs=3e-5), name
+    assert found["se"].share > 0.5
+    with pytest.raises(NotEvaluableError, match="at least one point, got none"):
+        lumping_overestimate(centers, radii, np.empty((0, 3)), FieldConfig())

@@ -1,0 +1,105 @@
+"""Splats and length scales at the edge of what can be: every field is finite and right, or refused in words."""
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError
+from splatctrl_cli.field import voxel_density
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.distance import DISTANCES, make_field
+from splatctrl_cli.field.unknown import apply_unknown
+from splatctrl_cli.field.weights import METHODS
+from splatctrl_cli.records import Box, Float64
+from tests.field.scenes import cloud, queries, splat_set
+from tests.reference import field as reference
+
+LENGTHS = [10.0**exponent for exponent in range(-10, 3)]
+KERNELS = [name for name in DISTANCES if name != "hard"]
+
+
+def scene(name: str) -> tuple[Float64, Float64]:
+    centers, radii = cloud(80)
+    if name == "one":
+        return centers[:1], np.array([0.01])
+    if name == "duplicates":
+        return np.concatenate([centers[:30]] * 3), np.concatenate([radii[:30]] * 3)
+    if name == "zero radii":
+        return centers, np.zeros(80)
+    if name == "mixed radii":
+        return centers, np.geomspace(0.001, 0.3, 80).astype(np.float32).astype(np.float64)
+    return np.zeros((4, 3)), np.full(4, 0.02)
+
+
+@pytest.mark.parametrize("weights", METHODS)
+@pytest.mark.parametrize("distance", KERNELS)
+@pytest.mark.parametrize("name", ["one", "duplicates", "zero radii", "mixed radii", "one place"])
+def test_every_length_scale_gives_finite_distances_or_is_refused_in_words(
+    name: str, distance: str, weights: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(voxel_density, "NODES", 40)  # smaller blocks, for speed
+    centers, radii = scene(name)
+    points = np.concatenate([queries(40), centers[:10], centers[:10] + 1e-4, 30.0 + queries(3)])
+    hard = reference.hard(points, centers, radii)
+    between = reference.distances(points, centers)
+    nearest = between.argmin(axis=1)  # the Gaussian kernel's limit has the radius of the nearest centre
+    limit = between.min(axis=1) - radii[nearest] if distance == "se" else hard
+    num_refused = 0
+    for length in LENGTHS:
+        config = FieldConfig(distance=distance, weights=weights, length_scale=length, noise=1e-3)
+        try:
+            found, gradient = make_field(centers, radii, config).query(points)
+        except (UsageError, NotEvaluableError) as error:
+            assert weights == "cg", (length, error)  # what is lumped can always be made
+            assert "field.weights" in str(error)
+            assert error.remedy
+            num_refused += 1
+            continue
+        assert np.isfinite(found).all(), length
+        assert np.isfinite(gradient).all(), length
+        if distance.startswith("safe"):
+            assert (found <= hard + 1e-5).all(), length
+        if length <= 1e-5:
+            np.testing.assert_allclose(found, limit, atol=20 * length + 1e-5)
+    assert num_refused < len(LENGTHS) - 6
+
+
+@pytest.mark.parametrize("distance", DISTANCES)
+def test_bad_splats_are_refused_by_every_field(distance: str) -> None:
+    config = FieldConfig(distance=distance)
+    centers, radii = cloud(10)
+    centers[4, 2] = np.nan
+    with pytest.raises(InputError, match="splat 4: expected a finite centre"):
+        make_field(centers, radii, config)
+    centers, radii = cloud(10)
+    radii[2] = np.inf
+    with pytest.raises(InputError, match="splat 2: expected a finite radius"):
+        make_field(centers, radii, config)
+    with pytest.raises(NotEvaluableError, match="got none"):
+        make_field(np.empty((0, 3)), np.empty(0), config)
+
+
+@pytest.mark.parametrize("weights", METHODS)
+def test_a_box_that_holds_no_splat_has_the_distances_to_those_beyond(weights: str) -> None:
+    centers, radii = cloud(200)
+    box = Box(lower=np.array([5.0, 5.0, 5.0]), upper=np.array([5.3, 5.3, 5.3]))
+    channels = ("sdf", "gradient", "bound", "hard", "gpdf", "se", "label", "probability")
+    config = FieldConfig(voxel=0.1, weights=weights, noise=1e-2)
+    grid = bake(splat_set(centers, radii), box, config, channels=channels)
+    points = grid.origin + grid.voxel * np.argwhere(np.ones(grid.channels["sdf"].shape, bool))
+    hard = reference.hard(points, centers, radii)
+    np.testing.assert_allclose(grid.channels["hard"].ravel(), hard, atol=2e-6)
+    assert (grid.channels["sdf"].ravel() <= hard + 2e-6).all()
+    assert (grid.channels["bound"].ravel() <= hard).all()
+    assert (grid.channels["probability"] == 0).all()
+    for values in grid.channels.values():
+        assert np.isfinite(values).all()
+    with pytest.raises(NotEvaluableError, match="expected a cell that some camera saw"):
+        apply_unknown(bake(splat_set(centers, radii), box, FieldConfig(voxel=0.1)), "obstacle")
+
+
+@pytest.mark.parametrize("weights", METHODS)
+@pytest.mark.parametrize("length", [0.0, -1.0, 1e-13, 1e7, float("nan")])
+def test_a_length_scale_that_is_none_is_refused(length: float, weights: str) -> None:
+    with pytest.raises(SplatCtrlError, match=r"field.length_scale: expected a length above 0 m"):
+        make_field(*cloud(10), FieldConfig(length_scale=length, weights=weights))
