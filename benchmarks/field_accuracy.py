@@ -98,6 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print("\n".join(default_lines(rows)), end="\n\n")
     print("\n".join(weight_lines(rows)), end="\n\n")
     print("\n".join(bias_lines(bias)), end="\n\n")
+    places = place_errors(shapes(with_meshes=False)[0], num)
+    print("\n".join(place_lines(places)), end="\n\n")
     lone = [lone_reading(case) for case in LONE_SPLATS]
     print("\n".join(lone_lines(lone)), end="\n\n")
     missed = [row for row in rows if row.field == "safe" and row.weights == FieldConfig.weights and not row.is_kept]
@@ -109,6 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "band": BAND,
         "rows": [{**asdict(row), "bar": row.bar, "kept": row.is_kept} for row in rows],
         "planar_bias": [asdict(one) for one in bias],
+        "places": [asdict(one) for one in places],
         "lone_splat": [asdict(one) for one in lone],
     }
     args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
@@ -188,6 +191,42 @@ def planar_bias(length: float) -> PlanarBias:
         largest_difference=float(np.abs(measured - closed_form).max()),
         at_10_cm=float(np.interp(0.10, heights, measured)),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaceError:
+    """Error of one field on the box by what is nearest: mean and RMSE [m] before faces, edges and corners."""
+
+    spacing: float
+    is_inset: bool
+    field: str
+    mean: tuple[float, float, float]
+    rmse: tuple[float, float, float]
+
+
+def place_errors(box: Shape, num_points: int) -> list[PlaceError]:
+    """A point is before an edge or a corner where two or three of its coordinates are beyond the box's."""
+    points, truth = points_around(box, num_points, *BAND, seed=1)
+    num_beyond = np.count_nonzero((points < box.box.lower) | (points > box.box.upper), axis=1)
+    places = [num_beyond == beyond for beyond in (1, 2, 3)]
+    found = []
+    for spacing in SPACINGS:
+        for is_inset in (False, True):
+            readings = distances(*splats_on(box, spacing, is_inset=is_inset, seed=0), points, [FieldConfig.weights])
+            for (name, _), distance in readings.items():
+                errors = [(distance - truth)[place] for place in places]
+                mean = [float(error.mean()) for error in errors]
+                rmse = [float(np.sqrt(np.mean(error**2))) for error in errors]
+                found.append(
+                    PlaceError(
+                        spacing=spacing,
+                        is_inset=is_inset,
+                        field=name,
+                        mean=(mean[0], mean[1], mean[2]),
+                        rmse=(rmse[0], rmse[1], rmse[2]),
+                    )
+                )
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,6 +317,25 @@ def bias_lines(bias: Sequence[PlanarBias]) -> list[str]:
         [f"{one.length * 100:g}", millimetres(one.at_10_cm), millimetres(one.largest_difference, 3)] for one in bias
     ]
     return ["gpdf over a dense plane of centres with radius 0", *table(header, cells)]
+
+
+def place_lines(errors: Sequence[PlaceError]) -> list[str]:
+    """Mean and RMSE by place."""
+    places = ("faces", "edges", "corners")
+    header = (
+        "spacing cm",
+        "centres",
+        "field",
+        *(f"{place}: {what}" for place in places for what in ("mean", "RMSE")),
+    )
+    cells = [
+        [
+            *(f"{one.spacing * 100:g}", "inside" if one.is_inset else "on it", one.field),
+            *(millimetres(value) for pair in zip(one.mean, one.rmse, strict=True) for value in pair),
+        ]
+        for one in errors
+    ]
+    return ["the box by what is nearest [mm]", *table(header, cells)]
 
 
 def lone_lines(readings: Sequence[LoneReading]) -> list[str]:

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.field_accuracy import BAND, Row, planar_bias, shape_rows
 from benchmarks.surfaces import Shape, points_around, shapes, splats_on
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.field.distance import SeField, SphereField
 
 NUM = 1500
 
@@ -55,3 +55,14 @@ def test_over_a_plane_the_kernel_of_the_paper_reads_the_closed_form(length: floa
     bias = planar_bias(length)
     assert bias.largest_difference < 1e-4
     assert bias.at_10_cm == pytest.approx(0.10 - length * np.log1p(0.10 / length), abs=1e-4)
+
+
+def test_over_a_plane_the_gaussian_kernel_has_no_bias() -> None:
+    axis = np.arange(-0.45, 0.45, 0.01)
+    x, y = np.meshgrid(axis, axis)
+    centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.01, 0.01, (NUM, 2)), rng.uniform(0.01, 0.2, NUM)])
+    for radius in (0.0, 0.005):
+        distance = SeField(centers, np.full(len(centers), radius)).query(points)[0]
+        np.testing.assert_allclose(distance, points[:, 2] - radius, atol=5e-5 + 1e-6)  # the truncation, and float32
