@@ -103,23 +103,38 @@ def field_accuracy(
     )
 
 
-def grid_distances(grid: DistanceGrid) -> dict[str, NDArray[np.floating]]:
-    """The distances (X, Y, Z) [m] that a grid holds, by field name: sdf, hard, se, gpdf.
+@dataclass(frozen=True, kw_only=True)
+class GridDistance:
+    """A distance that a grid holds: values (X, Y, Z) [m], and what is to be added to them [m]."""
 
-    hard is its channel, or else ``bound`` with the margin of the header put back: the same to a micrometre. Raises
-    InputError where the grid has neither.
+    values: NDArray[np.generic]
+    added: float = 0.0
+
+    def at(self, cells: NDArray[np.int64]) -> Float64:
+        """The distances [m] of cells by flat index, without a copy of the channel, which may be on disk."""
+        return np.asarray(self.values.reshape(-1)[cells].astype(np.float64) + self.added)
+
+
+def grid_distances(grid: DistanceGrid) -> dict[str, GridDistance]:
+    """The distances that a grid holds, by field name: sdf, hard, se, gpdf.
+
+    hard is its channel, or else ``bound`` with the margin of the header put back, the same to a micrometre (where
+    never-seen cells were made obstacles, the distance to those as well). Raises InputError for a grid with neither.
     """
-    names = [name for name in ("sdf", "hard", "se", "gpdf") if name in grid.channels]
-    distances: dict[str, NDArray[np.floating]] = {name: grid.channels[name].astype(np.float32) for name in names}
-    if "hard" not in distances:
+    found: dict[str, GridDistance] = {
+        name: GridDistance(values=grid.channels[name])
+        for name in ("sdf", "hard", "se", "gpdf")
+        if name in grid.channels
+    }
+    if "hard" not in found:
         margin = grid.header.get("bound_margin")
         if "bound" not in grid.channels or not isinstance(margin, int | float):
             raise InputError(
                 f"distance grid: expected a channel hard or bound, got {', '.join(grid.channels)}",
                 remedy="bake with the channel bound, which is there by default",
             )
-        distances["hard"] = grid.channels["bound"].astype(np.float32) + np.float32(margin)
-    return distances
+        found["hard"] = GridDistance(values=grid.channels["bound"], added=float(margin))
+    return found
 
 
 def median_radius(grid: DistanceGrid) -> float:

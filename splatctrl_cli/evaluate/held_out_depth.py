@@ -19,6 +19,7 @@ from splatctrl_cli.evaluate.field_accuracy import (
     BANDS,
     BandAccuracy,
     FieldAccuracy,
+    GridDistance,
     band_accuracy,
     field_accuracy,
     grid_distances,
@@ -79,7 +80,7 @@ def compare_with_held_out_depth(
     InputError for masks that do not fit, NotEvaluableError where no measured point lies in the grid.
     """
     distances = grid_distances(grid)
-    upper = grid.origin + grid.voxel * (np.array(distances["sdf"].shape) - 1)
+    upper = grid.origin + grid.voxel * (np.array(grid.channels["sdf"].shape) - 1)
     box = Box(lower=grid.origin, upper=upper)
     measured, eyes, num_edges = _measured(frames, counted, Box(lower=box.lower - REACH, upper=box.upper + REACH))
     if not box.contains(measured).any():
@@ -149,14 +150,13 @@ def _edges(depth: NDArray[np.float32]) -> Bool:
     return is_edge
 
 
-def _interpolated(
-    grid: DistanceGrid, distances: dict[str, NDArray[np.floating]], points: Float64
-) -> dict[str, Float64]:
+def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points: Float64) -> dict[str, Float64]:
     points = np.ascontiguousarray(points)
-    return {
-        name: interpolate(np.ascontiguousarray(values, np.float32), grid.origin, grid.voxel, points)[0]
-        for name, values in distances.items()
-    }
+    found = {}
+    for name, distance in distances.items():
+        values = np.ascontiguousarray(distance.values, dtype=np.float32)
+        found[name] = interpolate(values, grid.origin, grid.voxel, points)[0] + distance.added
+    return found
 
 
 def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame]) -> Bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy, grid_distances, median_radius
 from splatctrl_cli.evaluate.mesh_distance import MeshDistance, load_mesh
-from splatctrl_cli.records import DistanceGrid
+from splatctrl_cli.records import DistanceGrid, Float64
 
 REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
@@ -20,8 +20,8 @@ class MeshComparison:
     """The accuracy, and how many cells went into it.
 
     num_in_reach of the grid's cells lie in the box of the mesh widened by 20 cm; num_drawn of those were drawn,
-    num_unknown of those have no distance (NaN, by the policy for unknown space), num_inside lie inside the mesh, and
-    num_near are outside of it and within 20 cm: those are compared. is_closed: the mesh has an inside.
+    num_unknown of those have no distance (NaN, by the policy for unknown space), num_inside lie inside the mesh near its
+    surface, and num_near are outside of it and within 20 cm: those are compared. is_closed: the mesh has an inside.
     """
 
     accuracy: FieldAccuracy
@@ -49,12 +49,12 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     """
     mesh = load_mesh(mesh_path)
     distances = grid_distances(grid)
-    cells = _cells_in_reach(grid, mesh.vertices.min(axis=0) - REACH, mesh.vertices.max(axis=0) + REACH)
-    rng = np.random.default_rng(seed)
-    drawn = np.sort(rng.choice(cells, min(len(cells), max_points), replace=False))
-    is_known = np.isfinite(distances["sdf"].reshape(-1)[drawn])
-    known = drawn[is_known]
-    points = grid.origin + grid.voxel * np.stack(np.unravel_index(known, distances["sdf"].shape), axis=1)
+    cells, num_in_reach = _drawn_cells(
+        grid, mesh.vertices.min(axis=0) - REACH, mesh.vertices.max(axis=0) + REACH, max_points, seed
+    )
+    drawn = np.ravel_multi_index(tuple(cells.T), grid.channels["sdf"].shape)
+    is_known = np.isfinite(distances["sdf"].at(drawn))
+    known, points = drawn[is_known], grid.origin + grid.voxel * cells[is_known]
     field = MeshDistance(mesh)
     in_reach = field.lower_bound(points) < REACH
     known, points = known[in_reach], points[in_reach]
@@ -67,14 +67,14 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
         )
     return MeshComparison(
         accuracy=field_accuracy(
-            {name: values.reshape(-1)[known[is_near]] for name, values in distances.items()},
+            {name: values.at(known[is_near]) for name, values in distances.items()},
             distance[is_near],
             None,
             median_radius=median_radius(grid),
         ),
         is_closed=mesh.is_closed,
         num_faces=len(mesh.faces),
-        num_in_reach=len(cells),
+        num_in_reach=num_in_reach,
         num_drawn=len(drawn),
         num_unknown=int(np.count_nonzero(~is_known)),
         num_inside=int(np.count_nonzero(is_inside)),
@@ -82,13 +82,16 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
     )
 
 
-def _cells_in_reach(grid: DistanceGrid, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Flat indices of the cells whose centres lie in a box."""
-    shape = grid.channels["sdf"].shape
-    spans = []
-    for axis in range(3):
-        first = int(np.ceil((lower[axis] - grid.origin[axis]) / grid.voxel))
-        last = int(np.floor((upper[axis] - grid.origin[axis]) / grid.voxel))
-        spans.append(np.arange(max(first, 0), min(last, shape[axis] - 1) + 1, dtype=np.int64))
-    i, j, k = np.ix_(*spans)
-    return np.asarray(((i * shape[1] + j) * shape[2] + k).reshape(-1))
+def _drawn_cells(
+    grid: DistanceGrid, lower: Float64, upper: Float64, max_cells: int, seed: int
+) -> tuple[NDArray[np.int64], int]:
+    """Some of the cells (C, 3) whose centres lie in a box, in order, and how many there are in all."""
+    shape = np.array(grid.channels["sdf"].shape)
+    first = np.maximum(np.ceil((lower - grid.origin) / grid.voxel).astype(np.int64), 0)
+    last = np.minimum(np.floor((upper - grid.origin) / grid.voxel).astype(np.int64), shape - 1)
+    counts = np.maximum(last - first + 1, 0)
+    num_cells = int(np.prod(counts))
+    if num_cells == 0:
+        return np.empty((0, 3), dtype=np.int64), 0
+    chosen = np.sort(np.random.default_rng(seed).choice(num_cells, min(num_cells, max_cells), replace=False))
+    return first + np.stack(np.unravel_index(chosen, counts), axis=1), num_cells

@@ -60,12 +60,12 @@ def test_hard_comes_back_from_the_bound_of_a_grid() -> None:
     bound = np.full((2, 2, 2), 0.083, np.float32)
     header: dict[str, object] = {"bound_margin": 0.0175, "health": {"radius": 0.01}}
     grid = DistanceGrid(origin=np.zeros(3), voxel=0.02, channels={"sdf": sdf, "bound": bound}, header=header)
-    np.testing.assert_allclose(grid_distances(grid)["hard"], 0.1005, atol=1e-7)
+    np.testing.assert_allclose(grid_distances(grid)["hard"].at(np.array([0, 5])), [0.1005, 0.1005], atol=1e-7)
     assert median_radius(grid) == 0.01
     with_hard = DistanceGrid(
         origin=np.zeros(3), voxel=0.02, channels={"sdf": sdf, "hard": bound, "se": sdf}, header={}
     )
-    np.testing.assert_array_equal(grid_distances(with_hard)["hard"], bound)
+    np.testing.assert_array_equal(grid_distances(with_hard)["hard"].at(np.arange(8)), bound.ravel())
     assert list(grid_distances(with_hard)) == ["sdf", "hard", "se"]
     for header in ({}, {"bound_margin": "wide"}):
         bare = DistanceGrid(origin=np.zeros(3), voxel=0.02, channels={"sdf": sdf, "bound": bound}, header=header)
