@@ -117,8 +117,9 @@ class FieldConfig:
     noise: float = 1e-6  # epsilon of eq. 8
     truncation: float = 5e-5  # [m] by how much leaving out or merging small terms may change a kernel distance
     unknown: str = "free"  # never-seen space: free, obstacle or nan
-    probability: str = "calibrated"  # of collision: Phi(-sdf / error); or paper: eq. 13 and 14, a score
-    error: float = 0.003  # [m] sigma of that; what `safe` measured near solids, splats 1 to 2 cm apart
+    probability: str = "calibrated"  # of collision, Phi((error_mean - sdf) / error); or paper: eq. 13 and 14, a score
+    error_mean: float = 0.0015  # [m] what the calibrated form takes off sdf, measured near solids as error was
+    error: float = 0.002  # [m] sigma of the calibrated form: splats 1 to 2 cm apart, 2 mm of noise
     voxel: float = 0.02  # [m], IV-B
     padding: float = 0.20  # [m] around the splats where no workspace is given
 

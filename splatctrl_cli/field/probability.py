@@ -34,15 +34,18 @@ class CollisionProbability(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratedProbability:
-    """``Phi(-clearance / sigma)``, sigma [m] the error that was measured of the field that gives the clearance."""
+    """``Phi((mean - clearance) / sigma)``, mean and sigma [m] the error that was measured of the field that gives the
+    clearance: what it reads too much on average, and the standard deviation.
+    """
 
     sigma: float
+    mean: float = 0.0
 
     def of(self, clearance: Float64) -> Float64:
         """Probability of clearances of any shape [m]."""
         from scipy.special import ndtr
 
-        return np.asarray(ndtr(-clearance / self.sigma))
+        return np.asarray(ndtr((self.mean - clearance) / self.sigma))
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
         """As `CollisionProbability.baked`."""
@@ -50,7 +53,7 @@ class CalibratedProbability:
 
     def described(self) -> dict[str, object]:
         """As `CollisionProbability.described`."""
-        return {"meaning": "Phi(-sdf / sigma)", "sigma": self.sigma}
+        return {"meaning": "Phi((mean - sdf) / sigma)", "sigma": self.sigma, "mean": self.mean}
 
 
 class PaperProbability:
@@ -130,7 +133,9 @@ def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
 
 _Make = Callable[[Spheres, FieldConfig, int], CollisionProbability]
 PROBABILITIES: Mapping[str, _Make] = {
-    "calibrated": lambda spheres, config, threads: CalibratedProbability(sigma=checked_error(config.error)),
+    "calibrated": lambda spheres, config, threads: CalibratedProbability(
+        sigma=checked_error(config.error), mean=config.error_mean
+    ),
     "paper": lambda spheres, config, threads: PaperProbability(spheres, config, threads=threads),
 }
 
