@@ -20,8 +20,9 @@ class MeshComparison:
     """The accuracy, and how many cells went into it.
 
     num_in_reach of the grid's cells lie in the box of the mesh widened by 20 cm; num_drawn of those were drawn,
-    num_unknown of those have no distance (NaN, by the policy for unknown space), num_inside lie inside the mesh near its
-    surface, and num_near are outside of it and within 20 cm: those are compared. is_closed: the mesh has an inside.
+    num_unknown of those have no distance (NaN, by the policy for unknown space), num_inside lie inside the mesh near
+    its surface, and num_near are outside of it and within 20 cm: those are compared. is_closed: the mesh has an
+    inside.
     """
 
     accuracy: FieldAccuracy
