@@ -9,6 +9,7 @@ from splatctrl_cli.field.kernel import Matern12, SquaredExponential
 from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.field.voxel_density import voxel_row_sums
 from splatctrl_cli.field.weights import weights_named
+from splatctrl_cli.geometry import rotation_from_quat
 from tests.field.scenes import cloud, queries
 from tests.reference import field as reference
 
@@ -134,3 +135,22 @@ def test_coinciding_splats_share_their_weight() -> None:
         field = GpdfField(centers, radii, LENGTH, weights=weights, noise=1e-3)
         distance = field.query(np.array([[0.1, 0.0, 0.0]]))[0][0]
         assert distance == pytest.approx(0.09, abs=5e-3 if weights == "voxel" else 1e-4), weights
+
+
+@pytest.mark.parametrize("weights", ["voxel", "cg"])
+@pytest.mark.parametrize("kind", [GpdfField, SeField])
+def test_weights_follow_the_splats_and_their_scale_and_not_their_order(
+    kind: type[GpdfField] | type[SeField], weights: str
+) -> None:
+    centers, radii = cloud(400)
+    points = queries(100)
+    distance = kind(centers, radii, LENGTH, noise=1e-2, weights=weights).query(points)[0]
+    order = np.random.default_rng(3).permutation(400)
+    shuffled = kind(centers[order], radii[order], LENGTH, noise=1e-2, weights=weights)
+    np.testing.assert_allclose(shuffled.query(points)[0], distance, atol=2e-5)
+    scaled = kind(8 * centers, 8 * radii, 8 * LENGTH, noise=1e-2, weights=weights, truncation=8 * 2e-5)
+    np.testing.assert_allclose(scaled.query(8 * points)[0], 8 * distance, atol=4e-5)
+    rotation, shift = rotation_from_quat([0.1, -0.5, 0.3, 0.8]), np.array([0.7, -1.1, 0.4])
+    moved = kind(centers @ rotation.T + shift, radii, LENGTH, noise=1e-2, weights=weights)
+    turned = moved.query(points @ rotation.T + shift)[0]
+    np.testing.assert_allclose(turned, distance, atol=1e-3 if weights == "voxel" else 5e-5)  # a grid has axes
