@@ -45,11 +45,11 @@ class ClusteredPoints:
         result[self.source[is_point]] = values[is_point]
         return result
 
-    def offsets(self, values: NDArray[np.floating]) -> Offsets:
+    def offsets(self, values: NDArray[np.floating], *, spare: float = SPARE_OFFSET) -> Offsets:
         """The offset of each of the N points (N,), laid out, with the largest of each cluster and group."""
-        laid_out = self.laid_out(values, spare=SPARE_OFFSET).astype(np.float32)
+        laid_out = self.laid_out(values, spare=spare).astype(np.float32)
         by_cluster = laid_out.reshape(-1, LANES).max(axis=1)
-        by_group = np.full(_padded(len(by_cluster) // LANES, _GROUPS), SPARE_OFFSET, np.float32)
+        by_group = np.full(_padded(len(by_cluster) // LANES, _GROUPS), spare, np.float32)
         by_group[: len(by_cluster) // LANES] = by_cluster.reshape(-1, LANES).max(axis=1)
         return Offsets(values=laid_out, maxima=np.concatenate([by_cluster, by_group]))
 

@@ -183,7 +183,7 @@ class SeField:
         log_size = self.weights.log_size
         self._common = self.unit * float(log_size.max())
         self._offsets = spheres.points.offsets(self.unit * log_size - self._common)
-        self.radii = spheres.points.laid_out(spheres.radii, spare=0.0).astype(np.float32)
+        self.radii = spheres.points.offsets(spheres.radii, spare=0.0)
         self.sign = laid_out_sign(spheres, self.weights.sign)
         self._threads = threads
 
@@ -191,6 +191,22 @@ class SeField:
         """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3), not normalised; NaN where L >= 0."""
         points_ = self.spheres.points
         score, gradient = native.gaussian(
+            points_.clusters,
+            self._offsets,
+            self.radii.values,
+            self.sign,
+            self._common,
+            self.kernel.length,
+            self.tolerance,
+            points_.relative(checked_points(points)),
+            threads=self._threads,
+        )
+        return score.astype(np.float64), gradient.astype(np.float64)
+
+    def query_safe(self, points: Float64) -> tuple[Float64, Float64]:
+        """The smaller of this and the exact distance, in one walk: as `SafeField` of both."""
+        points_ = self.spheres.points
+        score, gradient = native.safe(
             points_.clusters,
             self._offsets,
             self.radii,
@@ -210,7 +226,7 @@ class SeField:
             points.clusters,
             points.offsets(self.unit * log_size),
             points.laid_out(log_size, spare=native.SPARE_OFFSET),
-            self.radii,
+            self.radii.values,
             self.sign,
             self.kernel.length,
             self.tolerance,
@@ -234,9 +250,13 @@ class SafeField:
 
     def __init__(self, exact: DistanceField, kernel: KernelField) -> None:
         self._exact, self._kernel = exact, kernel
+        are_of_one = isinstance(exact, SphereField) and exact.spheres is kernel.spheres
+        self._both = kernel if isinstance(kernel, SeField) and are_of_one else None
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> the least distance (Q,) [m] and its gradient (Q, 3); the exact one wins a tie."""
+        if self._both is not None:
+            return self._both.query_safe(points)
         distance, gradient = self._exact.query(points)
         smooth, smooth_gradient = self._kernel.query_raw(points)
         is_less = smooth < distance  # False for NaN

@@ -28,5 +28,7 @@ def num_threads(requested: int = 0) -> int:
     A processor is one that this process may use. The cap keeps thousands of threads from taking minutes to start;
     results are the same for any number.
     """
+    if 0 < requested <= MIN_CAP:
+        return requested
     processors = len(os.sched_getaffinity(0))
     return min(requested, max(MIN_CAP, processors)) if requested > 0 else processors

@@ -159,6 +159,39 @@ def gaussian(
     return score, gradient
 
 
+def safe(
+    spheres: Clusters,
+    offsets: Offsets,
+    radii: Offsets,
+    sign: Float32 | None,
+    common: float,
+    length: float,
+    tolerance: float,
+    points: Float32,
+    *,
+    threads: int = 0,
+) -> tuple[Float32, Float32]:
+    """The smaller of `gaussian` and `nearest` (Q,) and its gradient (Q, 3); `nearest` where they are equal or NaN."""
+    score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
+    native.field_safe(
+        spheres.centers,
+        spheres.boxes,
+        offsets.values,
+        offsets.maxima,
+        radii.values,
+        radii.maxima,
+        sign,
+        common,
+        length,
+        tolerance,
+        points,
+        num_threads(threads),
+        score,
+        gradient,
+    )
+    return score, gradient
+
+
 def row_sums(spheres: Clusters, has_sphere: UInt8, length: float, *, is_matern: bool, threads: int = 0) -> Float64:
     """``sum_j k(p_i, p_j)`` (16 C,) over the spheres where `has_sphere` (16 C,) is set, j = i included; 0 elsewhere.
 

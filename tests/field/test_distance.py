@@ -193,6 +193,23 @@ def test_safe_field_never_exceeds_the_exact_distance() -> None:
     np.testing.assert_array_equal(gradient[~is_exact], GpdfField(centers, radii).query(points)[1][~is_exact])
 
 
+@pytest.mark.parametrize("weights", ["rowsum", "cg"])
+@pytest.mark.parametrize("largest", [0.012, 0.3])
+def test_safe_in_one_walk_is_the_smaller_of_two_queries(largest: float, weights: str) -> None:
+    centers, radii = cloud(700)
+    radii[::40] = largest  # where one sphere is far larger, the walk of the kernel does not find the nearest
+    config = FieldConfig(weights=weights)
+    points = np.concatenate([queries(500), queries(200, extent=3.0)])
+    for num in (700, 100):
+        exact = SphereField(centers[:num], radii[:num]).query(points)
+        smooth = SeField(centers[:num], radii[:num], weights=weights).query_raw(points)
+        is_smooth = smooth[0] < exact[0]
+        assert largest > 0.1 or (is_smooth.any() and not is_smooth.all())
+        distance, gradient = make_field(centers[:num], radii[:num], config).query(points)
+        np.testing.assert_array_equal(distance, np.where(is_smooth, smooth[0], exact[0]))
+        np.testing.assert_array_equal(gradient, np.where(is_smooth[:, None], smooth[1], exact[1]))
+
+
 def test_duplicates_do_not_change_the_kernel_field() -> None:
     centers, radii = cloud(200)
     once = GpdfField(centers, radii, LENGTH, noise=0.0)

@@ -98,6 +98,17 @@ void gaussian(const Rows3& centers, const Rows6& boxes, const Floats& values, co
   query_gaussian(spheres, offsets, radii.data(), data_or_null(sign), common, length, tolerance, query);
 }
 
+void safe(const Rows3& centers, const Rows6& boxes, const Floats& values, const Floats& maxima, const Floats& radii,
+          const Floats& radius_maxima, const Maybe<Floats>& sign, double common, float length, float tolerance,
+          const Points& points, int threads, const Values& score, const Vectors& gradient) {
+  const Clusters spheres = view_clusters(centers, boxes);
+  const Offsets offsets = view_offsets(spheres, values, maxima), radius_offsets = view_offsets(spheres, radii, radius_maxima);
+  if (sign) expect_per_sphere(spheres, *sign, "sign: expected (16 C)");
+  const Query query = view_query(points, threads, score, gradient);
+  const nb::gil_scoped_release release;
+  query_safe(spheres, offsets, radius_offsets, data_or_null(sign), common, length, tolerance, query);
+}
+
 void density(const Rows3& centers, const Rows6& boxes, const Bytes& has_sphere, bool is_matern, float length, int threads,
              const Values64& sum) {
   const Clusters spheres = view_clusters(centers, boxes);
@@ -225,6 +236,10 @@ void bind_field(nb::module_& m) {
         nb::arg("points").noconvert(), nb::arg("threads"), nb::arg("score").noconvert(), nb::arg("gradient").noconvert());
   m.def("field_gaussian", &gaussian, nb::arg("centers").noconvert(), nb::arg("boxes").noconvert(),
         nb::arg("offsets").noconvert(), nb::arg("maxima").noconvert(), nb::arg("radii").noconvert(),
+        nb::arg("sign").noconvert().none(), nb::arg("common"), nb::arg("length"), nb::arg("tolerance"),
+        nb::arg("points").noconvert(), nb::arg("threads"), nb::arg("score").noconvert(), nb::arg("gradient").noconvert());
+  m.def("field_safe", &safe, nb::arg("centers").noconvert(), nb::arg("boxes").noconvert(), nb::arg("offsets").noconvert(),
+        nb::arg("maxima").noconvert(), nb::arg("radii").noconvert(), nb::arg("radius_maxima").noconvert(),
         nb::arg("sign").noconvert().none(), nb::arg("common"), nb::arg("length"), nb::arg("tolerance"),
         nb::arg("points").noconvert(), nb::arg("threads"), nb::arg("score").noconvert(), nb::arg("gradient").noconvert());
   m.def("field_density", &density, nb::arg("centers").noconvert(), nb::arg("boxes").noconvert(),

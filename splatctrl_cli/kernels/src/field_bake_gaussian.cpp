@@ -49,7 +49,7 @@ struct Exponents {
 };
 
 struct Work {
-  std::vector<float> bounds;
+  Candidates found;
   TermList block;
   Exponents sub_block;
 };
@@ -78,7 +78,7 @@ struct Baker {
 
   void block(const int* lowest, Work& work) const {
     const Point c = middle(grid, lowest, kBlock);
-    const Nearest nearest = find_nearest<SquaredScore>(spheres, offsets, c, work.bounds);
+    const Nearest nearest = find_nearest<SquaredScore>(spheres, offsets, c, work.found);
     const double reference = terms.log_weight[nearest.entry];
     collect(c, nearest, reference, work.block);
     for_each_sub_block(grid, lowest, [&](const int* corner) {

@@ -27,7 +27,7 @@ struct SphereList {
 };
 
 struct Work {
-  std::vector<float> bounds;
+  Candidates found;
   SphereList block, sub_block;
   std::vector<float> scores;
 };
@@ -51,12 +51,12 @@ struct Reference {
   }
 };
 
-void collect(const Clusters& s, const Offsets& o, const Reference& ref, const std::vector<float>& bounds, SphereList& list) {
+void collect(const Clusters& s, const Offsets& o, const Reference& ref, const Candidates& found, SphereList& list) {
   list.size = 0;
   const float limit = ref.score + 2.0f * ref.radius + ref.slack;
   const int groups = s.num_clusters / kLanes;
   for (int g = 0; g < groups; ++g) {
-    if (!(bounds[g] <= limit)) continue;
+    if (!(found.group_bounds[g] <= limit)) continue;
     for (int cluster = kLanes * g; cluster < kLanes * (g + 1); cluster += 8) {
       const Float8 near = box_distances(s, cluster, ref.middle);
       unsigned kept = signs8(ref.may_be_beaten(near - load8(o.maximum + cluster), near, farthest_corners(s, cluster, ref.place)));
@@ -141,9 +141,9 @@ void bake_sub_block(const SphereList& list, const GridSpan& grid, const int* low
   }
 }
 
-Reference reference_at(const Clusters& s, const Offsets& o, const GridSpan& grid, const int* block, std::vector<float>& bounds) {
+Reference reference_at(const Clusters& s, const Offsets& o, const GridSpan& grid, const int* block, Candidates& found) {
   const Point c = middle(grid, block, kBlock);
-  const Nearest nearest = find_nearest<LinearScore>(s, o, c, bounds);
+  const Nearest nearest = find_nearest<LinearScore>(s, o, c, found);
   const Point place{s.x[nearest.entry], s.y[nearest.entry], s.z[nearest.entry]};
   const float radius = grid.radius(kBlock);
   return {place, c, nearest.score, distance(place, c), radius, rounding_slack(c, std::fabs(nearest.score) + radius)};
@@ -153,8 +153,8 @@ Reference reference_at(const Clusters& s, const Offsets& o, const GridSpan& grid
 
 void bake_hard(const Clusters& spheres, const Offsets& radii, const GridSpan& grid, float* hard, float* gradient, int* entry) {
   for_each_block<Work>(grid, [&](const int* block, Work& work) {
-    const Reference ref = reference_at(spheres, radii, grid, block, work.bounds);
-    collect(spheres, radii, ref, work.bounds, work.block);
+    const Reference ref = reference_at(spheres, radii, grid, block, work.found);
+    collect(spheres, radii, ref, work.found, work.block);
     for_each_sub_block(grid, block, [&](const int* lowest) {
       const Point inside = middle_from(grid, lowest, kSubBlock, ref.middle);
       narrow(work.block, inside, grid.radius(kSubBlock), ref.slack, work.scores, work.sub_block);

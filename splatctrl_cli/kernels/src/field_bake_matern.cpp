@@ -27,7 +27,8 @@ struct Terms {
 };
 
 struct Work {
-  std::vector<float> bounds, scores[2], weights;
+  Candidates found;
+  std::vector<float> scores[2], weights;
   Terms block, members, near;
 };
 
@@ -80,7 +81,7 @@ struct Baker {
 
   void block(const int* lowest, Work& work) const {
     const Point c = middle(grid, lowest, kBlock);
-    const Nearest nearest = find_nearest<LinearScore>(spheres, offsets, c, work.bounds);
+    const Nearest nearest = find_nearest<LinearScore>(spheres, offsets, c, work.found);
     const double common = offset[nearest.entry];
     const float gap = collect(c, nearest, work.block) - grid.radius(kBlock);
     if (is_smooth(gap, kBlock)) {

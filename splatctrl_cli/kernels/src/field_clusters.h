@@ -80,69 +80,103 @@ struct Nearest {
   int entry;
 };
 
+// Clusters whose bound at a point may count, and work space for finding them.
+struct Candidates {
+  std::vector<float> group_bounds, bound;
+  std::vector<int> cluster;
+  int size = 0;
+
+  void reserve(const Clusters& s) {
+    if (static_cast<int>(group_bounds.size()) >= s.num_groups && static_cast<int>(bound.size()) >= s.num_clusters) return;
+    group_bounds.resize(s.num_groups), bound.resize(s.num_clusters), cluster.resize(s.num_clusters);
+  }
+};
+
 // Lower bounds of the scores at q in each group; returns the group with the least.
 template <typename Score>
-int bound_groups(const Clusters& s, const Offsets& o, Point q, std::vector<float>& bounds) {
-  bounds.resize(s.num_groups);
-  for (int g = 0; g < s.num_groups; g += 8)
-    store8(&bounds[g], Score::of(squared_box_distances(s, s.num_clusters + g, q), load8(o.maximum + s.num_clusters + g)));
-  int least = 0;
-  for (int g = 1; g < s.num_groups; ++g) least = bounds[g] < bounds[least] ? g : least;
-  return least;
-}
-
-// Lower bounds (16) of the scores at q in the clusters of a group.
-template <typename Score>
-void bound_clusters(const Clusters& s, const Offsets& o, int group, Point q, float* bounds) {
-  for (int k = 0; k < kLanes; k += 8) {
-    const int cluster = kLanes * group + k;
-    store8(bounds + k, Score::of(squared_box_distances(s, cluster, q), load8(o.maximum + cluster)));
+int bound_groups(const Clusters& s, const Offsets& o, Point q, float* bounds) {
+  Float8 lowest = splat8(kFar);
+  for (int g = 0; g < s.num_groups; g += 8) {
+    const Float8 bound = Score::of(squared_box_distances(s, s.num_clusters + g, q), load8(o.maximum + s.num_clusters + g));
+    store8(bounds + g, bound);
+    lowest = min8(lowest, bound);
   }
+  const float least = min_of8(lowest);
+  int g = 0;
+  while (bounds[g] != least) ++g;
+  return g;
 }
 
-// Calls visit(cluster) where a cluster's bound does not exceed limit(), which may fall on the way. `bounds` as filled
-// by bound_groups at q.
-template <typename Score, typename Limit, typename Visit>
-void walk_clusters(const Clusters& s, const Offsets& o, Point q, const std::vector<float>& bounds, const Limit& limit,
-                   const Visit& visit) {
-  float cluster_bounds[kLanes];
-  const int groups = (s.num_clusters + kLanes - 1) / kLanes;
-  for (int g = 0; g < groups; ++g) {
-    if (!(bounds[g] <= limit())) continue;
-    bound_clusters<Score>(s, o, g, q, cluster_bounds);
-    for (int k = 0; k < kLanes; ++k)
-      if (cluster_bounds[k] <= limit()) visit(kLanes * g + k);
-  }
-}
-
-// Fills `bounds` on the way.
+// Lower bounds of the scores at q in half of the clusters of a group.
 template <typename Score>
-Nearest find_nearest(const Clusters& s, const Offsets& o, Point q, std::vector<float>& bounds) {
-  Nearest nearest{kFar, 0};
-  float slack = 0.0f;
-  const auto visit = [&](int cluster) {
-    Float8 score[2];
-    for (int h = 0; h < 2; ++h) {
-      const int entry = kLanes * cluster + 8 * h;
-      score[h] = Score::of(squared_center_distances(s, entry, q), load8(o.value + entry));
+Float8 bound_clusters(const Clusters& s, const Offsets& o, int cluster, Point q) {
+  return Score::of(squared_box_distances(s, cluster, q), load8(o.maximum + cluster));
+}
+
+// The least scores so far, by lane, and the first entries that have them.
+struct LeastScores {
+  Float8 score = splat8(kFar);
+  Int8 entry = {};
+
+  void take(Float8 other, int first_entry) {
+    const Int8 place = Int8{0, 1, 2, 3, 4, 5, 6, 7} + first_entry;
+    const Int8 is_less = (other < score) | ((other == score) & (place < entry));
+    entry = is_less ? place : entry;
+    score = min8(other, score);
+  }
+  float least() const { return min_of8(score); }
+  Nearest nearest() const {
+    Nearest best{score[0], entry[0]};
+    for (int k = 1; k < 8; ++k)
+      if (score[k] < best.score || (score[k] == best.score && entry[k] < best.entry)) best = {score[k], entry[k]};
+    return best;
+  }
+};
+
+template <typename Score>
+void visit_cluster(const Clusters& s, const Offsets& o, int cluster, Point q, LeastScores& least) {
+  for (int entry = kLanes * cluster; entry < kLanes * (cluster + 1); entry += 8)
+    least.take(Score::of(squared_center_distances(s, entry, q), load8(o.value + entry)), entry);
+}
+
+// The nearest, and the clusters whose bounds are within `spread` of its score (some beyond, too); spread(lowest), of a
+// lower bound of the score.
+template <typename Score, typename Spread>
+Nearest find_nearest(const Clusters& s, const Offsets& o, Point q, Candidates& found, const Spread& spread) {
+  found.reserve(s);
+  found.size = 0;
+  LeastScores scores;
+  const int first = bound_groups<Score>(s, o, q, found.group_bounds.data());
+  int best = kLanes * first;
+  float least = kFar;
+  for (int cluster = kLanes * first; cluster < kLanes * (first + 1); cluster += 8) {
+    const Float8 bound = bound_clusters<Score>(s, o, cluster, q);
+    for (int k = 0; k < 8; ++k)
+      if (bound[k] < least) least = bound[k], best = cluster + k;
+  }
+  visit_cluster<Score>(s, o, best, q, scores);
+  float nearest = scores.least();
+  const float slack = rounding_slack(q, nearest), room = slack + spread(found.group_bounds[first]);
+  for (int g = 0; g < s.num_clusters / kLanes; ++g) {
+    if (!(found.group_bounds[g] <= nearest + room)) continue;
+    for (int cluster = kLanes * g; cluster < kLanes * (g + 1); cluster += 8) {
+      const Float8 bound = bound_clusters<Score>(s, o, cluster, q);
+      for (unsigned kept = signs8(bound <= nearest + room); kept != 0; kept &= kept - 1) {
+        const int k = __builtin_ctz(kept);
+        found.cluster[found.size] = cluster + k, found.bound[found.size] = bound[k];
+        ++found.size;
+        if (!(bound[k] <= nearest + slack)) continue;
+        visit_cluster<Score>(s, o, cluster + k, q, scores);
+        nearest = scores.least();
+      }
     }
-    if (!any8((score[0] <= nearest.score) | (score[1] <= nearest.score))) return;
-    for (int k = 0; k < kLanes; ++k) {
-      const Nearest other{score[k / 8][k % 8], kLanes * cluster + k};
-      if (other.score < nearest.score || (other.score == nearest.score && other.entry < nearest.entry)) nearest = other;
-    }
-  };
-  const int group = bound_groups<Score>(s, o, q, bounds);
-  float cluster_bounds[kLanes];
-  bound_clusters<Score>(s, o, group, q, cluster_bounds);
-  int first = 0;
-  for (int k = 1; k < kLanes; ++k) first = cluster_bounds[k] < cluster_bounds[first] ? k : first;
-  visit(kLanes * group + first);
-  slack = rounding_slack(q, nearest.score);
-  walk_clusters<Score>(s, o, q, bounds, [&] { return nearest.score + slack; }, [&](int c) {
-    if (c != kLanes * group + first) visit(c);
-  });
-  return nearest;
+  }
+  return scores.nearest();
+}
+
+template <typename Score>
+Nearest find_nearest(const Clusters& s, const Offsets& o, Point q, Candidates& found) {
+  return find_nearest<Score>(s, o, q, found, [](float) { return 0.0f; });
 }
 
 }  // namespace splatctrl

@@ -27,6 +27,11 @@ void query_matern(const Clusters& spheres, const Offsets& offsets, const float* 
 void query_gaussian(const Clusters& spheres, const Offsets& offsets, const float* radii, const float* sign, double common,
                     float length, float tolerance, const Query& query);
 
+// The least of query_gaussian and query_nearest, and its gradient; the exact one where they are equal or the other has
+// no value. radii: those of query_gaussian too.
+void query_safe(const Clusters& spheres, const Offsets& offsets, const Offsets& radii, const float* sign, double common,
+                float length, float tolerance, const Query& query);
+
 // By how much the logarithm of the Gaussian sum may fall short where the distance is `distance`, so that the distance
 // grows by no more than `tolerance`: (d + t)^2 - d^2 = 2 l^2 log_share. At most a thousandth, for the gradient's sake.
 inline float gaussian_log_share(float distance, float tolerance, float length) {

@@ -9,7 +9,7 @@ namespace {
 constexpr float kBlockExponent = 30.0f;  // as bake_gaussian
 
 struct Work {
-  std::vector<float> bounds;
+  Candidates found;
 };
 
 template <typename Score>
@@ -37,7 +37,7 @@ void mark(const Clusters& s, const Offsets& o, const unsigned char* changed, flo
   const float radius = grid.radius(kBlock);
   for_each_block<Work>(grid, [&](const int* block, Work& work) {
     const Point c = middle(grid, block, kBlock);
-    const Nearest nearest = find_nearest<Score>(s, o, c, work.bounds);
+    const Nearest nearest = find_nearest<Score>(s, o, c, work.found);
     const Point p0{s.x[nearest.entry], s.y[nearest.entry], s.z[nearest.entry]};
     const float dx = p0.x - c.x, dy = p0.y - c.y, dz = p0.z - c.z, d0 = std::sqrt(dx * dx + dy * dy + dz * dz);
     const float slack = rounding_slack(c, std::fabs(nearest.score) + radius);

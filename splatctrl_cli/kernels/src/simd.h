@@ -69,6 +69,13 @@ inline bool any8(Int8 mask) {
 // Sum of the lanes, in one fixed order.
 inline float sum8(Float8 v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); }
 
+// The least of the lanes.
+inline float min_of8(Float8 v) {
+  const Float8 four = min8(v, __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3));
+  const Float8 two = min8(four, __builtin_shufflevector(four, four, 2, 3, 0, 1, 6, 7, 4, 5));
+  return two[0] < two[1] ? two[0] : two[1];
+}
+
 // Lane k is the sum of the lanes of in[k], in one fixed order: a third of the work of eight sum8.
 inline Float8 sums8(const Float8 in[8]) {
   Float8 pairs[4], fours[2];  // lanes 0 + 2 and 1 + 3 of two vectors; then of four, lower and upper half apart
