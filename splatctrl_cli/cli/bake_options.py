@@ -86,6 +86,11 @@ def _add_truth(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reference-mesh", type=Path, metavar="FILE", help="measure the field against this mesh (world, metres)"
     )
+    parser.add_argument(
+        "--held-out",
+        metavar="LOG[:CAMERA,...]",
+        help="measure the field against depth of cameras that did not train (default: all; --urdf: but the robot)",
+    )
     parser.add_argument("--no-report", action="store_true", help="draw no pictures")
 
 
@@ -125,7 +130,7 @@ def channels_of(args: argparse.Namespace, default: Sequence[str], unknown: str) 
     names = default if args.channels is None else ("sdf", *names_of(args.channels, CHANNELS, "--channels"))
     names = names if args.probability is None else (*names, "probability")
     chosen = tuple(name for name in CHANNELS if name in names)
-    for option in ("truth", "reference_mesh"):
+    for option in ("truth", "reference_mesh", "held_out"):
         if getattr(args, option) is not None and not EXACT & set(chosen):
             raise UsageError(
                 f"--{option.replace('_', '-')}: compares with the exact distance, too",

@@ -9,6 +9,7 @@ from splatctrl_cli.cli.common import table
 
 if TYPE_CHECKING:
     from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy
+    from splatctrl_cli.evaluate.reliability import Reliability
     from splatctrl_cli.field.incremental import Changes
     from splatctrl_cli.field.report import GridStatistics
     from splatctrl_cli.records import DistanceGrid
@@ -22,13 +23,16 @@ FAR = 1.0  # [m] a grid whose every cell is farther from the splats than this is
 
 @dataclass(frozen=True, kw_only=True)
 class FieldReport:
-    """A baked grid with its statistics, what it was compared with (plain values by name), and the warnings."""
+    """A baked grid with its statistics and the warnings; accuracy: plain values, by what it was compared with;
+    reliability: of its probability, by the truth.
+    """
 
     grid: "DistanceGrid"
     statistics: "GridStatistics"
     warnings: tuple[str, ...]
     changes: "Changes | None" = None
     accuracy: Mapping[str, Any] | None = None
+    reliability: "Reliability | None" = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as written to ``field.json``: the grid's header and place first."""
@@ -135,6 +139,11 @@ def write_pictures(folder: Path, report: FieldReport, point: Sequence[float]) ->
         gradient_picture(pictures / "gradient.png", grid, lengths.histogram, lengths.bin_width, point)
     if "probability" in grid.channels:
         probability_picture(pictures / "probability.png", grid, point)
+    if report.reliability is not None:
+        from splatctrl_cli.evaluate.reliability import reliability_picture
+
+        name = str(grid.header.get("probability"))
+        reliability_picture(pictures / "reliability.png", {name: report.reliability}, "Probability against the truth")
 
 
 def _update(changes: "Changes") -> dict[str, Any]:

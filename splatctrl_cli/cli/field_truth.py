@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.cli.bake_source import BakeSource
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy
+from splatctrl_cli.evaluate.reliability import Reliability, reliability
 from splatctrl_cli.evaluate.visibility import seen_by
 from splatctrl_cli.field.grid import exact_channel
 from splatctrl_cli.io.source import open_source
@@ -19,6 +21,7 @@ from splatctrl_cli.simulate.truth import Truth, load_truth
 
 FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
 MAX_CELLS = 200_000  # a larger grid is compared at this many cells, drawn with the seed
+_CURVES = ("edges", "predicted", "observed")
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
@@ -26,21 +29,25 @@ POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 class Comparison:
     """The accuracy, and how many cells went into it.
 
-    num_drawn of the grid's cells, num_near of them outside the objects and within 20 cm, num_seen of those with a
-    nearest true surface point that a training camera saw inside the workspace; num_outside_workspace more were seen,
-    but their surface lies where the scene keeps no splats.
+    num_drawn of the grid's cells, num_blank of them without a distance (field.unknown = nan), num_near of the others
+    outside the objects and within 20 cm, num_seen of those with a nearest true surface point that a training camera
+    saw inside the workspace; num_outside_workspace more were seen, but their surface lies where the scene keeps no
+    splats. reliability: of the channel probability at seen cells within 20 cm of a surface, inside or out.
     """
 
     accuracy: FieldAccuracy
     num_drawn: int
+    num_blank: int
     num_near: int
     num_seen: int
     num_outside_workspace: int
+    reliability: Reliability | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as written to ``accuracy.json``."""
-        counts = {name: value for name, value in vars(self).items() if name != "accuracy"}
-        return {**counts, **self.accuracy.as_dict()}
+        """Plain values, as written to ``field.json``."""
+        counts = {name: value for name, value in vars(self).items() if name.startswith("num_")}
+        curve = {} if self.reliability is None else {"reliability": _curve(self.reliability)}
+        return {**counts, **self.accuracy.as_dict(), **curve}
 
 
 def compare_with_truth(
@@ -55,23 +62,52 @@ def compare_with_truth(
     shape = grid.channels["sdf"].shape
     num_cells = int(np.prod(shape))
     drawn = np.sort(np.random.default_rng(seed).choice(num_cells, min(num_cells, MAX_CELLS), replace=False))
+    cells = _cells(grid, drawn)
     points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
     distance, surface = _closest(truth, points, stamp_ns)
-    is_near = (distance >= BANDS[0][0]) & (distance < BANDS[-1][1])
+    is_blank = ~np.isfinite(cells["sdf"])
+    is_around = (np.abs(distance) < BANDS[-1][1]) & ~is_blank
+    is_near = (distance >= BANDS[0][0]) & is_around
     if not is_near.any():
         raise NotEvaluableError(f"{truth_path}: no cell of the grid lies within {BANDS[-1][1]} m outside an object")
-    seen = _seen(surface[is_near], log, source.cameras, stamp_ns)
-    in_workspace = np.ones_like(seen) if source.workspace is None else source.workspace.contains(surface[is_near])
-    channels = {"hard": exact_channel(grid), "sdf": grid.channels["sdf"]}
-    fields = {name: channels[name].reshape(-1)[drawn[is_near]].astype(np.float64) for name in FIELDS}
+    seen, in_workspace = np.zeros_like(is_near), np.ones_like(is_near)
+    seen[is_around] = _seen(surface[is_around], log, source.cameras, stamp_ns)
+    if source.workspace is not None:
+        in_workspace[is_around] = source.workspace.contains(surface[is_around])
     health: Any = grid.header["health"]
+    is_counted = seen & in_workspace
     return Comparison(
-        accuracy=field_accuracy(fields, distance[is_near], seen & in_workspace, median_radius=health["radius"]),
+        accuracy=field_accuracy(
+            {name: cells[name][is_near] for name in FIELDS},
+            distance[is_near],
+            is_counted[is_near],
+            median_radius=health["radius"],
+        ),
         num_drawn=len(drawn),
-        num_near=int(is_near.sum()),
-        num_seen=int((seen & in_workspace).sum()),
-        num_outside_workspace=int((seen & ~in_workspace).sum()),
+        num_blank=int(np.count_nonzero(is_blank)),
+        num_near=int(np.count_nonzero(is_near)),
+        num_seen=int(np.count_nonzero(is_counted & is_near)),
+        num_outside_workspace=int(np.count_nonzero(seen & ~in_workspace & is_near)),
+        reliability=reliability(cells["probability"][is_counted], distance[is_counted] <= 0)
+        if "probability" in cells and is_counted.any()
+        else None,
     )
+
+
+def _cells(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
+    """What the grid holds at drawn cells, whole channels of which may not fit the memory: hard, sdf, probability."""
+    names = [name for name in ("sdf", "hard", "bound", "probability") if name in grid.channels]
+    channels: dict[str, NDArray[np.generic]] = {
+        name: grid.channels[name].reshape(-1)[drawn].astype(np.float32) for name in names
+    }
+    exact = exact_channel(DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header))
+    return {name: values.astype(np.float64) for name, values in channels.items()} | {"hard": exact.astype(np.float64)}
+
+
+def _curve(found: Reliability) -> dict[str, object]:
+    """Plain values; None where a bin is empty."""
+    values = {name: [None if np.isnan(v) else float(v) for v in getattr(found, name)] for name in _CURVES}
+    return {**values, "count": found.count, "calibration_error": found.calibration_error}
 
 
 def _closest(truth: Truth, points: Float64, stamp_ns: int) -> tuple[Float64, Float64]:
@@ -120,9 +156,14 @@ def accuracy_lines(compared: Comparison) -> list[str]:
         )
     if compared.num_outside_workspace:
         verdict += f"; {compared.num_outside_workspace} cells before seen surfaces outside the workspace do not count"
+    curve = compared.reliability
+    expected = (
+        [] if curve is None else [f"probability: calibration error {curve.calibration_error:.3f} at seen cells"]
+    )
     return [
         "error = field - truth, positive where clearance is over-estimated",
         *table(header, rows),
         "seen: cells whose nearest true surface a camera saw; all: also those before backs that none saw",
         verdict,
+        *expected,
     ]

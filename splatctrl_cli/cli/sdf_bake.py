@@ -16,7 +16,7 @@ from splatctrl_cli.cli.bake_options import (
     with_options,
 )
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, check_gate_names, check_gates, configured
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.bake_report import FieldReport
@@ -103,6 +103,17 @@ def _check_options(args: argparse.Namespace) -> None:
         raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
 
 
+def _check_references(args: argparse.Namespace, source: "BakeSource") -> None:
+    """Raise for what cannot be compared with, before a bake that may take long."""
+    for path in (args.truth, args.seen_by, args.reference_mesh):
+        if path is not None and not path.exists():
+            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if args.held_out is not None:
+        from splatctrl_cli.cli.field_held_out import held_out_cameras
+
+        held_out_cameras(args.held_out, source.cameras)
+
+
 def _tell_of_partial(args: argparse.Namespace, checkpoint: Path, console: Console) -> None:
     partial = checkpoint.parent.parent
     if args.resume and not checkpoint.is_file():
@@ -133,6 +144,7 @@ def _read(
     channels = channels_of(
         args, DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels), config.field.unknown
     )
+    _check_references(args, source)
     check_formats(formats, channels, unknown=config.field.unknown)
     has_box = previous is None or args.box is not None or args.urdf is not None
     box = box_of(args, source.splats, labels, config.field.padding) if has_box or previous is None else previous.box
@@ -181,8 +193,8 @@ def _bake(
     report = FieldReport(grid=grid, statistics=statistics, warnings=warnings, changes=changes)
     lines = summary_lines(report.summary())
     with stopwatch.stage("accuracy"):
-        accuracy, compared_lines = _compared(grid, job, args)
-    report, lines = replace(report, accuracy=accuracy), lines + compared_lines
+        report, compared_lines = _compared(report, job, args)
+        lines += compared_lines
     with stopwatch.stage("report"):
         write_json(partial / "field.json", report.as_dict())
         if not args.no_report:
@@ -235,7 +247,8 @@ def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | N
         return task, None, None
     settings |= {f"sha256 of {name}": value for name, value in job.previous.digests.items()}
     before = field_splats(job.previous.source.splats, job.labels)
-    old = Baker(before, job.baker.layout, job.config.field, channels=job.baker.channels, threads=args.threads)
+    needed = [name for name in ("sdf", "se", "gpdf") if name in job.baker.channels]
+    old = Baker(before, job.baker.layout, job.config.field, channels=needed, threads=args.threads)
     changes = changed_blocks(before, old, job.chosen, job.baker)
     kept = None
     if changes.mask is not None:
@@ -257,17 +270,18 @@ def _unknown(job: _Job) -> "UnknownSpace | None":
     return UnknownSpace(job.baker.layout, job.config.field, job.source.occupancy, job.config.occupancy)
 
 
-def _compared(grid: "DistanceGrid", job: _Job, args: argparse.Namespace) -> tuple[dict[str, Any] | None, list[str]]:
-    """What the field was compared with, as plain values by name, and the tables of it."""
+def _compared(report: "FieldReport", job: _Job, args: argparse.Namespace) -> tuple["FieldReport", list[str]]:
+    """The report with the accuracy against all that options name, and the tables of it."""
     from splatctrl_cli.cli.bake_report import reference_lines
 
+    grid, curve = report.grid, None
     found: dict[str, Any] = {}
     lines: list[str] = []
     if args.truth is not None:
         from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
 
         compared = compare_with_truth(grid, job.source, args.truth, args.seen_by, seed=args.seed)
-        found["truth"] = compared.as_dict()
+        found["truth"], curve = compared.as_dict(), compared.reliability
         lines += ["", *accuracy_lines(compared)]
     if args.reference_mesh is not None:
         from splatctrl_cli.evaluate.reference_mesh import compare_with_mesh
@@ -275,16 +289,23 @@ def _compared(grid: "DistanceGrid", job: _Job, args: argparse.Namespace) -> tupl
         mesh = compare_with_mesh(grid, args.reference_mesh, seed=args.seed)
         found["reference_mesh"] = {"file": args.reference_mesh.name, **mesh.as_dict()}
         lines += ["", *reference_lines(mesh.accuracy, "mesh")]
-    return found or None, lines
+    if args.held_out is not None:
+        from splatctrl_cli.cli.field_held_out import compare_with_held_out, held_out_lines
+
+        held_out = compare_with_held_out(grid, job.source, args)
+        found["held_out_depth"] = held_out.as_dict()
+        lines += ["", *held_out_lines(held_out)]
+    return replace(report, accuracy=found or None, reliability=curve), lines
 
 
 def _middle(job: _Job) -> list[float]:
-    """Where slices are shown: the median of the splats in the grid, or the grid's middle [m]."""
+    """Where slices are shown: in the middle of the splats in the grid but for the outermost, or of the grid [m]."""
     import numpy as np
 
     box = job.baker.layout.box
     inside = job.chosen.centers[box.contains(job.chosen.centers)]
-    middle = np.median(inside, axis=0) if len(inside) else 0.5 * (box.lower + box.upper)
+    lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)
+    middle = 0.5 * (lower + upper)
     return [float(value) for value in middle]
 
 

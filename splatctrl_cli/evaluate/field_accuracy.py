@@ -59,7 +59,7 @@ class FieldAccuracy:
     over_estimate: OverEstimate
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values, as written to ``accuracy.json``."""
+        """Plain values, as written to ``field.json``."""
         return {**asdict(self), "holds": self.over_estimate.holds}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.evaluate.pictures import (
+    CONTOURS,
     INK,
     WIDTH,
     draw_distance,
@@ -59,11 +60,14 @@ def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> No
     """
     with _panels(grid, point) as (figure, panels):
         for axes, cut in panels:
-            image = draw_distance(axes, cut.coordinates, _floats(cut, grid, "sdf"), cut.voxel)
+            distance = _floats(cut, grid, "sdf")
+            image = draw_distance(axes, cut.coordinates, distance, cut.voxel, names_lines=False)
             _veil(axes, cut, grid)
         figure.colorbar(image, ax=[axes for axes, _ in panels], extend="both", label="distance [cm]", pad=0.01)
         never = "; hatched: never seen" if _knows_seen(grid) else ""
-        figure.suptitle(f"Distance, {grid.header.get('sdf', 'positive outside')}; world frame{never}", fontsize=12)
+        lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
+        field = grid.header.get("sdf", "positive outside")
+        figure.suptitle(f"Distance in world: {field}; lines at {lines} cm{never}", fontsize=12)
         save_figure(figure, path)
 
 
@@ -82,7 +86,7 @@ def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) 
             )
             _surface(axes, cut, grid, "white")
         figure.colorbar(image, ax=[axes for axes, _ in panels], label="probability of collision", pad=0.01)
-        figure.suptitle(f"Probability of collision ({grid.header.get('probability', 'score')}); white: sdf = 0")
+        figure.suptitle(f"Probability of collision, {grid.header.get('probability', '')}; white line: sdf = 0")
         save_figure(figure, path)
 
 

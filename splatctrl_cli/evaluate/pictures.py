@@ -214,7 +214,9 @@ def _draw_comparison(figure: "Figure", axes: Sequence[Any], row: ComparisonRow) 
         panel.spines[:].set_visible(False)
 
 
-def draw_distance(axes: Any, coordinates: Sequence[Float64], distance: Float64, voxel: float) -> Any:
+def draw_distance(
+    axes: Any, coordinates: Sequence[Float64], distance: Float64, voxel: float, *, names_lines: bool = True
+) -> Any:
     """Draw a distance as colour, [cm], and its contour lines; returns the image, for a colour bar."""
     finite = distance[np.isfinite(distance)]
     limit = 100.0 * MAX_DISTANCE
@@ -237,7 +239,8 @@ def draw_distance(axes: Any, coordinates: Sequence[Float64], distance: Float64, 
             linewidths=[2.0 if level == 0 else 1.0 for level in with_lines],
             linestyles="solid",
         )
-        axes.clabel(lines, fmt=lambda level: f"{100 * level:g} cm", fontsize=9)
+        if names_lines:
+            axes.clabel(lines, fmt=lambda level: f"{100 * level:g} cm", fontsize=9)
     return image
 
 

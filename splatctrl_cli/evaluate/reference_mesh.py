@@ -35,7 +35,7 @@ class MeshComparison:
     num_near: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as written to ``accuracy.json``."""
+        """Plain values, as written to ``field.json``."""
         counts = {name: value for name, value in vars(self).items() if name != "accuracy"}
         return {**counts, **self.accuracy.as_dict()}
 

@@ -1,6 +1,7 @@
 """A distance field over the planes of a grid, a few at a time: what every way of baking is made of."""
 
 from collections.abc import Collection, Mapping
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "har
 _TEMPORARY_BYTES = 64 << 20  # of the arrays beside the channels
 
 Planes = dict[str, NDArray[np.generic]]
+T = TypeVar("T", bound=np.generic)
 
 
 class Baker:
@@ -112,32 +114,45 @@ class Baker:
             last=last,
             mask=mask,
         )
-        where = np.ones(span.shape_of_channel, np.bool_) if mask is None else _cells(mask, span)
-        hard, gradient, entry = self._hard(span)
+        where = None if mask is None else _cells(mask, span)
+        if where is not None and not where.any():
+            return
+        made = self._made(span, where)
+        for name in self.channels:
+            out[name][... if where is None else where] = made[name]
+
+    def _made(self, span: GridSpan, where: Bool | None) -> dict[str, NDArray[np.generic]]:
+        """The channels of the span's cells, those `where` alone (then in one row)."""
+        cells = None if where is None else np.flatnonzero(where)
+
+        def picked(values: NDArray[T]) -> NDArray[T]:
+            return values if cells is None else values.reshape(-1, *values.shape[3:])[cells]
+
+        exact, exact_gradient, entry = self._hard(span)
+        hard, gradient = picked(exact), None if exact_gradient is None else picked(exact_gradient)
         kernels: dict[str, tuple[Float32, Float32 | None]] = {}
         for name in self.num_without_value:
-            kernels[name] = self._kernel(name, span)
-        for name, (distance, _) in kernels.items():
-            self.num_without_value[name] += int(np.count_nonzero(np.isnan(distance) & where))
-        sdf, slope = self._chosen(hard, gradient, kernels)
+            distance, slope = self._kernel(name, span)
+            kernels[name] = (picked(distance), None if slope is None else picked(slope))
+            self.num_without_value[name] += int(np.count_nonzero(np.isnan(kernels[name][0])))
+        sdf, gradient = self._chosen(hard, gradient, kernels)
         made: dict[str, NDArray[np.generic]] = {"sdf": sdf, "hard": hard}
-        if slope is not None:
-            made["gradient"] = slope
+        if gradient is not None:
+            made["gradient"] = gradient
         if "bound" in self.channels:
             made["bound"] = (hard.astype(np.float64) - self.bound_margin).astype(np.float32)
         if self.probability is not None:
-            made["probability"] = self.probability.baked(span, sdf, threads=self.threads)
+            whole = np.zeros_like(exact)
+            whole[... if where is None else where] = sdf
+            made["probability"] = picked(self.probability.baked(span, whole, threads=self.threads))
         if entry is not None:
-            made["label"] = self.labels[self.spheres.points.source[entry]]
+            made["label"] = self.labels[self.spheres.points.source[picked(entry)]]
         if "observed" in self.channels:
-            made["observed"] = observed_planes(self._occupancy, self.layout, self._thresholds, first, last)
+            observed = observed_planes(self._occupancy, self.layout, self._thresholds, span.first, span.last)
+            made["observed"] = picked(observed)
         for name, (distance, _) in kernels.items():
             made[name] = np.where(np.isnan(distance), hard, distance)
-        for name in self.channels:
-            if mask is None:
-                out[name][...] = made[name]
-            else:
-                np.copyto(out[name], made[name], where=where if made[name].ndim == 3 else where[..., None])
+        return made
 
     def _hard(self, span: GridSpan) -> tuple[Float32, Float32 | None, NDArray[np.int32] | None]:
         hard = np.zeros(span.shape_of_channel, np.float32)
