@@ -102,13 +102,17 @@ def process_gpdf(points: Array, centers: Array, radii: Array, length: float, noi
 
 
 def process_se(points: Array, centers: Array, radii: Array, length: float, noise: float) -> Array:
-    """The full Gaussian process with the Gaussian kernel and y = 1, less the mean radius; NaN without a value."""
+    """The full Gaussian process with the Gaussian kernel and y = 1, less the mean radius; NaN without a value.
+
+    A mean that is larger than every radius tells of terms that all but cancel: no value either.
+    """
     squared = distances(points, centers) ** 2
     kernel = np.exp(-(distances(centers, centers) ** 2) / (2 * length**2))
     terms = process_weights(kernel, np.ones(len(radii)), noise) * np.exp(-squared / (2 * length**2))
     occupancy = terms.sum(axis=1)
     log = np.log(np.where((occupancy > 0) & (occupancy < 1), occupancy, np.nan))
-    return np.sqrt(-2 * length**2 * log) - (terms @ radii) / occupancy
+    mean = (terms @ radii) / occupancy
+    return np.where(np.abs(mean) <= radii.max(), np.sqrt(-2 * length**2 * log) - mean, np.nan)
 
 
 def explained(points: Array, centers: Array, length: float, noise: float) -> Array:

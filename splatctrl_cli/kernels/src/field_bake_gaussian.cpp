@@ -73,6 +73,7 @@ struct Baker {
   float length, tolerance;
   const GridSpan& grid;
   float *distance, *gradient;
+  float largest_radius;  // where terms have signs, a mean radius beyond it has no distance
 
   float unit() const { return 2.0f * length * length; }
 
@@ -228,9 +229,10 @@ struct Baker {
       const Float8 dx = splat8(slab.x - r.x), dy = slab.y[h] - r.y, dz = slab.z[h] - r.z;
       const Float8 squared = dx * dx + dy * dy + dz * dz - constant - unit() * (sums.shift[h] + log8(sums.weight[h]));
       const Float8 root = sqrt8(squared);
-      const Int8 has_value = (root > 0.0f) & (sums.weight[h] > 0.0f);  // false for NaN too
+      const Float8 mean_radius = r.radius + sums.base[h] + radius, limit = splat8(1.001f * largest_radius);
+      const Int8 has_value = (root > 0.0f) & (sums.weight[h] > 0.0f) & (max8(mean_radius, -mean_radius) <= limit);  // not NaN
       const Float8 none = splat8(NAN);
-      store8(values + 8 * h, has_value ? root - (r.radius + sums.base[h] + radius) : none);
+      store8(values + 8 * h, has_value ? root - mean_radius : none);
       if (gradient == nullptr) continue;
       const Float8 to_cell[3] = {dx, dy, dz};
       for (int a = 0; a < 3; ++a) {  // mean of x - p, and of (r - mean r)(x - p)
@@ -249,7 +251,8 @@ struct Baker {
 
 void bake_gaussian(const Clusters& spheres, const Offsets& offsets, const GaussianTerms& terms, float length,
                    float tolerance, const GridSpan& grid, float* distance, float* gradient) {
-  const Baker baker{spheres, offsets, terms, length, tolerance, grid, distance, gradient};
+  const float largest = terms.sign == nullptr ? kFar : largest_of(terms.radius, kLanes * spheres.num_clusters);
+  const Baker baker{spheres, offsets, terms, length, tolerance, grid, distance, gradient, largest};
   for_each_block<Work>(grid, [&](const int* block, Work& work) { baker.block(block, work); });
 }
 

@@ -99,6 +99,8 @@ void query_matern(const Clusters& spheres, const Offsets& offsets, const float* 
 
 namespace {
 
+constexpr float kSpareOffset = -1e29f;  // spare entries have less
+
 // The field of query_gaussian.
 struct GaussianField {
   const Clusters& spheres;
@@ -107,6 +109,7 @@ struct GaussianField {
   double common;
   float length, tolerance;
   float log_count = std::log(static_cast<float>(kLanes * spheres.num_clusters));
+  float largest_radius = sign == nullptr ? kFar : largest_of(radii, kLanes * spheres.num_clusters);
 
   float unit() const { return 2.0f * length * length; }
 
@@ -136,13 +139,15 @@ struct GaussianField {
     const double log_sum = static_cast<double>(unit()) * std::log(static_cast<double>(total[0]));
     const float inverse = 1.0f / total[0], radius = total[1] * inverse;
     const float root = std::sqrt(static_cast<float>(nearest.score - common - log_sum));
-    if (!(root > 0.0f)) return {NAN, NAN, NAN, NAN};  // NaN too
+    const float mean_radius = radii[nearest.entry] + radius;
+    // Of terms with signs, a mean beyond all radii tells that the sum has all but cancelled.
+    if (!(root > 0.0f) || !(std::fabs(mean_radius) <= 1.001f * largest_radius)) return {NAN, NAN, NAN, NAN};  // NaN too
     float gradient[3];
     for (int a = 0; a < 3; ++a) {
       const float mean = total[2 + a] * inverse;
       gradient[a] = mean / root + (total[5 + a] * inverse - radius * mean) * 2.0f / unit();
     }
-    return {root - (radii[nearest.entry] + radius), gradient[0], gradient[1], gradient[2]};
+    return {root - mean_radius, gradient[0], gradient[1], gradient[2]};
   }
 
   // Radii count from that of the largest term: where it stands alone nothing is left to cancel.
@@ -161,15 +166,6 @@ struct GaussianField {
   }
 };
 
-// The largest and the least of values that are not those of spare entries.
-void range(const float* values, int count, float& least, float& largest) {
-  least = kFar, largest = -kFar;
-  for (int i = 0; i < count; ++i) {
-    if (values[i] <= -1e29f) continue;
-    least = values[i] < least ? values[i] : least;
-    largest = values[i] > largest ? values[i] : largest;
-  }
-}
 
 }  // namespace
 
@@ -186,9 +182,10 @@ void query_gaussian(const Clusters& spheres, const Offsets& offsets, const float
 void query_safe(const Clusters& spheres, const Offsets& offsets, const Offsets& radii, const float* sign, double common,
                 float length, float tolerance, const Query& query) {
   const GaussianField field{spheres, offsets, radii.value, sign, common, length, tolerance};
-  float least_offset, largest_radius, ignored;
-  range(offsets.maximum, spheres.num_clusters, least_offset, ignored);
-  range(radii.maximum, spheres.num_clusters, ignored, largest_radius);
+  const float largest_radius = largest_of(radii.maximum, spheres.num_clusters);
+  float least_offset = kFar;  // of a cluster, spare ones aside
+  for (int c = 0; c < spheres.num_clusters; ++c)
+    if (offsets.maximum[c] > kSpareOffset) least_offset = std::min(least_offset, offsets.maximum[c]);
   for_each_point(query, [&](int i, Point q, Candidates& found) {
     float limit;
     const Nearest largest = field.find(q, found, limit);

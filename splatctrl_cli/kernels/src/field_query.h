@@ -23,7 +23,7 @@ void query_matern(const Clusters& spheres, const Offsets& offsets, const float* 
 
 // With L = log sum_i c_i exp(-q_i(x) / (2 l^2)), b_i = 2 l^2 log w_i less `common`: sqrt(-2 l^2 L - common) less the mean
 // of the radii (16 C) under the terms. Without signs the terms left out raise it by at most `tolerance`. NaN where the
-// root has no positive argument.
+// root has no positive argument, and, with signs, where the mean is beyond all radii.
 void query_gaussian(const Clusters& spheres, const Offsets& offsets, const float* radii, const float* sign, double common,
                     float length, float tolerance, const Query& query);
 
@@ -31,6 +31,12 @@ void query_gaussian(const Clusters& spheres, const Offsets& offsets, const float
 // no value. radii: those of query_gaussian too.
 void query_safe(const Clusters& spheres, const Offsets& offsets, const Offsets& radii, const float* sign, double common,
                 float length, float tolerance, const Query& query);
+
+inline float largest_of(const float* values, int count) {
+  float largest = 0.0f;
+  for (int i = 0; i < count; ++i) largest = values[i] > largest ? values[i] : largest;
+  return largest;
+}
 
 // By how much the logarithm of the Gaussian sum may fall short where the distance is `distance`, so that the distance
 // grows by no more than `tolerance`: (d + t)^2 - d^2 = 2 l^2 log_share. At most a thousandth, for the gradient's sake.
