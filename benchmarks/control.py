@@ -1,12 +1,13 @@
 """One step of the controller, and the audit of logged states."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import cycle
 
 import numpy as np
 
-from benchmarks.measure import Options, Result, medians
+from benchmarks.measure import Limit, Options, Result, medians
 from benchmarks.scenes import sample_fitter, sample_robot, sample_states
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import audit
@@ -18,6 +19,7 @@ from splatctrl_cli.field.selection import field_splats
 from splatctrl_cli.records import Box, DistanceField, Float64
 
 NUM_STEPS = 200
+SOLVERS = ("clarabel", "daqp")
 
 
 def run(options: Options) -> Result:
@@ -29,7 +31,7 @@ def run(options: Options) -> Result:
     workspace = Box(lower=model.base_position - reach, upper=model.base_position + reach)
     grid = GridField(bake(splats, workspace, config.field))
     fields: dict[str, DistanceField] = {"grid": grid, "analytic": analytic}
-    steps: dict[str, Callable[[], object]] = {name: _step(field) for name, field in fields.items()}
+    steps = {f"{name}_{solver}": _step(field, solver) for name, field in fields.items() for solver in SOLVERS}
     points = np.ascontiguousarray(model.sphere_centers(sample_states()[0].position))
     queries = {f"{name}_query": partial(field.query, points) for name, field in fields.items()}
     times = medians(steps | queries, options.rounds(NUM_STEPS))
@@ -38,28 +40,33 @@ def run(options: Options) -> Result:
     num_states = len(sample_states())
     return Result(
         title=f"control: an arm of {len(model.joint_names)} joints and {len(points)} spheres",
-        columns=("field", "QP-IK step [ms]", "steps/s", "of it one field query [ms]", "audit [states/s]"),
+        columns=("field", "solver", "QP-IK step [ms]", "steps/s", "of it one field query [ms]", "audit [states/s]"),
         rows=[
-            [title, f"{1e3 * times[name]:.2f}", f"{1 / times[name]:.0f}", f"{1e3 * times[f'{name}_query']:.2f}",
-             f"{num_states / audits[name]:.0f}"]
-            for name, title in names.items()
+            [title, solver, f"{1e3 * times[f'{name}_{solver}']:.2f}", f"{1 / times[f'{name}_{solver}']:.0f}",
+             f"{1e3 * times[f'{name}_query']:.2f}", f"{num_states / audits[name]:.0f}"]
+            for name, title in names.items() for solver in SOLVERS
         ],
         figures={
-            **{f"{name}_step_ms": 1e3 * times[name] for name in names},
+            **{f"{key}_steps_per_s": 1 / times[key] for key in steps},
             **{f"{name}_query_ms": 1e3 * times[f"{name}_query"] for name in names},
             **{f"{name}_audit_states_per_s": num_states / audits[name] for name in names},
         },
-        ratios={"grid_step_over_analytic": times["analytic"] / times["grid"]},
-        notes=["a step: kinematics, one query for the rows, clarabel, one query or more that checks the promise"],
+        ratios={f"{name}_daqp_over_clarabel": times[f"{name}_clarabel"] / times[f"{name}_daqp"] for name in names},
+        limits=[
+            Limit(figure="grid_daqp_steps_per_s", bound=1000.0, is_least=True),
+            Limit(figure="grid_clarabel_steps_per_s", bound=400.0, is_least=True),
+            Limit(figure="analytic_clarabel_steps_per_s", bound=300.0, is_least=True),
+        ],
+        notes=["a step: kinematics, one query for the rows, the QP, one query or more that checks the promise"],
     )  # fmt: skip
 
 
-def _step(field: DistanceField) -> Callable[[], object]:
+def _step(field: DistanceField, solver: str) -> Callable[[], object]:
     """The next logged state's step, each time it is called."""
     model, states = sample_robot(), sample_states()
     frame = model.frame_names[-1]
     goal = model.frame_pose(states[-1].position, frame)
-    controller = QpIkController(model, Config().control, field, frame=frame)
+    controller = QpIkController(model, replace(Config().control, solver=solver), field, frame=frame)
     chosen = cycle(states[:: max(len(states) // NUM_STEPS, 1)])
     return lambda: controller.step(next(chosen).position, goal)
 

@@ -12,7 +12,7 @@ from splatctrl_cli.control.barriers import Barrier
 from splatctrl_cli.control.checks import check_config, check_model, checked_posture
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import velocity_box
-from splatctrl_cli.control.qp import ClarabelSolver, QpSolver
+from splatctrl_cli.control.qp import QpSolver, solver_named
 from splatctrl_cli.control.target import pose_error, reference_velocity
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64
@@ -109,7 +109,7 @@ class QpIkController:
         check_config(config)
         check_model(model)
         self._model, self._config, self._field, self._frame = model, config, field, frame
-        self._solver: QpSolver = ClarabelSolver() if solver is None else solver
+        self._solver: QpSolver = solver_named(config.solver) if solver is None else solver
         self._home = np.asarray(model.middle if home is None else home, dtype=np.float64)
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)

@@ -5,8 +5,9 @@ import pytest
 
 from splatctrl_cli.control.barriers import Barrier, can_bind
 from splatctrl_cli.control.problem import assemble
-from splatctrl_cli.control.qp import ClarabelSolver, QuadraticProgram, residuals
+from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QuadraticProgram, residuals, solver_named
 from splatctrl_cli.control.tasks import Cost, eliminated_weight, posture_task, velocity_task
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64
 from tests.reference.control import literal_program
 
@@ -101,3 +102,39 @@ def test_the_same_program_gives_the_same_bits() -> None:
     program = assemble(costs, np.full(7, -0.1), np.full(7, 0.1), [])
     first, second = (ClarabelSolver().solve(program) for _ in range(2))
     assert first.z.tobytes() == second.z.tobytes()
+
+
+def test_two_solvers_agree_on_random_steps() -> None:
+    rng = np.random.default_rng(0)
+    tight, exact = ClarabelSolver(tolerance=1e-12), DaqpSolver()
+    num_active, num_compared = 0, 0
+    for _ in range(300):
+        *_, costs = seven_joint_costs(rng)
+        num_rows = int(rng.integers(0, 40))
+        rows = barrier(0.4 * rng.normal(size=(num_rows, 7)), rng.uniform(-0.2, 0.6, num_rows))
+        program = assemble(costs, np.full(7, -1.0), np.full(7, 1.0), [rows])
+        ours, theirs = exact.solve(program), tight.solve(program)
+        assert ours.is_solved
+        assert ours.residuals.worst < 1e-12
+        num_active += int(np.count_nonzero(ours.multipliers > 1e-6))
+        if not theirs.is_solved:  # its last digit is out of reach here and there: AlmostSolved
+            continue
+        num_compared += 1
+        value = [0.5 * z @ program.H @ z + program.c @ z for z in (ours.z, theirs.z)]
+        assert abs(value[0] - value[1]) < 1e-8 * (1 + abs(value[1]))
+        np.testing.assert_allclose(ours.z[:7], theirs.z[:7], atol=3e-5)
+    assert num_active > 1000
+    assert num_compared > 200
+
+
+@pytest.mark.parametrize("name", ["clarabel", "daqp"])
+def test_a_program_without_a_point_is_not_solved(name: str) -> None:
+    nowhere = QuadraticProgram(H=np.eye(2), c=np.zeros(2), G=np.array([[1.0, 0], [-1, 0]]), h=np.array([-1.0, -1.0]))
+    solution = solver_named(name).solve(nowhere)
+    assert not solution.is_solved
+    assert "nfeasible" in solution.status
+
+
+def test_a_solver_that_is_not_there_is_named() -> None:
+    with pytest.raises(UsageError, match=r"control\.solver: expected one of clarabel, daqp, got osqp"):
+        solver_named("osqp")
