@@ -1,6 +1,5 @@
 """Which blocks of a grid an edit of the splats can have changed: the others keep what an earlier bake gave them."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,7 +10,7 @@ from splatctrl_cli.field.baker import Baker, Planes
 from splatctrl_cli.field.layout import GridLayout
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
-from splatctrl_cli.records import Bool, SplatSet, UInt8
+from splatctrl_cli.records import Float64, SplatSet, UInt8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,34 +118,39 @@ def _changed(
 ) -> tuple[UInt8, UInt8]:
     """The entries (16 C,) of each set that are not in the other, to the bit."""
     rows = [_rows(s, b, with_weights=with_weights) for s, b in zip(splats, bakers, strict=True)]
+    _, kinds = np.unique(np.concatenate(rows), return_inverse=True)
+    here, there = np.split(kinds, [len(rows[0])])
     laid_out = []
-    for here, there, baker in zip(rows, reversed(rows), bakers, strict=True):
-        others = set(there)
-        is_new: Bool = np.fromiter((row not in others for row in here), np.bool_, len(here))
+    for own, other, baker in ((here, there, bakers[0]), (there, here, bakers[1])):
         changed = np.zeros(len(baker.spheres.points.source), np.uint8)
-        changed[np.flatnonzero(baker.spheres.points.is_point)] = is_new
+        changed[np.flatnonzero(baker.spheres.points.is_point)] = ~np.isin(own, other)
         laid_out.append(changed)
     return laid_out[0], laid_out[1]
 
 
-def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> list[bytes]:
-    """Each splat, in the order of the clusters, as bytes: equal ones do the same to a field.
+def _rows(splats: SplatSet, baker: Baker, *, with_weights: bool) -> NDArray[np.void]:
+    """Each splat, in the order of the clusters, as bytes (N,): equal ones do the same to a field.
 
     Splats of one centre are told apart by their rank, as their order is that of the set and can decide the last bit.
     """
     order = baker.spheres.points.source[baker.spheres.points.is_point.view(np.bool_)]
-    centers = np.ascontiguousarray(splats.centers.astype(np.float64)[order] + 0.0)  # no -0, which is equal to 0
-    values: list[NDArray[np.float64]] = [splats.radii.astype(np.float64), splats.labels.astype(np.float64)]
+    centers = splats.centers.astype(np.float64)[order] + 0.0  # no -0, which is equal to 0
+    values: list[NDArray[np.floating | np.integer]] = [*centers.T, splats.radii[order], splats.labels[order]]
     if with_weights:
         assert baker.se is not None
-        values.append(baker.se.weights.log_size)
+        values.append(baker.se.weights.log_size[order])
         if baker.se.weights.sign is not None:
-            values.append(baker.se.weights.sign.astype(np.float64))
-    table = np.stack(values, axis=1)[order]
-    seen: Counter[bytes] = Counter()
-    rows = []
-    for center, row in zip(centers, table, strict=True):
-        place = center.tobytes()
-        rows.append(place + row.tobytes() + seen[place].to_bytes(4, "little"))
-        seen[place] += 1
-    return rows
+            values.append(baker.se.weights.sign[order])
+    table = np.stack([*values, _ranks(centers)], axis=1, dtype=np.float64)
+    return table.view(np.dtype((np.void, table.strides[0]))).ravel()
+
+
+def _ranks(centers: Float64) -> NDArray[np.int64]:
+    """How many of the rows before it each row (N, 3) is equal to."""
+    order = np.lexsort(centers.T)  # stable
+    is_first = np.ones(len(centers), np.bool_)
+    is_first[1:] = (np.diff(centers[order], axis=0) != 0).any(axis=1)
+    places = np.arange(len(centers))
+    ranks = np.empty_like(places)
+    ranks[order] = places - np.maximum.accumulate(np.where(is_first, places, 0))
+    return ranks
