@@ -89,7 +89,7 @@ def _add_truth(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--held-out",
         metavar="LOG[:CAMERA,...]",
-        help="measure the field against depth of cameras that did not train (default: all; --urdf: but the robot)",
+        help="measure the field against depth of cameras that did not train; --urdf tells which pixels are robot",
     )
     parser.add_argument("--no-report", action="store_true", help="draw no pictures")
 

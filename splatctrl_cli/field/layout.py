@@ -64,7 +64,7 @@ def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:
         size = " x ".join(str(n) for n in layout.shape)
         raise UsageError(
             f"grid of {size} cells: needs {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
-            remedy="give a larger --voxel or a smaller --box",
+            remedy="give a larger --voxel or a smaller --box; the command sdf-bake keeps a grid on disk",
         )
 
 

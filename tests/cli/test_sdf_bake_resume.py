@@ -9,12 +9,15 @@ from collections import namedtuple
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from splatctrl_cli.cli import bake_run
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.field import slabs
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field import layout, slabs
 from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.layout import GridLayout
 from splatctrl_cli.io.grid_slabs import GridSlabs
 from splatctrl_cli.io.splats import write_ply
 from tests.field.scenes import cloud, splat_set
@@ -112,7 +115,9 @@ def test_a_killed_process_goes_on_to_the_same_bytes(
     program = """
 import os, signal, sys
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.field import slabs
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field import layout, slabs
+from splatctrl_cli.field.layout import GridLayout
 from splatctrl_cli.io.grid_slabs import GridSlabs
 slabs.SLAB_BYTES, real, calls = 1, GridSlabs.write, []
 def write(self, slab):
@@ -194,6 +199,18 @@ def test_a_full_disk_is_told_before_anything_is_baked(
     (line,) = capsys.readouterr().err.splitlines()
     assert "of disk" in line and "0.0 GiB (3145728 bytes) is free at" in line and "fewer --channels" in line
     assert not list(tmp_path.iterdir())
+
+
+def test_openvdb_that_does_not_fit_the_memory_is_told_before_anything_is_baked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    grid = GridLayout(origin=np.zeros(3), voxel=0.1, shape=(100, 100, 100))
+    monkeypatch.setattr(layout, "available_memory", lambda: 27 * 10**6)
+    bake_run.check_vdb(grid, ["sdf"], ["npz"])
+    with pytest.raises(UsageError, match=r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats"):
+        bake_run.check_vdb(grid, ["sdf"], ["npz", "vdb"])
+    monkeypatch.setattr(layout, "available_memory", lambda: 28 * 10**6)
+    bake_run.check_vdb(grid, ["sdf"], ["npz", "vdb"])
 
 
 @pytest.mark.usefixtures("small_slabs")

@@ -13,7 +13,7 @@ from tests.field.scenes import cloud, splat_set
 BOX = Box(lower=np.array([-0.61, -0.57, -0.4]), upper=np.array([0.55, 0.6, 0.43]))
 CONFIG = FieldConfig(voxel=0.025, distance="safe")
 LAYOUT = GridLayout.over(BOX, CONFIG.voxel)
-CHANNELS = ("sdf", "gradient", "bound", "observed", "label", "hard", "se")
+CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label", "hard", "se")
 EDITS = ("add", "remove", "move", "radius", "label", "duplicate", "order")
 
 
@@ -114,6 +114,12 @@ def test_what_reaches_every_cell_bakes_everything_and_says_why() -> None:
     changes = changed_blocks(before, old, after, new)
     assert changes.num_baked == changes.num_blocks
     assert "gpdf" in changes.reason
+    for config, channels, words in (
+        (replace(CONFIG, probability="paper"), ("sdf", "probability"), "the paper's probability"),
+        (replace(CONFIG, unknown="obstacle"), ("sdf",), "field.unknown = obstacle"),
+    ):
+        old, new = (Baker(splats, LAYOUT, config, channels=channels) for splats in (before, after))
+        assert words in changed_blocks(before, old, after, new).reason
     moved = replace(before, centers=before.centers * np.float32(1.5))
     old, new = (Baker(splats, LAYOUT, CONFIG) for splats in (before, moved))
     assert "bound's margin" in changed_blocks(before, old, moved, new).reason
