@@ -213,6 +213,8 @@ def _baked(
 
     baker = job.baker
     task, changes, old = _task(job, args)
+    if changes is not None and changes.reason:
+        console.log(f"--update: every block is baked anew: {changes.reason}")
     store = bake_to_disk(task, partial, console, resume=args.resume)
     if task.kept is not None and old is not None and job.previous is not None:
         counts: Any = job.previous.grid.header["cells_without_value"]

@@ -116,11 +116,15 @@ def test_a_bare_file_needs_its_predecessor(fields: Path, tmp_path: Path, capsys:
     assert (tmp_path / "field" / "field.npz").read_bytes() == (tmp_path / "whole" / "field.npz").read_bytes()
 
 
-def test_a_field_that_every_splat_reaches_is_baked_anew_and_says_so(scene: Path, tmp_path: Path) -> None:
+def test_a_field_that_every_splat_reaches_is_baked_anew_and_says_so(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     given = ["--distance", "gpdf", "--voxel", "0.1"]
     assert bake(scene, tmp_path / "0", BOX, "--at", "0", *given) == 0
     assert bake(scene, tmp_path / "2", BOX, "--at", "2", *given) == 0
-    assert bake(scene, tmp_path / "field", "--at", "2", "--update", str(tmp_path / "0"), *given) == 0
+    words = ["--at", "2", "--update", str(tmp_path / "0"), *given, *OPTIONS[2:-1]]
+    assert main(["sdf-bake", str(scene), "-o", str(tmp_path / "field"), *words]) == 0
+    assert "every block is baked anew: every splat reaches every cell of gpdf" in capsys.readouterr().err
     assert (tmp_path / "field" / "field.npz").read_bytes() == (tmp_path / "2" / "field.npz").read_bytes()
     update = field_json(tmp_path / "field")["update"]
     assert update["blocks_baked"] == update["blocks"]
