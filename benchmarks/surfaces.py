@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import ROOT
-from splatctrl_cli.evaluate.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.evaluate.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh
 from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Box, Float64
 from splatctrl_cli.simulate.primitives import Primitive, closest_point, normals
 from splatctrl_cli.simulate.textures import Texture

@@ -8,7 +8,7 @@ RANK = {
     "cli": 3,
     **dict.fromkeys(["io", "scene", "field", "control", "simulate", "evaluate", "batch"], 2),
     "robot": 1,
-    **dict.fromkeys(["records", "geometry", "config", "errors", "kernels"], 0),
+    **dict.fromkeys(["records", "geometry", "config", "errors", "kernels", "mesh_distance"], 0),
 }
 HOMES = {
     "torch": {"scene"},

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy, grid_distances, median_radius
-from splatctrl_cli.evaluate.mesh_distance import MeshDistance, load_mesh
+from splatctrl_cli.mesh_distance import MeshDistance, load_mesh
 from splatctrl_cli.records import DistanceGrid, Float64
 
 REACH = BANDS[-1][1]  # [m] of true distance that is compared

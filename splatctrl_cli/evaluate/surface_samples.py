@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.mesh_distance import TriangleMesh
+from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Float64
 
 CANDIDATES = 24  # per square of one spacing: what is left between samples then has little room for another

@@ -7,7 +7,7 @@ import trimesh
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.reference_mesh import compare_with_mesh
 from splatctrl_cli.records import DistanceGrid, Float64
-from tests.evaluate.test_mesh_distance import box_distance
+from tests.test_mesh_distance import box_distance
 
 SIZE = (0.21, 0.21, 0.21)
 HEADER: dict[str, object] = {"bound_margin": 0.017, "health": {"radius": 0.004}}

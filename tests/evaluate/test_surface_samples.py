@@ -3,9 +3,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.mesh_distance import MeshDistance
 from splatctrl_cli.evaluate.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
-from tests.evaluate.test_mesh_distance import box_distance, box_mesh
+from splatctrl_cli.mesh_distance import MeshDistance
+from tests.test_mesh_distance import box_distance, box_mesh
 
 SIZE = (0.3, 0.2, 0.1)
 

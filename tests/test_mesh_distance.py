@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.mesh_distance import MeshDistance, TriangleMesh, barycentric_of_closest, load_mesh
+from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, barycentric_of_closest, load_mesh
 from splatctrl_cli.records import Float64
 
 CLOSED = (
