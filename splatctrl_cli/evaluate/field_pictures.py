@@ -180,7 +180,7 @@ def _floats(cut: Cut, grid: DistanceGrid, channel: str) -> Float64:
 def _label(axes: Any, cut: Cut) -> None:
     right, up = cut.names
     axes.set(xlabel=f"{right} [m]", ylabel=f"{up} [m]", aspect="equal")
-    axes.set_title(f"{'xyz'[cut.axis]} = {cut.plane:.2f} m", pad=8)
+    axes.set_title(f"{'xyz'[cut.axis]} = {round(cut.plane, 2) + 0.0:.2f} m", pad=8)
 
 
 def _veil(axes: Any, cut: Cut, grid: DistanceGrid) -> None:

@@ -9,6 +9,7 @@ import pytest
 from splatctrl_cli.cli import bake_options
 from splatctrl_cli.cli.bake_report import SUMMARY_METRICS
 from splatctrl_cli.cli.field_truth import FIELDS
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.field import baker, distance, probability, unknown, weights
 from splatctrl_cli.field.grid import exact_channel
@@ -108,12 +109,18 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
     ],
 )
 def test_bad_arguments_are_one_line_and_leave_nothing(
-    tmp_path: Path, splats: Path, arguments: list[str], code: int, message: str
+    tmp_path: Path,
+    splats: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    message: str,
 ) -> None:
-    result = sdf_bake(splats, "-o", tmp_path / "field", *arguments)
-    assert (result.returncode, result.stdout) == (code, "")
-    assert message in result.stderr
-    assert result.stderr.count("\n") == 1
+    assert main(["sdf-bake", str(splats), "-o", str(tmp_path / "field"), *arguments]) == code
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert message in said.err
+    assert said.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
