@@ -6,6 +6,7 @@ from functools import partial
 from itertools import cycle
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from benchmarks.measure import Limit, Options, Result, medians
 from benchmarks.scenes import sample_fitter, sample_robot, sample_states
@@ -16,16 +17,17 @@ from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.grid import GridField
 from splatctrl_cli.field.selection import field_splats
-from splatctrl_cli.records import Box, DistanceField, Float64
+from splatctrl_cli.records import Box, DistanceField, Float64, SplatSet
 
 NUM_STEPS = 200
+CLEAR = 0.04  # [m]
 SOLVERS = ("clarabel", "daqp")
 
 
 def run(options: Options) -> Result:
     """The sample log's arm and map: steps from its logged states towards the last one's pose, and their audit."""
     config, model = Config(), sample_robot()
-    splats = field_splats(sample_fitter().splats())
+    splats = _scene()
     analytic = make_field(splats.centers, splats.radii, config.field)
     reach = model.reach()
     workspace = Box(lower=model.base_position - reach, upper=model.base_position + reach)
@@ -59,6 +61,17 @@ def run(options: Options) -> Result:
         ],
         notes=["a step: kinematics, one query for the rows, the QP, one query or more that checks the promise"],
     )  # fmt: skip
+
+
+def _scene() -> SplatSet:
+    """The sample log's map without the arm: no splat within 4 cm of it at any logged state."""
+    model, splats = sample_robot(), field_splats(sample_fitter().splats())
+    centers = model.sphere_centers_batch(np.array([state.position for state in sample_states()]))
+    is_free = np.ones(len(splats), dtype=np.bool_)
+    for sphere, radius in enumerate(model.sphere_set.radii):
+        distance = cKDTree(centers[:, sphere]).query(splats.centers)[0]
+        is_free &= distance - radius - splats.radii > CLEAR
+    return splats.select(is_free)
 
 
 def _step(field: DistanceField, solver: str) -> Callable[[], object]:

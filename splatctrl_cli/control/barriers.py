@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Float64
 
 Index = NDArray[np.integer]
@@ -45,10 +46,7 @@ def pair_distance(centers: Float64, radii: Float64, pairs: Index) -> tuple[Float
 
     centers (S, 3), radii (S,) [m]; pairs (P, 2). The direction is zero where two centres coincide.
     """
-    offset = centers[pairs[:, 0]] - centers[pairs[:, 1]]
-    length = np.sqrt(np.einsum("pi,pi->p", offset, offset))
-    direction = offset / np.where(length > 0, length, 1.0)[:, None]
-    return length - radii[pairs[:, 0]] - radii[pairs[:, 1]], direction
+    return pair_gaps(centers, radii, np.asarray(pairs, dtype=np.int64))
 
 
 def pair_gradient(direction: Float64, jacobians: Float64, pairs: Index) -> Float64:
@@ -70,6 +68,12 @@ def fastest_approach(G: Float64, lowest: Float64, highest: Float64) -> Float64:
 def can_bind(G: Float64, h: Float64, lowest: Float64, highest: Float64) -> NDArray[np.bool_]:
     """Rows (M,) that some velocity of the box violates; the others hold for all of them and drop out exactly."""
     return np.asarray(fastest_approach(G, lowest, highest) > h)
+
+
+def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Float64:
+    """How fast each sphere (S,) can go over the box of joint velocities, at most [m/s]; jacobians (S, 3, J)."""
+    speed = np.abs(jacobians) @ np.maximum(np.abs(lowest), np.abs(highest))
+    return np.asarray(np.sqrt(np.einsum("si,si->s", speed, speed)))
 
 
 def is_immovable(G: Float64, velocity_limit: Float64) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import tasks
 from splatctrl_cli.control.barriers import Barrier
-from splatctrl_cli.control.problem import assemble
+from splatctrl_cli.control.problem import assemble, assemble_hard
 from splatctrl_cli.control.qp import QpSolution, QpSolver
 from splatctrl_cli.records import Float64
 
@@ -52,9 +52,23 @@ def descend(
 ) -> Choice:
     """Solved, or relaxed where a slack remains; else the least violation; else hold still.
 
-    Both programs have a feasible point by construction, so the lower rungs are for a solver that fails.
+    First without slacks, which is far smaller: where that is solved and no multiplier exceeds its row's slack cost, it
+    is the answer. The programs with slacks have a feasible point by construction, so the lower rungs are for a solver
+    that fails.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
+    firm = solver.solve(assemble_hard(costs, *box, barriers))
+    price = np.concatenate([np.full(len(barrier), barrier.slack_cost) for barrier in barriers] or [np.zeros(0)])
+    if is_usable(firm, config.max_residual) and bool(np.all(firm.multipliers[2 * J :] <= price)):
+        return Choice(
+            velocity=firm.z,
+            rung=Rung.SOLVED,
+            slack=np.zeros(M),
+            box_multipliers=firm.multipliers[: 2 * J],
+            row_multipliers=firm.multipliers[2 * J :],
+            solution=firm,
+            num_refused=0,
+        )
     least_violation = [tasks.posture_task(np.zeros(J), 1.0)]
     for num_refused, (rung, terms) in enumerate(((Rung.SOLVED, costs), (Rung.MINIMUM_VIOLATION, least_violation))):
         solution = solver.solve(assemble(terms, *box, barriers))

@@ -11,6 +11,31 @@ from splatctrl_cli.control.tasks import Cost
 from splatctrl_cli.records import Float64
 
 
+def assemble_hard(
+    costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
+) -> QuadraticProgram:
+    """The program over v alone, no row giving way; rows: upper and lower box (2 J), barriers (M). It may be infeasible.
+
+    Where it has a solution and no barrier's multiplier exceeds its slack cost, that is the solution of `assemble` too,
+    with all slacks zero: an L1 penalty above the multipliers is exact, and the slack signs take the rest of the cost.
+    """
+    J = len(lowest)
+    H, c = _objective(costs, J)
+    G, h = box_rows(lowest, highest)
+    rows = [barrier for barrier in barriers if len(barrier)]
+    return QuadraticProgram(
+        H=H, c=c, G=np.vstack([G, *(b.G for b in rows)]), h=np.concatenate([h, *(b.h for b in rows)])
+    )
+
+
+def _objective(costs: Sequence[Cost], J: int) -> tuple[Float64, Float64]:
+    H, c = np.zeros((J, J)), np.zeros(J)
+    for cost_H, cost_c in costs:
+        H += cost_H
+        c += cost_c
+    return H, c
+
+
 def assemble(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
@@ -20,9 +45,7 @@ def assemble(
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)
-    for cost_H, cost_c in costs:
-        H[:J, :J] += cost_H
-        c[:J] += cost_c
+    H[:J, :J], c[:J] = _objective(costs, J)
     slack = np.arange(J, J + M)
     H[slack, slack] = np.concatenate([np.full(len(b), 2.0 * b.slack_weight) for b in barriers] or [np.zeros(0)])
     c[J:] = np.concatenate([np.full(len(b), b.slack_cost) for b in barriers] or [np.zeros(0)])

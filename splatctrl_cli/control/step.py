@@ -152,7 +152,7 @@ class QpIkController:
     def _rows(self, q: Float64, box: tuple[Float64, Float64], distance_rate: float | Float64) -> _Rows:
         """Every barrier row at q: gradient and distance come from one query of one function."""
         config = self._config
-        centers, jacobians = self._model.sphere_centers(q), self._model.sphere_jacobians(q)
+        centers, jacobians = self._model.spheres_at(q)
         distance, gradient = self._queried(centers)
         between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
         external = Barrier(
@@ -163,10 +163,11 @@ class QpIkController:
             slack_cost=config.slack_cost,
             slack_weight=config.weight_slack,
         )
+        own_h = barriers.barrier_bound(between, margin=config.self_margin, gain=config.barrier_gain)
         own = Barrier(
             index=np.arange(len(self._pairs)),
-            G=-barriers.pair_gradient(direction, jacobians, self._pairs),
-            h=barriers.barrier_bound(between, margin=config.self_margin, gain=config.barrier_gain),
+            G=-self._pair_gradient(direction, jacobians, own_h, box),
+            h=own_h,
             distance=between,
             slack_cost=config.self_slack_cost,
             slack_weight=config.weight_slack,
@@ -176,6 +177,18 @@ class QpIkController:
         can_bind = np.concatenate([barriers.can_bind(b.G, b.h, *box) for b in both])
         margin = np.repeat([config.margin, config.self_margin], [len(external), len(own)])
         return _Rows(external=external, own=own, margin=margin, is_fixed=is_fixed, in_qp=can_bind & ~is_fixed)
+
+    def _pair_gradient(
+        self, direction: Float64, jacobians: Float64, h: Float64, box: tuple[Float64, Float64]
+    ) -> Float64:
+        """``dd/dq`` (P, J) of the pairs whose spheres are fast enough to use up h; zero for the others, which no
+        velocity of the box brings to bind.
+        """
+        speed = barriers.fastest_spheres(jacobians, *box)
+        near = np.flatnonzero(h <= speed[self._pairs[:, 0]] + speed[self._pairs[:, 1]])
+        gradient = np.zeros((len(h), jacobians.shape[2]))
+        gradient[near] = barriers.pair_gradient(direction[near], jacobians, self._pairs[near])
+        return gradient
 
     def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
         """Distance (M,) of the moving spheres' surfaces and the field's gradient (M, 3) at their centres."""

@@ -11,6 +11,7 @@ import pinocchio
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 from splatctrl_cli.robot.spheres import matched_links, read_spheres, spheres_of
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
@@ -58,7 +59,7 @@ class RobotModel:
         }
         self.frame_names = tuple(link for link in urdf.links if link in self._frames)
         self._sphere_joint, self._sphere_offset = self._joint_offsets()
-        self._ancestors = self._ancestor_table()
+        self._chain = self._as_chain()
         self.moving_spheres: Bool = self._moved()
 
     @classmethod
@@ -124,33 +125,35 @@ class RobotModel:
 
     def sphere_centers(self, q: Float64) -> Float64:
         """Sphere centres (S, 3) [m], world, at joint positions q (J,)."""
-        self._place(q)
-        return self._centers()
+        return np.asarray(self._chain.centers(self._checked(q)[None])[0])
 
-    def sphere_centers_batch(self, q: Float64) -> Float64:
+    def sphere_centers_batch(self, q: Float64, *, threads: int = 1) -> Float64:
         """Sphere centres (T, S, 3) [m], world, at joint positions q (T, J)."""
-        return np.array([self.sphere_centers(row) for row in q]).reshape(-1, len(self.sphere_set.radii), 3)
+        postures = np.asarray(q, dtype=np.float64)
+        if postures.ndim != 2 or postures.shape[1] != self.num_joints:
+            raise InputError(f"joint positions: expected shape (T, {self.num_joints}), got {postures.shape}")
+        return self._chain.centers(postures, threads=threads)
 
     def sphere_jacobians(self, q: Float64) -> Float64:
         """d centre / d q (S, 3, J), world, at q (J,)."""
-        self._jacobians(q)
-        return self._point_jacobians(self._centers(), self._sphere_joint)
+        return self._chain.jacobians(self._checked(q))[1]
+
+    def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
+        """`sphere_centers` (S, 3) and `sphere_jacobians` (S, 3, J) at q (J,), in one walk."""
+        return self._chain.jacobians(self._checked(q))
 
     def frame_pose(self, q: Float64, frame: str) -> Float64:
         """T_world_frame (4, 4) of a link at q (J,). Raises InputError for a frame that is not there."""
-        index = self._frame(frame)
-        self._place(q)
-        placement = pinocchio.updateFramePlacement(self._model, self._data, index)
-        return np.asarray(self.T_world_base @ placement.homogeneous)
+        return np.vstack([self._framed(q, frame)[0], [0.0, 0.0, 0.0, 1.0]])
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64:
         """Jacobian (6, J) of a link's origin, world axes: linear velocity rows [m] first, then angular."""
-        joint = np.array([self._model.frames[self._frame(frame)].parentJoint])
-        origin = self.frame_pose(q, frame)[:3, 3]
-        self._jacobians(q)
-        linear = self._point_jacobians(origin[None], joint)[0]
-        angular = self._axes()[1].T * self._ancestors[joint[0]]
-        return np.concatenate([linear, angular])
+        return self._framed(q, frame)[1]
+
+    def _framed(self, q: Float64, frame: str) -> tuple[Float64, Float64]:
+        there = self._model.frames[self._frame(frame)]
+        in_body = np.ascontiguousarray(there.placement.homogeneous[:3])
+        return self._chain.frame(self._checked(q), there.parentJoint, in_body)
 
     def reach(self) -> float:
         """Radius [m] of a ball about the base that holds every sphere in every posture (sum of link lengths)."""
@@ -184,36 +187,41 @@ class RobotModel:
             )
         return np.array([list(log_joint_names).index(name) for name in self.joint_names], dtype=np.int64)
 
-    def _configuration(self, q: Float64) -> Float64:
+    def _checked(self, q: Float64) -> Float64:
         if np.shape(q) != (self.num_joints,):
             raise InputError(f"joint positions: expected shape ({self.num_joints},), got {np.shape(q)}")
+        return np.asarray(q, dtype=np.float64)
+
+    def _configuration(self, q: Float64) -> Float64:
+        q = self._checked(q)
         if not self._is_wrapped.any():
             return np.asarray(q, dtype=np.float64)
         columns = [[np.cos(x), np.sin(x)] if w else [x] for x, w in zip(q, self._is_wrapped, strict=True)]
         return np.concatenate(columns)
 
-    def _place(self, q: Float64) -> None:
-        pinocchio.forwardKinematics(self._model, self._data, self._configuration(q))
-
     def _jacobians(self, q: Float64) -> None:
         pinocchio.computeJointJacobians(self._model, self._data, self._configuration(q))
 
-    def _centers(self) -> Float64:
-        R = np.array([placement.rotation for placement in self._data.oMi])[self._sphere_joint]
-        t = np.array([placement.translation for placement in self._data.oMi])[self._sphere_joint]
-        base = np.einsum("sij,sj->si", R, self._sphere_offset) + t
-        return np.asarray(base @ self.T_world_base[:3, :3].T + self.T_world_base[:3, 3])
-
-    def _axes(self) -> tuple[Float64, Float64]:
-        """Columns of the world Jacobian: linear (J, 3) at the base's origin and angular (J, 3), world axes."""
-        R = self.T_world_base[:3, :3]
-        return self._data.J[:3].T @ R.T, self._data.J[3:].T @ R.T
-
-    def _point_jacobians(self, points_world: Float64, joint: Index) -> Float64:
-        linear, angular = self._axes()
-        arm = points_world - self.base_position
-        columns = linear[None] + np.cross(angular[None], arm[:, None])  # (S, J, 3)
-        return np.asarray(np.swapaxes(columns * self._ancestors[joint][:, :, None], 1, 2))
+    def _as_chain(self) -> Chain:
+        """The bodies and spheres as the kernels walk them."""
+        placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
+        self._jacobians(self.middle)
+        kind, axis = [REVOLUTE], [np.array([0.0, 0.0, 1.0])]
+        for body in range(1, self.num_joints + 1):
+            local = pinocchio.getJointJacobian(self._model, self._data, body, pinocchio.ReferenceFrame.LOCAL)
+            column = np.asarray(local).reshape(6, -1)[:, body - 1]
+            linear, angular = column[:3], column[3:]
+            is_turn = bool(np.linalg.norm(angular) > 0.5)
+            kind.append(REVOLUTE if is_turn else PRISMATIC)
+            axis.append(angular if is_turn else linear)
+        return Chain(
+            parent=np.array(self._model.parents, dtype=np.int64),
+            kind=np.array(kind, dtype=np.int64),
+            placement=np.ascontiguousarray(placement[:, :3, :]),
+            axis=np.array(axis, dtype=np.float64),
+            sphere_body=self._sphere_joint,
+            offset=np.ascontiguousarray(self._sphere_offset).reshape(-1, 3),
+        )
 
     def _joint_offsets(self) -> tuple[Index, Float64]:
         joints, offsets = [], []
@@ -222,14 +230,6 @@ class RobotModel:
             joints.append(frame.parentJoint)
             offsets.append(frame.placement.rotation @ center + frame.placement.translation)
         return np.array(joints, dtype=np.int64), np.array(offsets, dtype=np.float64)
-
-    def _ancestor_table(self) -> Bool:
-        """(J + 1, J) True where joint j moves body i; body 0 is the base."""
-        table = np.zeros((self.num_joints + 1, self.num_joints), dtype=bool)
-        for body in range(1, self.num_joints + 1):
-            table[body] = table[self._model.parents[body]]
-            table[body, body - 1] = True
-        return table
 
     def _moved(self) -> Bool:
         """Structural: a sphere on the base, or centred on the only axes that carry it, never moves."""

@@ -35,6 +35,9 @@ class PlanarArm:
     def sphere_centers_batch(self, q: Float64) -> Float64:
         return np.array([self.sphere_centers(row) for row in q])
 
+    def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
+        return self.sphere_centers(q), self.sphere_jacobians(q)
+
     def sphere_jacobians(self, q: Float64) -> Float64:
         centers, elbow = self.sphere_centers(q), self.lengths[0] * _unit(q[0])
         J = np.zeros((len(centers), 3, 2))

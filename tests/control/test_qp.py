@@ -1,10 +1,14 @@
 """The program, its elimination and its solver."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import Barrier, can_bind
-from splatctrl_cli.control.problem import assemble
+from splatctrl_cli.control.ladder import descend
+from splatctrl_cli.control.problem import assemble, assemble_hard
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QuadraticProgram, residuals, solver_named
 from splatctrl_cli.control.tasks import Cost, eliminated_weight, posture_task, velocity_task
 from splatctrl_cli.errors import UsageError
@@ -138,3 +142,25 @@ def test_a_program_without_a_point_is_not_solved(name: str) -> None:
 def test_a_solver_that_is_not_there_is_named() -> None:
     with pytest.raises(UsageError, match=r"control\.solver: expected one of clarabel, daqp, got osqp"):
         solver_named("osqp")
+
+
+def test_the_program_without_slacks_gives_the_same_step_where_it_is_used() -> None:
+    rng = np.random.default_rng(5)
+    solver, num_firm, num_priced = DaqpSolver(), 0, 0
+    for k in range(200):
+        *_, costs = seven_joint_costs(rng)
+        num_rows = int(rng.integers(0, 25))
+        cheap = 1.0 if k % 4 == 0 else 1e3  # with cheap slacks rows give way although they could hold
+        rows = replace(
+            barrier(0.4 * rng.normal(size=(num_rows, 7)), rng.uniform(-0.2, 0.6, num_rows)), slack_cost=cheap
+        )
+        box = np.full(7, -1.0), np.full(7, 1.0)
+        whole, firm = solver.solve(assemble(costs, *box, [rows])), solver.solve(assemble_hard(costs, *box, [rows]))
+        choice = descend(solver, costs, box, [rows], ControlConfig())
+        np.testing.assert_allclose(choice.velocity, whole.z[:7], atol=1e-8)
+        np.testing.assert_allclose(choice.slack, np.maximum(whole.z[7:], 0), atol=1e-8)
+        np.testing.assert_allclose(choice.row_multipliers, whole.multipliers[14 : 14 + num_rows], atol=1e-5)
+        num_firm += firm.is_solved and choice.solution.z.shape == (7,)
+        num_priced += firm.is_solved and choice.solution.z.shape != (7,)
+    assert num_firm > 60
+    assert num_priced > 3

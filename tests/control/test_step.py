@@ -120,10 +120,12 @@ def test_a_flat_field_cannot_be_acted_on_and_is_named() -> None:
 @pytest.mark.parametrize(("status", "residual"), [("AlmostSolved", 0.0), ("Solved", 1e-3), ("MaxIterations", 0.0)])
 def test_an_unchecked_solution_is_never_used(status: str, residual: float) -> None:
     step = controller(far_away(), solver=Scripted(1, status, residual)).step(Q, goal(np.zeros(2)))
+    assert step.rung is Rung.SOLVED  # with slacks, after the program without them did not check
+    step = controller(far_away(), solver=Scripted(2, status, residual)).step(Q, goal(np.zeros(2)))
     assert step.rung is Rung.MINIMUM_VIOLATION
     assert step.num_refused == 1
     np.testing.assert_allclose(step.velocity, 0.0, atol=1e-6)
-    step = controller(far_away(), solver=Scripted(2, status, residual)).step(Q, goal(np.zeros(2)))
+    step = controller(far_away(), solver=Scripted(3, status, residual)).step(Q, goal(np.zeros(2)))
     assert step.rung is Rung.HOLD and step.scale == 0.0 and step.num_refused == 2
     assert np.all(step.velocity == 0.0)
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pinocchio
 import pytest
 
 from splatctrl_cli.errors import InputError
@@ -218,3 +219,36 @@ def test_links_without_a_sphere_are_said(sample_data: Path, real_data: Path, tmp
     assert "gripper" in model.doubts[1]
     foreign = real_data / "robot_spheres/curobo/curobo/content/configs/robot/franka.yml"
     assert any("same robot" in doubt for doubt in RobotModel.from_urdf(urdf, foreign).doubts)
+
+
+def test_frames_and_spheres_stand_and_move_as_pinocchio_says(arm_files: tuple[Path, Path]) -> None:
+    arm = RobotModel.from_urdf(*arm_files, T_world_base=T_WORLD_BASE)
+    model = pinocchio.buildModelFromUrdf(str(arm_files[0]))
+    data, base = model.createData(), T_WORLD_BASE[:3, :3]
+    for q in np.random.default_rng(0).uniform(arm.lower, arm.upper, (20, arm.num_joints)):
+        pinocchio.framesForwardKinematics(model, data, q)
+        poses = {}
+        for link in {arm.frame_names[-1], *arm.sphere_set.links}:
+            index = model.getFrameId(link, pinocchio.FrameType.BODY)
+            poses[link] = T_WORLD_BASE @ data.oMf[index].homogeneous
+            np.testing.assert_allclose(arm.frame_pose(q, link), poses[link], atol=1e-12)
+            aligned = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            jacobian = np.asarray(pinocchio.computeFrameJacobian(model, data, q, index, aligned))
+            expected = np.vstack([base @ jacobian[:3], base @ jacobian[3:]])
+            np.testing.assert_allclose(arm.frame_jacobian(q, link), expected, atol=1e-12)
+        spheres = zip(arm.sphere_set.links, arm.sphere_set.centers, strict=True)
+        expected = np.array([(poses[link] @ [*center, 1.0])[:3] for link, center in spheres])
+        np.testing.assert_allclose(arm.sphere_centers(q), expected, atol=1e-12)
+        centers, jacobians = arm.spheres_at(q)
+        np.testing.assert_allclose(centers, expected, atol=1e-12)
+        np.testing.assert_array_equal(jacobians, arm.sphere_jacobians(q))
+
+
+def test_batches_are_the_same_at_any_thread_count(arm_files: tuple[Path, Path]) -> None:
+    arm = RobotModel.from_urdf(*arm_files)
+    q = np.random.default_rng(1).uniform(-1, 1, (500, arm.num_joints))
+    one = arm.sphere_centers_batch(q)
+    np.testing.assert_array_equal(arm.sphere_centers_batch(q, threads=3), one)
+    np.testing.assert_array_equal(one[123], arm.sphere_centers(q[123]))
+    with pytest.raises(InputError, match=r"expected shape \(T, 7\), got \(7, 2\)"):
+        arm.sphere_centers_batch(np.zeros((7, 2)))

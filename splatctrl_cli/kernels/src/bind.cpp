@@ -19,5 +19,6 @@ NB_MODULE(SPLATCTRL_MODULE, m) {
   splatctrl::bind_raster(m);
   splatctrl::bind_gaussians(m);
   splatctrl::bind_field(m);
+  splatctrl::bind_chain(m);
   splatctrl::bind_occupancy(m);
 }

@@ -1,0 +1,138 @@
+"""The clearance of many postures at once, and how fast a motion can use it up.
+
+B postures, J joints; R rows: first the moving spheres against the scene, then the pairs of spheres that could collide.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.records import Bool, DistanceField, Float64
+
+
+class PlanningArm(ArmModel, Protocol):
+    """An arm whose spheres' travel per radian (or metre) of every joint is bounded; `RobotModel` is one."""
+
+    def lever_arms(self) -> Float64:
+        """(S, J)."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanningField:
+    """Distance alone, from a field: what a planner asks, without the gradient it would pay for."""
+
+    field: DistanceField
+
+    def distance(self, points: Float64) -> Float64:
+        """points (Q, 3) [m], world -> distance (Q,) [m]."""
+        return self.field.query(points)[0]
+
+
+class HasDistance(Protocol):
+    """A scene that gives the distance without its gradient; `Solids` is one."""
+
+    def distance(self, points: Float64) -> Float64:
+        """points (Q, 3) [m], world -> signed distance (Q,) [m]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clearance:
+    """Signed distances of an arm's spheres to a scene and to each other, less margins.
+
+    radii, moving: of the M spheres that a joint moves, their indices; pairs (P, 2) of all spheres; levers (R, J): no
+    row loses more than `levers @ |dq|` [m] on the way of dq, given that the scene's distance is 1-Lipschitz (exact
+    distances are; for another field `lipschitz` scales its rows). names (R,) of the rows. num_checks counts postures.
+    """
+
+    model: PlanningArm
+    scene: HasDistance
+    margin: Float64
+    radii: Float64
+    moving: NDArray[np.intp]
+    pairs: NDArray[np.integer]
+    levers: Float64
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        model: PlanningArm,
+        scene: HasDistance,
+        *,
+        margin: float = 0.0,
+        self_margin: float = 0.0,
+        lipschitz: float = 1.0,
+    ) -> "Clearance":
+        """The clearance of an arm in a scene; margins [m] are taken off the distances, to the scene and to itself.
+
+        Raises InputError where no sphere moves.
+        """
+        moving = np.flatnonzero(model.moving_spheres)
+        if not len(moving):
+            raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
+        levers, pairs = model.lever_arms(), np.asarray(model.self_pairs()).reshape(-1, 2)
+        names = sphere_names(model.sphere_set)
+        return cls(
+            model=model,
+            scene=scene,
+            margin=np.repeat([margin, self_margin], [len(moving), len(pairs)]),
+            radii=np.asarray(model.sphere_set.radii, dtype=np.float64),
+            moving=moving,
+            pairs=pairs,
+            levers=np.concatenate([lipschitz * levers[moving], _between(levers, pairs)]),
+            names=tuple(names[s] for s in moving) + tuple(f"{names[a]}~{names[b]}" for a, b in pairs),
+        )
+
+    def in_scene(self, scene: HasDistance) -> "Clearance":
+        """The same arm and margins in another scene."""
+        return replace(self, scene=scene)
+
+    def rows(self, q: Float64) -> Float64:
+        """Every row's distance less its margin (B, R) [m] at postures q (B, J).
+
+        Raises NotEvaluableError where the scene has no distance.
+        """
+        centers = self.model.sphere_centers_batch(q)
+        points = np.ascontiguousarray(centers[:, self.moving]).reshape(-1, 3)
+        distance = self.scene.distance(points)
+        if not np.all(distance == distance):  # NaN is not itself
+            first = int(np.argmax(np.isnan(distance)))
+            where = ", ".join(f"{v:.3f}" for v in points[first])
+            raise NotEvaluableError(
+                f"sphere {self.names[first % len(self.moving)]} at ({where}) m: the field has no distance there",
+                remedy="bake a field that covers the robot's reach",
+            )
+        num_moving = len(self.moving)
+        rows = np.empty((len(q), len(self.names)))
+        rows[:, :num_moving] = distance.reshape(len(q), -1) - self.radii[self.moving]
+        if len(self.pairs):
+            offset = centers[:, self.pairs[:, 0]] - centers[:, self.pairs[:, 1]]
+            between = np.sqrt(np.einsum("bpk,bpk->bp", offset, offset))
+            rows[:, num_moving:] = between - self.radii[self.pairs].sum(axis=1)
+        return rows - self.margin
+
+    def at(self, q: Float64) -> Float64:
+        """The least row (B,) [m] at postures q (B, J)."""
+        return np.asarray(np.min(self.rows(q), axis=1))
+
+    def speeds(self, motion: Float64) -> Float64:
+        """How much (E, R) [m] a row can lose at most over motions dq (E, J)."""
+        return np.asarray(np.abs(motion) @ self.levers.T)
+
+    def worst(self, q: Float64) -> tuple[str, float]:
+        """Name and distance less margin [m] of the least row at q (J,)."""
+        row = self.rows(q[None])[0]
+        return self.names[int(np.argmin(row))], float(np.min(row))
+
+
+def _between(levers: Float64, pairs: NDArray[np.integer]) -> Float64:
+    """(P, J): how fast two spheres can near each other; a joint that moves both moves neither in the other's eyes."""
+    a, b = levers[pairs[:, 0]], levers[pairs[:, 1]]
+    moves_both: Bool = (a > 0) & (b > 0)
+    return np.where(moves_both, 0.0, np.maximum(a, b))

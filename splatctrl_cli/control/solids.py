@@ -1,0 +1,130 @@
+"""A scene of exact solids: spheres, boxes, cylinders and capsules, asked for many points at once.
+
+Q points, P solids of one kind; a cylinder and a capsule lie along the z axis of their own frame, whose origin is in
+their middle. Everything in world, [m], float64.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.records import Float64
+
+STEP = 1e-6  # [m] of the differences that give a gradient
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ball:
+    """A ball at center (3,) of a radius."""
+
+    center: Float64
+    radius: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cuboid:
+    """A box of full size (3,) along its own axes, placed by T_world_shape (4, 4)."""
+
+    size: Float64
+    T_world_shape: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rod:
+    """A cylinder, or a capsule (`is_round`: caps of its radius are put on both ends), of a radius and a length."""
+
+    radius: float
+    length: float
+    T_world_shape: Float64
+    is_round: bool = False
+
+
+Solid = Ball | Cuboid | Rod
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solids:
+    """A `DistanceField` of solids: the signed distance to the nearest, negative inside, exact outside and 1-Lipschitz.
+
+    Inside several solids at once it is the depth in the deepest, which is at most the way out.
+    Raises InputError for a solid with a size that is not above zero.
+    """
+
+    solids: Sequence[Solid]
+    _balls: tuple[Float64, Float64] = field(init=False, repr=False)
+    _boxes: tuple[Float64, Float64, Float64] = field(init=False, repr=False)
+    _rods: tuple[Float64, Float64, Float64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for index, solid in enumerate(self.solids):
+            if not min(_sizes(solid)) > 0:
+                raise InputError(f"solid {index}: expected sizes above 0 m, got {_sizes(solid)}")
+        balls = [s for s in self.solids if isinstance(s, Ball)]
+        boxes = [s for s in self.solids if isinstance(s, Cuboid)]
+        rods = [s for s in self.solids if isinstance(s, Rod)]
+        centers = np.array([s.center for s in balls], dtype=np.float64).reshape(-1, 3)
+        object.__setattr__(self, "_balls", (centers, np.array([s.radius for s in balls], dtype=np.float64)))
+        half = np.array([s.size for s in boxes], dtype=np.float64).reshape(-1, 3).T / 2
+        object.__setattr__(self, "_boxes", (*_into([s.T_world_shape for s in boxes]), half))
+        # rounding (P,): how far the surface lies outside the flat-ended core; radius, half length of that core
+        shape = np.array([[0.0, s.length / 2, s.radius] if s.is_round else [s.radius, s.length / 2, 0.0] for s in rods])
+        object.__setattr__(self, "_rods", (*_into([s.T_world_shape for s in rods]), shape.reshape(-1, 3).T))
+
+    def distance(self, points: Float64) -> Float64:
+        """points (Q, 3) -> signed distance (Q,) to the nearest solid, inf without any."""
+        least = np.full(len(points), np.inf)
+        for of_kind in (_to_balls, _to_boxes, _to_rods):
+            table = {_to_balls: self._balls, _to_boxes: self._boxes, _to_rods: self._rods}[of_kind]
+            if table[-1].size:
+                np.minimum(least, np.min(of_kind(points, *table), axis=0), out=least)  # type: ignore[operator]
+        return least
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) -> distance (Q,) and its gradient (Q, 3), by central differences."""
+        steps = STEP * np.eye(3)
+        gradient = [(self.distance(points + step) - self.distance(points - step)) / (2 * STEP) for step in steps]
+        return self.distance(points), np.stack(gradient, axis=1)
+
+
+def _to_balls(points: Float64, centers: Float64, radii: Float64) -> Float64:
+    """(P, Q)."""
+    return np.asarray(np.linalg.norm(points - centers[:, None], axis=2) - radii[:, None])
+
+
+def _to_boxes(points: Float64, turn: Float64, shift: Float64, half: Float64) -> Float64:
+    """(P, Q): the distance outside, less the way to the nearest face inside."""
+    out = np.abs(_local(points, turn, shift)) - half[:, :, None]
+    inside = np.minimum(np.max(out, axis=0), 0.0)
+    np.maximum(out, 0.0, out=out)
+    return np.asarray(np.sqrt(np.einsum("kpq,kpq->pq", out, out)) + inside)
+
+
+def _to_rods(points: Float64, turn: Float64, shift: Float64, shape: Float64) -> Float64:
+    """(P, Q): as for a box, in the half plane through the axis."""
+    x, y, z = _local(points, turn, shift)
+    across = np.sqrt(x * x + y * y) - shape[0][:, None]
+    along = np.abs(z) - shape[1][:, None]
+    inside = np.minimum(np.maximum(across, along), 0.0)
+    return np.asarray(np.hypot(np.maximum(across, 0.0), np.maximum(along, 0.0)) + inside - shape[2][:, None])
+
+
+def _local(points: Float64, turn: Float64, shift: Float64) -> Float64:
+    """(3, P, Q): points in the frames of P solids."""
+    return np.asarray((turn @ points.T).reshape(3, -1, len(points)) + shift[:, :, None])
+
+
+def _into(placements: Sequence[Float64]) -> tuple[Float64, Float64]:
+    """Rotation rows (3 P, 3) and shifts (3, P) of the maps from world into P frames, axis by axis."""
+    maps = np.array([invert_transform(T) for T in placements]).reshape(-1, 4, 4)
+    return np.ascontiguousarray(np.swapaxes(maps[:, :3, :3], 0, 1)).reshape(-1, 3), maps[:, :3, 3].T
+
+
+def _sizes(solid: Solid) -> tuple[float, ...]:
+    if isinstance(solid, Ball):
+        return (float(solid.radius),)
+    if isinstance(solid, Cuboid):
+        return tuple(float(v) for v in solid.size)
+    return float(solid.radius), float(solid.length)
