@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 SUMMARY_METRICS = (
     *("num_splats", "num_splats_left_out", "num_cells", "voxel", "length_scale", "median_radius", "median_spacing"),
-    *("never_seen_share", "num_warnings"),
+    *("never_seen_share", "over_estimating_share", "num_warnings"),
 )
 FAR = 1.0  # [m] a grid whose every cell is farther from the splats than this is warned about
 
@@ -49,6 +49,14 @@ class FieldReport:
             **({} if not self.accuracy else {"accuracy": self.accuracy}),
         }
 
+    def _over_estimating_share(self) -> float | None:
+        """Of the cells where the kernel field of sdf, alone, exceeds the exact distance; None without one."""
+        counts, name = self.grid.header["kernel_counts"], {"safe": "se", "safe_gpdf": "gpdf"}
+        assert isinstance(counts, dict)
+        distance = str(self.grid.header["distance"])
+        count = counts.get(f"{name.get(distance, distance)}_over_estimates")
+        return None if count is None else count / self.statistics.num_cells
+
     def summary(self) -> dict[str, Any]:
         """What is printed, and what --json has beside the accuracy."""
         header, used = self.grid.header, self.grid.header["splats_used"]
@@ -65,6 +73,7 @@ class FieldReport:
             "median_radius": health["radius"],
             "median_spacing": health["spacing"],
             "never_seen_share": self.statistics.never_seen_share,
+            "over_estimating_share": self._over_estimating_share(),
             "num_warnings": len(self.warnings),
         }
         if self.changes is not None:

@@ -120,11 +120,11 @@ def _counts_now(task: BakeTask) -> dict[str, int]:
     """What was counted so far."""
     unknown = task.unknown
     treated = {} if unknown is None else {"never_seen": unknown.num_never_seen, "changed": unknown.num_changed}
-    return {**task.baker.num_without_value, **treated}
+    return {**task.baker.counts, **treated}
 
 
 def _set_counts(task: BakeTask, counts: Mapping[str, int]) -> None:
-    task.baker.num_without_value = {name: counts[name] for name in task.baker.num_without_value}
+    task.baker.counts = {name: counts[name] for name in task.baker.counts}
     if task.unknown is not None:
         task.unknown.num_never_seen, task.unknown.num_changed = counts["never_seen"], counts["changed"]
 

@@ -217,9 +217,9 @@ def _baked(
         console.log(f"--update: every block is baked anew: {changes.reason}")
     store = bake_to_disk(task, partial, console, resume=args.resume)
     if task.kept is not None and old is not None and job.previous is not None:
-        counts: Any = job.previous.grid.header["cells_without_value"]
+        counts: Any = job.previous.grid.header["kernel_counts"]
         ranges = list(slabs(baker.layout, baker.channels))
-        baker.num_without_value = counts_after(counts, old, baker, task.kept.mask, ranges)
+        baker.counts = counts_after(counts, old, baker, task.kept.mask, ranges)
     header = field_header(
         job.source.splats, job.chosen, job.labels, baker, has_occupancy=job.source.occupancy is not None
     )

@@ -30,6 +30,7 @@ CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
 }
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
 KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
+RESOLUTION = np.float32(2e-6)  # [m] distances nearer than this are the same
 _TEMPORARY_BYTES = 64 << 20  # of the arrays beside the channels
 
 Planes = dict[str, NDArray[np.generic]]
@@ -39,8 +40,9 @@ T = TypeVar("T", bound=np.generic)
 class Baker:
     """The channels of a field over splats at the cells of `layout`.
 
-    Nothing depends on how the planes are cut or on the number of threads, to the bit. num_without_value counts the
-    cells where a kernel field had no distance and the exact one stands in, by its name.
+    Nothing depends on how the planes are cut or on the number of threads, to the bit. counts: ``se_without_value``,
+    the cells where a kernel field has no distance and the exact one stands in; ``se_over_estimates``, those where it
+    exceeds the exact one by more than `RESOLUTION`; the same of gpdf.
     """
 
     def __init__(
@@ -69,7 +71,8 @@ class Baker:
         self.gpdf = GpdfField.over(self.spheres, config, threads=threads) if "gpdf" in names else None
         has_probability = "probability" in channels
         self.probability = make_probability(self.spheres, config, threads=threads) if has_probability else None
-        self.num_without_value: dict[str, int] = {name: 0 for name in ("se", "gpdf") if name in names}
+        self.kernels: tuple[str, ...] = tuple(name for name in ("se", "gpdf") if name in names)
+        self.counts = {f"{name}_{what}": 0 for name in self.kernels for what in ("without_value", "over_estimates")}
         self._occupancy, self._thresholds = occupancy, thresholds or OccupancyConfig()
 
     @property
@@ -131,10 +134,11 @@ class Baker:
         exact, exact_gradient, entry = self._hard(span)
         hard, gradient = picked(exact), None if exact_gradient is None else picked(exact_gradient)
         kernels: dict[str, tuple[Float32, Float32 | None]] = {}
-        for name in self.num_without_value:
+        for name in self.kernels:
             distance, slope = self._kernel(name, span)
             kernels[name] = (picked(distance), None if slope is None else picked(slope))
-            self.num_without_value[name] += int(np.count_nonzero(np.isnan(kernels[name][0])))
+            self.counts[f"{name}_without_value"] += int(np.count_nonzero(np.isnan(kernels[name][0])))
+            self.counts[f"{name}_over_estimates"] += int(np.count_nonzero(kernels[name][0] > hard + RESOLUTION))
         sdf, gradient = self._chosen(hard, gradient, kernels)
         made: dict[str, NDArray[np.generic]] = {"sdf": sdf, "hard": hard}
         if gradient is not None:

@@ -47,7 +47,7 @@ def field_header(
         "noise": config.noise,
         "weights": config.weights,
         "truncation_bound": config.truncation,
-        "cells_without_value": dict(baker.num_without_value),
+        "kernel_counts": dict(baker.counts),
         "unknown": config.unknown,
         "observed": "from the occupancy grid" if has_occupancy else "no occupancy grid: all never seen",
         "inside": "a shell: cells deep inside a closed object read positive; take the sign there from observed",
@@ -55,7 +55,7 @@ def field_header(
         "splats_given": label_counts(splats),
         "splats_used": label_counts(chosen),
         "radius": radii,
-        "health": field_health(chosen.centers, chosen.radii, config.length_scale).as_dict(),
+        "health": field_health(chosen.centers, chosen.radii, config.length_scale, kernels=baker.kernels).as_dict(),
     }
     if baker.probability is not None:
         header |= {"probability": config.probability, "probability_numbers": baker.probability.described()}

@@ -1,16 +1,10 @@
 """Is a splat set dense and thick enough for the field made of it, and how far are the kernel fields from exact?"""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
-from splatctrl_cli.field.spheres import Spheres
-from splatctrl_cli.records import Float64
+from numpy.typing import NDArray
 
 ROUGH_LENGTH = 10.0  # [m] from which on float32 costs the Gaussian kernel's distance 0.2 mm; at 100 m 5 cm
 MAX_SPREAD = 30.0  # of the radii: the largest over the smallest above zero
@@ -38,8 +32,10 @@ class FieldHealth:
         return asdict(self)
 
 
-def field_health(centers: NDArray[np.floating], radii: NDArray[np.floating], length: float) -> FieldHealth:
-    """Health of splats (N, 3), (N,) [m] under a length scale [m]."""
+def field_health(
+    centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, kernels: Collection[str]
+) -> FieldHealth:
+    """Health of splats (N, 3), (N,) [m] under a length scale [m], for a field of these kernels (se, gpdf)."""
     spacing, radius = median_spacing(centers), float(np.median(radii))
     zero_level = planar_zero_level(radius, length)
     return FieldHealth(
@@ -49,38 +45,45 @@ def field_health(centers: NDArray[np.floating], radii: NDArray[np.floating], len
         radius_per_spacing=radius / spacing if spacing > 0 else None,
         radius_per_length=radius / length,
         planar_zero_level=zero_level,
-        warnings=(*_warnings(spacing, radius, length, zero_level), *_set_warnings(centers, radii, length)),
+        warnings=(
+            *_warnings(spacing, radius, length, zero_level, kernels),
+            *_set_warnings(centers, radii, length, has_kernel=bool(kernels)),
+        ),
     )
 
 
-def _warnings(spacing: float, radius: float, length: float, zero_level: float) -> Iterable[str]:
+def _warnings(
+    spacing: float, radius: float, length: float, zero_level: float, kernels: Collection[str]
+) -> Iterable[str]:
     if radius < spacing / np.sqrt(2):
         yield (
             f"radius {radius * 1e3:.1f} mm is below spacing / sqrt 2 = {spacing / np.sqrt(2) * 1e3:.1f} mm: "
             "the exact field's surface has holes between splats"
         )
-    if spacing > length:
+    if kernels and spacing > length:
         yield (
             f"spacing {spacing * 1e3:.1f} mm exceeds the length scale {length * 1e3:.1f} mm: "
             "the kernel field does not join neighbouring splats"
         )
-    if zero_level - radius > length:
+    if "gpdf" in kernels and zero_level - radius > length:
         yield (
-            f"the kernel field's surface stands {zero_level * 1e3:.1f} mm before a dense plane of splats, "
+            f"the surface of gpdf stands {zero_level * 1e3:.1f} mm before a dense plane of splats, "
             f"{(zero_level - radius) * 1e3:.1f} mm beyond their radius; a smaller length scale brings it closer"
         )
 
 
-def _set_warnings(centers: NDArray[np.floating], radii: NDArray[np.floating], length: float) -> Iterable[str]:
+def _set_warnings(
+    centers: NDArray[np.floating], radii: NDArray[np.floating], length: float, *, has_kernel: bool
+) -> Iterable[str]:
     extent = float(np.ptp(centers.astype(np.float64), axis=0).max())
     if len(centers) > 1 and extent == 0.0:
         yield f"all {len(centers)} splats stand at one place: the field is that of the largest"
-    elif len(centers) > 1 and length > extent:
+    elif has_kernel and len(centers) > 1 and length > extent:
         yield (
             f"the length scale {length:g} m exceeds the extent of the splats, {extent:.3g} m: "
             "the kernel field cannot tell them apart"
         )
-    if length >= ROUGH_LENGTH:
+    if has_kernel and length >= ROUGH_LENGTH:
         yield f"the length scale {length:g} m is so large that rounding shows in the kernel fields"
     thick = radii[radii > 0]
     if len(thick) and thick.max() > MAX_SPREAD * thick.min():
@@ -88,34 +91,6 @@ def _set_warnings(centers: NDArray[np.floating], radii: NDArray[np.floating], le
             f"radii from {thick.min() * 1e3:.3g} to {thick.max() * 1e3:.3g} mm in one set: "
             "the median radius and its ratios stand for neither end"
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class OverEstimate:
-    """share of points where a kernel field exceeds the exact distance to the spheres; largest: by how much [m]."""
-
-    share: float
-    largest: float
-
-
-def lumping_overestimate(
-    centers: ArrayLike, radii: ArrayLike, points: Float64, config: FieldConfig, *, threads: int = 1
-) -> Mapping[str, OverEstimate]:
-    """How often the kernel fields ``se`` and ``gpdf`` claim more clearance than there is, at points (Q, 3) [m].
-
-    Row sums give a sparse splat before a dense surface the weight of one in a crowd; it is why the field of a
-    controller is the smaller of kernel and exact. Raises NotEvaluableError without points.
-    """
-    if not len(points):
-        raise NotEvaluableError("lumping: expected at least one point, got none")
-    spheres = Spheres.of(centers, radii)
-    exact, _ = SphereField.over(spheres, threads=threads).query(points)
-    found = {}
-    for name, kind in (("se", SeField), ("gpdf", GpdfField)):
-        over = kind.over(spheres, config, threads=threads).query_raw(points)[0] - exact
-        over = over[over > RESOLUTION]  # False for NaN: where it has no value the exact one stands in
-        found[name] = OverEstimate(share=len(over) / len(points), largest=float(over.max(initial=0.0)))
-    return found
 
 
 def median_spacing(centers: NDArray[np.floating]) -> float:

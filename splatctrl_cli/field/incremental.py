@@ -73,17 +73,17 @@ def whole_span(baker: Baker) -> GridSpan:
 def counts_after(
     counts: Mapping[str, int], old: Baker, new: Baker, mask: UInt8, slabs: Sequence[tuple[int, int]]
 ) -> dict[str, int]:
-    """The cells without a kernel value of the whole grid: `counts` of the bake before, less what the blocks of `mask`
+    """The counts of kernel values over the whole grid: `counts` of the bake before, less what the blocks of `mask`
     had then, plus what `new` counted when it baked them. `old` bakes them once more for it.
     """
-    if not old.num_without_value:
+    if not old.counts:
         return {}
-    old.num_without_value = dict.fromkeys(old.num_without_value, 0)
+    old.counts = dict.fromkeys(old.counts, 0)
     for first, last in slabs:
         if mask[first // BLOCK : -(-last // BLOCK)].any():
             scratch: Planes = old.allocate(last - first)
             old.bake(first, last, scratch, mask)
-    then, now = old.num_without_value, new.num_without_value
+    then, now = old.counts, new.counts
     return {name: counts[name] - then[name] + now[name] for name in now}
 
 

@@ -198,3 +198,24 @@ def test_bad_boxes_voxels_and_splats_are_named() -> None:
         bake(splats, BOX, CONFIG)
     with pytest.raises(InputError, match="splat 0: expected a label of 0, 1 or 2, got 3"):
         bake(replace(splats, labels=np.full(10, 3, np.uint8)), BOX, CONFIG)
+
+
+def test_cells_are_counted_where_a_kernel_field_alone_over_estimates_or_has_no_value() -> None:
+    centers, radii = cloud()
+    channels = ("sdf", "hard", "se", "gpdf")
+    grid = bake(splat_set(centers, radii), BOX, replace(CONFIG, length_scale=0.1), channels=channels)
+    points, hard = cell_centers(grid), grid.channels["hard"].ravel()
+    counts = {}
+    for name, kind in (("se", SeField), ("gpdf", GpdfField)):
+        alone = kind(centers, radii, 0.1).query_raw(points)[0]
+        counts |= {
+            f"{name}_without_value": np.isnan(alone).sum(),
+            f"{name}_over_estimates": (alone > hard + 2e-6).sum(),
+        }
+    baked = grid.header["kernel_counts"]
+    assert isinstance(baked, dict)
+    assert baked.keys() == counts.keys()
+    assert baked["se_without_value"] > 100
+    assert baked["gpdf_without_value"] == 0
+    for name, count in counts.items():  # a cell on the edge may fall on either side of it
+        assert abs(baked[name] - count) <= 3, name

@@ -1,11 +1,14 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.field.health import field_health, lumping_overestimate, median_spacing
-from tests.field.scenes import cloud, queries
-from tests.reference import field as reference
+from splatctrl_cli.field.health import FieldHealth, median_spacing
+from splatctrl_cli.field.health import field_health as health_of
+
+KERNELS = ("se", "gpdf")
+
+
+def field_health(centers: np.ndarray, radii: np.ndarray, length: float) -> FieldHealth:
+    return health_of(centers, radii, length, kernels=KERNELS)
 
 
 def square_lattice(spacing: float) -> np.ndarray:
@@ -27,7 +30,7 @@ def test_each_ratio_out_of_range_has_its_warning() -> None:
     thin = field_health(square_lattice(0.01), np.full(100, 0.005), 0.02)
     assert [w.split(":")[1] for w in thin.warnings] == [" the exact field's surface has holes between splats"]
     short = field_health(square_lattice(0.01), np.full(100, 0.008), 0.009)
-    assert [w.split(":")[0][:7] for w in short.warnings] == ["spacing", "the ker"]
+    assert [w.split(":")[0][:7] for w in short.warnings] == ["spacing", "the sur"]
     assert short.radius_per_spacing == pytest.approx(0.8)
 
 
@@ -56,19 +59,7 @@ def test_splats_at_one_place_are_warned_of_and_a_single_one_is_not() -> None:
     assert warnings_of(np.ones((1, 3)), np.full(1, 0.01), 0.02) == ""
 
 
-def test_over_estimate_is_the_share_of_points_beyond_the_exact_distance() -> None:
-    centers, radii = cloud()
-    points = queries(2000)
-    found = lumping_overestimate(centers, radii, points, FieldConfig())
-    hard = reference.hard(points, centers, radii)
-    kernels = {
-        "se": reference.se(points, centers, radii, 0.02, 1e-6)[0],
-        "gpdf": reference.gpdf(points, centers, radii, 0.02, 1e-6),
-    }
-    for name, distance in kernels.items():
-        over = distance - hard
-        assert found[name].share == pytest.approx(np.mean(over > 2e-6), abs=2e-3), name
-        assert found[name].largest == pytest.approx(max(np.nanmax(over), 0.0), abs=3e-5), name
-    assert found["se"].share > 0.5
-    with pytest.raises(NotEvaluableError, match="at least one point, got none"):
-        lumping_overestimate(centers, radii, np.empty((0, 3)), FieldConfig())
+def test_a_field_is_not_warned_of_kernels_that_it_has_not() -> None:
+    lattice, radii = square_lattice(0.01), np.full(100, 0.008)
+    by_kernels = [len(health_of(lattice, radii, 0.009, kernels=names).warnings) for names in ((), ("se",), KERNELS)]
+    assert by_kernels == [0, 1, 2]

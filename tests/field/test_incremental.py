@@ -73,7 +73,7 @@ def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distanc
     channels = [name for name in CHANNELS if name != "se" or distance != "hard"]
     old, new = (Baker(splats, LAYOUT, config, channels=channels, threads=2) for splats in (before, after))
     arrays = whole(old)
-    counts = dict(old.num_without_value)
+    counts = dict(old.counts)
     changes = changed_blocks(before, old, after, new)
     assert changes.mask is not None
     new.bake(0, LAYOUT.shape[0], arrays, changes.mask)
@@ -81,7 +81,7 @@ def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distanc
     full = Baker(after, LAYOUT, config, channels=channels)
     for name, values in whole(full).items():
         assert arrays[name].tobytes() == values.tobytes(), name
-    assert counts == full.num_without_value
+    assert counts == full.counts
     assert changes.num_baked < 0.8 * changes.num_blocks
     if kind != "order" or not seed % 2:
         assert (changes.num_baked > 0) == (kind != "order")
