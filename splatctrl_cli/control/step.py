@@ -1,6 +1,7 @@
 """One step of the QP-IK controller of III-E: query the field, build the rows, solve, look at the field again."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +30,45 @@ class RowSlack:
     slack: float
 
 
+class RowKind(StrEnum):
+    """What a row of the program guards."""
+
+    LIMIT = "limit"
+    SCENE = "scene"
+    SELF = "self"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intervention:
+    """A row that shapes the command: its name, what it guards, and its multiplier (cost per unit of the row)."""
+
+    name: str
+    kind: RowKind
+    multiplier: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class VelocityMargin:
+    """How much room a joint velocity leaves: the least ``h - G v`` of the barrier rows [m/s], and the least distance
+    to the box of the limits [rad/s], each with its row's name; negative where the velocity breaks the row.
+    """
+
+    barrier: float
+    barrier_row: str
+    limit: float
+    limit_row: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class ControlStep:
     """What the controller decided at one configuration, and how sure it may be of it.
 
     velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise);
     pose_error (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field;
-    self_clearance [m] (inf without pairs); intervening are the rows that shape the solution; violated_fixed the
-    violated rows that no joint velocity changes here; num_rows went into the QP; residual is the worst KKT residual
-    of the last solution and status the solver's word for it; num_refused solutions did not check.
+    self_clearance [m] (inf without pairs); interventions are the rows that shape the solution, `intervening` their
+    names; violated_fixed the violated rows that no joint velocity changes here; num_rows went into the QP; residual
+    is the worst KKT residual of the last solution and status the solver's word for it; num_refused solutions did not
+    check.
     """
 
     velocity: Float64
@@ -48,12 +79,16 @@ class ControlStep:
     nearest: str
     self_clearance: float
     relaxed: tuple[RowSlack, ...]
-    intervening: tuple[str, ...]
+    interventions: tuple[Intervention, ...]
     violated_fixed: tuple[str, ...]
     num_rows: int
     residual: float
     status: str
     num_refused: int
+
+    @property
+    def intervening(self) -> tuple[str, ...]:
+        return tuple(intervention.name for intervention in self.interventions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +149,7 @@ class QpIkController:
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
+        self._limit_names = tuple(f"{joint} {side}" for side in ("highest", "lowest") for joint in model.joint_names)
         self._row_names = _row_names(sphere_names(model.sphere_set), self._moving, self._pairs)
         weight = np.repeat([config.weight_linear, config.weight_angular], 3)
         self._weight = tasks.eliminated_weight(weight, config.weight_kinematics * weight)
@@ -137,6 +173,33 @@ class QpIkController:
         rows = self._rows(q, box, distance_rate)
         choice = descend(self._solver, self._costs(q, error), box, rows.for_qp, config)
         return self._reported(error, rows, choice, self._kept_scale(q, choice, rows))
+
+    def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
+        """The room that any joint velocity (J,) [rad/s] leaves at q (J,), this controller's or not.
+
+        Raises as `step`.
+        """
+        q, config, model = checked_posture(self._model, q), self._config, self._model
+        centers, jacobians = model.spheres_at(q)
+        distance, gradient = self._queried(centers)
+        between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
+        motion = jacobians @ velocity
+        apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
+        gain = config.barrier_gain
+        scene = barriers.barrier_bound(distance, margin=config.margin, gain=gain, rate=distance_rate)
+        own = barriers.barrier_bound(between, margin=config.self_margin, gain=gain)
+        room = np.concatenate(
+            [scene + np.sum(gradient * motion[self._moving], axis=1), own + np.sum(direction * apart, axis=1)]
+        )
+        lowest, highest = velocity_box(q, model.lower, model.upper, model.velocity_limit, gain)
+        limits = np.concatenate([highest - velocity, velocity - lowest])
+        row, limit = int(np.argmin(room)), int(np.argmin(limits))
+        return VelocityMargin(
+            barrier=float(room[row]),
+            barrier_row=self._row_names[row],
+            limit=float(limits[limit]),
+            limit_row=self._limit_names[limit],
+        )
 
     def _costs(self, q: Float64, error: Float64) -> list[tasks.Cost]:
         """The terms of III-E's objective: reach for the goal, lean home."""
@@ -240,7 +303,7 @@ class QpIkController:
                 RowSlack(name=self._row_names[i], slack=float(slack[i]))
                 for i in np.flatnonzero(slack > self._config.slack_tolerance)
             ),
-            intervening=self._intervening(choice, rows),
+            interventions=self._interventions(choice, rows),
             violated_fixed=self._named(rows.is_fixed & (rows.distance < rows.margin)),
             num_rows=int(rows.in_qp.sum()),
             residual=choice.solution.residuals.worst,
@@ -248,12 +311,19 @@ class QpIkController:
             num_refused=choice.num_refused,
         )
 
-    def _intervening(self, choice: Choice, rows: _Rows) -> tuple[str, ...]:
+    def _interventions(self, choice: Choice, rows: _Rows) -> tuple[Intervention, ...]:
         """The limits and barrier rows whose multiplier is not zero."""
-        joints = self._model.joint_names
-        sides = [f"{joint} {side}" for side in ("highest", "lowest") for joint in joints]
-        at_limit = tuple(sides[i] for i in np.flatnonzero(choice.box_multipliers > MULTIPLIER))
-        return at_limit + self._named(rows.spread(choice.row_multipliers) > MULTIPLIER)
+        multipliers = np.concatenate([choice.box_multipliers, rows.spread(choice.row_multipliers)])
+        names, num_limits = (*self._limit_names, *self._row_names), len(self._limit_names)
+        num_scene = num_limits + len(self._moving)
+        return tuple(
+            Intervention(
+                name=names[i],
+                kind=RowKind.LIMIT if i < num_limits else RowKind.SCENE if i < num_scene else RowKind.SELF,
+                multiplier=float(multipliers[i]),
+            )
+            for i in np.flatnonzero(multipliers > MULTIPLIER)
+        )
 
     def _named(self, rows: Bool) -> tuple[str, ...]:
         return tuple(self._row_names[i] for i in np.flatnonzero(rows))

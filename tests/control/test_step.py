@@ -9,7 +9,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.checks import static_violations
 from splatctrl_cli.control.ladder import Rung, is_usable
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
-from splatctrl_cli.control.step import QpIkController
+from splatctrl_cli.control.step import MULTIPLIER, QpIkController, RowKind
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.records import DistanceField, Float64
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away
@@ -213,3 +213,34 @@ def test_a_start_outside_the_joint_limits_is_brought_back() -> None:
     assert step.rung is Rung.SOLVED
     assert step.velocity[0] == pytest.approx(-0.5, abs=1e-5)  # gain 10 /s times 0.05 rad
     assert "shoulder highest" in step.intervening
+
+
+def test_interventions_say_what_guards_and_at_what_price() -> None:
+    wall = Plane([-1.0, 0.0, 0.0], -0.93)
+    rows = {row.name: row for row in controller(wall).step(np.array([0.1, 0.1]), goal(np.zeros(2))).interventions}
+    assert rows["fore[1]"].kind is RowKind.SCENE and rows["fore[1]"].multiplier > MULTIPLIER
+    arm = PlanarArm()
+    fast = controller(far_away(), replace(CONFIG, pose_gain=50.0, max_linear_speed=9.0, max_angular_speed=9.0))
+    kinds = {row.name: row.kind for row in fast.step(arm.upper - 0.01, goal(arm.upper + 1.0)).interventions}
+    assert kinds and set(kinds.values()) == {RowKind.LIMIT}
+
+
+def test_the_margin_of_a_velocity_is_the_room_that_its_tightest_row_has_left() -> None:
+    wall, q = Plane([-1.0, 0.0, 0.0], -0.99), np.array([0.3, 0.2])
+    steered, arm = controller(wall), PlanarArm()
+    for velocity in np.random.default_rng(0).uniform(-1.4, 1.4, (20, 2)):
+        found = steered.margin_of(q, velocity, distance_rate=-0.01)
+        ahead, before = (arm.sphere_centers(q + h * velocity) for h in (1e-6, -1e-6))
+        rate = (wall.query(ahead)[0] - wall.query(before)[0])[1:] / 2e-6
+        clearance = (wall.query(arm.sphere_centers(q))[0] - arm.sphere_set.radii)[1:]
+        room = CONFIG.barrier_gain * (clearance - CONFIG.margin) - 0.01 + rate
+        between = [np.linalg.norm(c[0] - c[3:], axis=1) for c in (ahead, arm.sphere_centers(q), before)]
+        own = CONFIG.barrier_gain * (between[1] - 0.1 - CONFIG.self_margin) + (between[0] - between[2]) / 2e-6
+        names = ["upper[0]", "upper[1]", "fore[0]", "fore[1]", "base[0]~fore[0]", "base[0]~fore[1]"]
+        all_rooms = np.concatenate([room, own])
+        assert found.barrier == pytest.approx(all_rooms.min(), abs=1e-7)
+        assert found.barrier_row == names[int(np.argmin(all_rooms))]
+        assert found.limit == pytest.approx(min(1.5 - velocity.max(), 1.5 + velocity.min()))
+    step = steered.step(q, goal(np.zeros(2)))
+    assert steered.margin_of(q, step.velocity).barrier >= -1e-6
+    assert steered.margin_of(q, np.array([0.0, 2.0])).limit_row == "elbow highest"
