@@ -52,9 +52,9 @@ def descend(
 ) -> Choice:
     """Solved, or relaxed where a slack remains; else the least violation; else hold still.
 
-    First without slacks, which is far smaller: where that is solved and no multiplier exceeds its row's slack cost, it
-    is the answer. The programs with slacks have a feasible point by construction, so the lower rungs are for a solver
-    that fails.
+    First without slacks, which is far smaller: where that is solved and no multiplier exceeds its row's slack cost,
+    it is the answer. The programs with slacks have a feasible point by construction, so the lower rungs are for a
+    solver that fails.
     """
     J, M = len(box[0]), sum(len(barrier) for barrier in barriers)
     firm = solver.solve(assemble_hard(costs, *box, barriers))

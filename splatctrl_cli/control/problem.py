@@ -14,10 +14,10 @@ from splatctrl_cli.records import Float64
 def assemble_hard(
     costs: Sequence[Cost], lowest: Float64, highest: Float64, barriers: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """The program over v alone, no row giving way; rows: upper and lower box (2 J), barriers (M). It may be infeasible.
+    """The program over v alone; rows: upper and lower box (2 J), barriers (M), none giving way. It may be infeasible.
 
-    Where it has a solution and no barrier's multiplier exceeds its slack cost, that is the solution of `assemble` too,
-    with all slacks zero: an L1 penalty above the multipliers is exact, and the slack signs take the rest of the cost.
+    Where it has a solution and no barrier's multiplier exceeds its slack cost, that is the solution of `assemble`,
+    with all slacks zero: an L1 penalty above the multipliers is exact, and the slacks' signs take the rest of the cost.
     """
     J = len(lowest)
     H, c = _objective(costs, J)
