@@ -75,8 +75,8 @@ def run(options: Options) -> Result:
         ratios=report.ratios,
         limits=limits,
         notes=[
-            "tree: scipy's cKDTree, distances to the nearest centre (or the nearest 8); no radius, kernel or gradient",
-            f"on grids it is asked one x-plane in {TREE_EVERY}, torch one point in {TORCH_EVERY}; times are scaled up",
+            "tree: scipy's cKDTree, distances to the nearest centre, or 8; no radius, kernel or gradient",
+            f"asked one x-plane in {TREE_EVERY} of a grid, torch one point in {TORCH_EVERY}; times scaled up",
             "torch: log-sum-exp of the Matern field in tiles of 250 points, float32, no gradient",
         ],
     )

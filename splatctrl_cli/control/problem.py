@@ -17,7 +17,7 @@ def assemble_hard(
     """The program over v alone; rows: upper and lower box (2 J), barriers (M), none giving way. It may be infeasible.
 
     Where it has a solution and no barrier's multiplier exceeds its slack cost, that is the solution of `assemble`,
-    with all slacks zero: an L1 penalty above the multipliers is exact, and the slacks' signs take the rest of the cost.
+    with all slacks zero: an L1 penalty above the multipliers is exact, and the slacks' signs take the rest.
     """
     J = len(lowest)
     H, c = _objective(costs, J)
