@@ -14,7 +14,7 @@ from splatctrl_cli.control.checks import check_config, check_model, checked_post
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import velocity_box
 from splatctrl_cli.control.qp import QpSolver, solver_named
-from splatctrl_cli.control.target import pose_error, reference_velocity
+from splatctrl_cli.control.target import Guide, pose_error, reference_velocity
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
@@ -160,18 +160,26 @@ class QpIkController:
         other.__dict__.update(self.__dict__, _field=field)
         return other
 
-    def step(self, q: Float64, T_world_goal: Float64, *, distance_rate: float | Float64 = 0.0) -> ControlStep:
+    def step(
+        self,
+        q: Float64,
+        T_world_goal: Float64,
+        *,
+        distance_rate: float | Float64 = 0.0,
+        guide: Guide | None = None,
+    ) -> ControlStep:
         """The joint velocity at q (J,) [rad] towards a goal pose (4, 4) of the controlled frame.
 
         distance_rate is dd/dt [m/s] of the moving spheres' distances, (M,) or one number, for a field that changes
-        with time. Raises InputError for a q that is not finite, NotEvaluableError where the field has no distance.
+        with time; guide says how the goal moves, None that it stands still. Raises InputError for a q that is not
+        finite, NotEvaluableError where the field has no distance.
         """
         q = checked_posture(self._model, q)
         model, config = self._model, self._config
         error = pose_error(model.frame_pose(q, self._frame), T_world_goal)
         box = velocity_box(q, model.lower, model.upper, model.velocity_limit, config.barrier_gain)
         rows = self._rows(q, box, distance_rate)
-        choice = descend(self._solver, self._costs(q, error), box, rows.for_qp, config)
+        choice = descend(self._solver, self._costs(q, error, guide), box, rows.for_qp, config)
         return self._reported(error, rows, choice, self._kept_scale(q, choice, rows))
 
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
@@ -201,15 +209,18 @@ class QpIkController:
             limit_row=self._limit_names[limit],
         )
 
-    def _costs(self, q: Float64, error: Float64) -> list[tasks.Cost]:
-        """The terms of III-E's objective: reach for the goal, lean home."""
+    def _costs(self, q: Float64, error: Float64, guide: Guide | None) -> list[tasks.Cost]:
+        """The terms of III-E's objective: reach for the goal, lean home; both on top of the goal's own motion."""
         config = self._config
         reference = reference_velocity(
             error, gain=config.pose_gain, max_linear=config.max_linear_speed, max_angular=config.max_angular_speed
         )
+        lean = config.posture_gain * ((self._home if guide is None else guide.posture) - q)
+        if guide is not None:
+            reference, lean = reference + guide.twist, lean + guide.velocity
         return [
             tasks.velocity_task(self._model.frame_jacobian(q, self._frame), reference, self._weight),
-            tasks.posture_task(config.posture_gain * (self._home - q), config.posture_weight),
+            tasks.posture_task(lean, config.posture_weight),
         ]
 
     def _rows(self, q: Float64, box: tuple[Float64, Float64], distance_rate: float | Float64) -> _Rows:

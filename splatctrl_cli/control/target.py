@@ -1,9 +1,22 @@
 """From a goal pose to an end-effector velocity, world-aligned, linear rows first."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.records import Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guide:
+    """How a goal itself moves: twist (6,) [m/s, rad/s], world, of its pose; posture (J,) [rad] that the arm leans to,
+    and the velocity (J,) [rad/s] of that posture.
+    """
+
+    twist: Float64
+    posture: Float64
+    velocity: Float64
 
 
 def rotation_vector(R: Float64) -> Float64:

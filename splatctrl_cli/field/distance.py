@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
@@ -45,6 +45,12 @@ class SphereField:
         local = self.spheres.points.relative(checked_points(points))
         score, gradient, _ = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)
         return score.astype(np.float64), gradient.astype(np.float64)
+
+    def nearest(self, points: Float64) -> NDArray[np.int64]:
+        """points (Q, 3) [m] -> the index (Q,) of the sphere that gives the distance."""
+        local = self.spheres.points.relative(checked_points(points))
+        entry = native.nearest(self.spheres.points.clusters, self.radii, local, threads=self._threads)[2]
+        return self.spheres.points.source[entry]
 
 
 class KernelField(Protocol):

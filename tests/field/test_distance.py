@@ -275,3 +275,12 @@ def test_of_equal_distances_the_exact_one_wins() -> None:
     safe = SafeField(SphereField(place, radius), GpdfField(place, radius, noise=0.0))
     distance, gradient = safe.query(np.array([[1.0, 0, 0]]))
     assert (distance[0], gradient[0, 0]) == (1.0, 1.0)
+
+
+def test_the_nearest_sphere_is_the_one_that_gives_the_distance() -> None:
+    random = np.random.default_rng(5)
+    centers, radii = random.uniform(-1, 1, (300, 3)), random.uniform(0.0, 0.3, 300)
+    points = random.uniform(-2, 2, (50, 3))
+    nearest = SphereField(centers, radii).nearest(points)
+    gaps = np.linalg.norm(points[:, None] - centers, axis=2) - radii
+    np.testing.assert_allclose(gaps[np.arange(50), nearest], gaps.min(axis=1), atol=1e-6)

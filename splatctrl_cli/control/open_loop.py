@@ -1,0 +1,93 @@
+"""Open loop: what the controller would have commanded at every logged state, beside what was done there."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.course import LoggedMotion, guided_goal
+from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.qp import QpSolver
+from splatctrl_cli.control.step import ControlStep, QpIkController, RowKind, VelocityMargin
+from splatctrl_cli.records import Bool, DistanceField, Float64
+
+FieldAt = Callable[[int], DistanceField]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenLoopTask:
+    """What the controller is asked for at each state: the logged motion itself, or a goal pose (4, 4) of the frame.
+
+    home (J,) [rad] is the posture leant to beside a goal pose; None is the middle of the limits.
+    """
+
+    frame: str
+    T_world_goal: Float64 | None = None
+    home: Float64 | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenLoopTrace:
+    """T states: the step that the controller would have taken and the room that the logged velocity left.
+
+    Both are None where the field has no distance. logged, commanded (T, J) [rad/s]; commanded is NaN there.
+    """
+
+    logged: Float64
+    commanded: Float64
+    steps: tuple[ControlStep | None, ...]
+    margins: tuple[VelocityMargin | None, ...]
+
+    @property
+    def difference(self) -> Float64:
+        """(T, J) [rad/s] commanded less logged."""
+        return self.commanded - self.logged
+
+
+def open_loop(
+    model: ArmModel,
+    config: ControlConfig,
+    motion: LoggedMotion,
+    task: OpenLoopTask,
+    field_at: FieldAt,
+    *,
+    has_distance: Bool,
+    solver: QpSolver | None = None,
+) -> OpenLoopTrace:
+    """Ask the controller at every logged state, each in the field known at its stamp; nothing is integrated.
+
+    Asked for the logged motion itself, the command is the logged velocity wherever no row shapes it: what differs is
+    the intervention. has_distance (T,): where it is False the controller is not asked.
+    """
+    field = field_at(int(motion.stamp_ns[0]))
+    controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
+    steps: list[ControlStep | None] = []
+    margins: list[VelocityMargin | None] = []
+    commanded = np.full(motion.velocity.shape, np.nan)
+    for index, (stamp, q, v) in enumerate(zip(motion.stamp_ns, motion.position, motion.velocity, strict=True)):
+        if not has_distance[index]:
+            steps.append(None)
+            margins.append(None)
+            continue
+        if field_at(int(stamp)) is not field:
+            field = field_at(int(stamp))
+            controller = controller.with_field(field)
+        goal, guide = (task.T_world_goal, None)
+        if goal is None:
+            goal, guide = guided_goal(model, task.frame, q, v)
+        step = controller.step(q, goal, guide=guide)
+        commanded[index] = step.velocity
+        steps.append(step)
+        margins.append(controller.margin_of(q, v))
+    return OpenLoopTrace(logged=motion.velocity, commanded=commanded, steps=tuple(steps), margins=tuple(margins))
+
+
+def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
+    """True where a row (of a kind) shapes the command, or without a kind where the step was not plainly taken."""
+    if step is None:
+        return False
+    if kind is not None:
+        return any(row.kind is kind for row in step.interventions)
+    return bool(step.interventions) or step.scale < 1 or step.rung is not Rung.SOLVED
