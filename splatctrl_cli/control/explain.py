@@ -1,0 +1,234 @@
+"""When and why: runs of states with something to say about them, as intervals with their worst value and names."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.audit import AuditTrace, Stamps
+from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.step import ControlStep, RowKind
+from splatctrl_cli.records import Bool, Float64
+
+MAX_NAMES = 12  # of an event; how many there are is in num_names
+
+
+class EventKind(StrEnum):
+    """What happened over an interval; the comment says what its worst value is."""
+
+    BELOW_MARGIN = "below-margin"  # least clearance [m]
+    IN_COLLISION = "in-collision"  # least clearance [m]
+    WITHOUT_DISTANCE = "without-distance"  # number of fields without one
+    UNKNOWN_SPACE = "unknown-space"  # largest share of sphere centres
+    OUTSIDE_LIMITS = "outside-limits"  # least distance to the limit, negative [rad]
+    STALE_MAP = "stale-map"  # oldest scene [s]
+    SCENE = "scene"  # largest multiplier of a row against the scene
+    SELF = "self"  # the same of a self-collision row
+    LIMIT = "limit"  # the same of a joint's position or velocity limit
+    RELAXED = "relaxed"  # largest slack [m/s]
+    MINIMUM_VIOLATION = "minimum-violation"  # largest residual
+    HOLD = "hold"  # least barrier clearance [m]
+    SCALED_BACK = "scaled-back"  # least scale
+    CANNOT_ACT = "cannot-act"  # least barrier clearance [m] where a violated row has no joint to turn
+
+
+INTERVENTIONS = frozenset(
+    {
+        *(EventKind.SCENE, EventKind.SELF, EventKind.LIMIT, EventKind.RELAXED),
+        *(EventKind.MINIMUM_VIOLATION, EventKind.HOLD, EventKind.SCALED_BACK),
+    }
+)
+"""Kinds in which the controller did something else than it was asked for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """What is nearest: its surface's distance [m] to a point and its place (3,) [m], world; a splat's index in the
+    file of its scene and its label, or a grid's cell.
+    """
+
+    distance: float
+    position: tuple[float, float, float]
+    splat: int | None = None
+    label: str | None = None
+    cell: tuple[int, int, int] | None = None
+
+    def __str__(self) -> str:
+        where = ", ".join(f"{v:.3f}" for v in self.position)
+        what = f"cell {self.cell}" if self.splat is None else f"{self.label} splat {self.splat}"
+        return f"{what} at ({where})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """An interval of consecutive states: first and last stamp [ns] and time [s], how many, the worst value and when,
+    its names in the order they came up (at most MAX_NAMES of num_names), and the obstacle at the worst.
+
+    source: the field it is by, empty where none is; state: index of the worst.
+    """
+
+    kind: EventKind
+    source: str
+    first_ns: int
+    last_ns: int
+    start_s: float
+    end_s: float
+    num_states: int
+    worst: float
+    worst_s: float
+    state: int
+    names: tuple[str, ...]
+    num_names: int
+    obstacle: Obstacle | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal:
+    """What makes events of one kind: is_on (T,), value (T,), the names at a state, and which end is the worse."""
+
+    kind: EventKind
+    is_on: Bool
+    value: Float64
+    names_at: Callable[[int], Sequence[str]]
+    is_high_worse: bool = True
+    source: str = ""
+
+
+def runs_of(is_on: Bool) -> list[tuple[int, int]]:
+    """First and one past the last index of every run of true values (T,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_on, [False]]).astype(np.int8)))
+    return [(int(first), int(end)) for first, end in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def events_of(stamp_ns: Stamps, signals: Iterable[Signal]) -> tuple[Event, ...]:
+    """The intervals of all signals (T,), by their start."""
+    events = [_event(stamp_ns, signal, first, end) for signal in signals for first, end in runs_of(signal.is_on)]
+    return tuple(sorted(events, key=lambda event: (event.first_ns, -event.last_ns)))
+
+
+def audit_signals(audit: AuditTrace, margin: float, spheres: Sequence[str], joints: Sequence[str]) -> list[Signal]:
+    """What the clearances, limits and known space of T states amount to."""
+    signals = []
+    for source, clearance in audit.clearance.items():
+        for kind, bound in ((EventKind.BELOW_MARGIN, margin), (EventKind.IN_COLLISION, 0.0)):
+            is_on = clearance.distance < bound
+            names = _names_of(spheres, clearance.sphere)
+            signals.append(_low(kind, is_on, clearance.distance, names, source))
+        is_blank = np.isnan(clearance.distance)
+        names = _names_of(spheres, clearance.sphere)
+        signals.append(
+            Signal(
+                kind=EventKind.WITHOUT_DISTANCE,
+                is_on=is_blank,
+                value=is_blank.astype(np.float64),
+                names_at=names,
+                source=source,
+            )
+        )
+    unknown = np.nan_to_num(audit.unknown_share)
+    signals.append(Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown, names_at=_nobody))
+    outside = audit.limit_margin
+    signals.append(_low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, _names_of(joints, audit.limit_joint)))
+    return signals
+
+
+def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
+    """Where the scene in use is older than allowed; age_s (T,) [s], NaN where a scene has no time."""
+    return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s), names_at=_nobody)
+
+
+def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
+    """What the controller did at T states; None where it was not asked."""
+    signals = [_intervention_signal(steps, kind) for kind in RowKind]
+    slack = _of(steps, lambda step: max((row.slack for row in step.relaxed), default=0.0))
+    signals.append(
+        Signal(
+            kind=EventKind.RELAXED,
+            is_on=slack > 0,
+            value=slack,
+            names_at=lambda i: [row.name for row in _asked(steps, i).relaxed],
+        )
+    )
+    residual, clearance = _of(steps, lambda step: step.residual), _of(steps, lambda step: step.clearance)
+    is_least = _of(steps, lambda step: float(step.rung is Rung.MINIMUM_VIOLATION)) > 0
+    is_hold = _of(steps, lambda step: float(step.rung is Rung.HOLD)) > 0
+    scale = _of(steps, lambda step: step.scale, otherwise=1.0)
+    cannot = _of(steps, lambda step: float(len(step.violated_fixed))) > 0
+
+    def nearest(i: int) -> Sequence[str]:
+        return [_asked(steps, i).nearest]
+
+    signals += [
+        Signal(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=residual, names_at=nearest),
+        _low(EventKind.HOLD, is_hold, clearance, nearest),
+        _low(EventKind.SCALED_BACK, (scale < 1) & ~is_hold, scale, nearest),
+        _low(EventKind.CANNOT_ACT, cannot, clearance, lambda i: _asked(steps, i).violated_fixed),
+    ]
+    return signals
+
+
+def first_intervention(events: Sequence[Event]) -> Event | None:
+    """The earliest event in which the controller did something else than it was asked for."""
+    return next((event for event in events if event.kind in INTERVENTIONS), None)
+
+
+def _event(stamp_ns: Stamps, signal: Signal, first: int, end: int) -> Event:
+    values = signal.value[first:end]
+    worst = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
+    names = tuple(dict.fromkeys(name for i in range(first, end) for name in signal.names_at(i)))
+    seconds = (stamp_ns - stamp_ns[0]) * 1e-9
+    return Event(
+        kind=signal.kind,
+        source=signal.source,
+        first_ns=int(stamp_ns[first]),
+        last_ns=int(stamp_ns[end - 1]),
+        start_s=float(seconds[first]),
+        end_s=float(seconds[end - 1]),
+        num_states=end - first,
+        worst=float(signal.value[worst]),
+        worst_s=float(seconds[worst]),
+        state=worst,
+        names=names[:MAX_NAMES],
+        num_names=len(names),
+    )
+
+
+def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> Signal:
+    def largest(step: ControlStep) -> float:
+        return max((row.multiplier for row in step.interventions if row.kind is kind), default=0.0)
+
+    value = _of(steps, largest)
+    return Signal(
+        kind=EventKind(kind.value),
+        is_on=value > 0,
+        value=value,
+        names_at=lambda i: [row.name for row in _asked(steps, i).interventions if row.kind is kind],
+    )
+
+
+def _low(
+    kind: EventKind, is_on: Bool, value: Float64, names_at: Callable[[int], Sequence[str]], source: str = ""
+) -> Signal:
+    return Signal(kind=kind, is_on=is_on, value=value, names_at=names_at, is_high_worse=False, source=source)
+
+
+def _of(
+    steps: Sequence[ControlStep | None], value: Callable[[ControlStep], float], otherwise: float = 0.0
+) -> Float64:
+    return np.array([otherwise if step is None else value(step) for step in steps], dtype=np.float64)
+
+
+def _asked(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
+    step = steps[index]
+    assert step is not None
+    return step
+
+
+def _names_of(names: Sequence[str], index: NDArray[np.int64]) -> Callable[[int], Sequence[str]]:
+    return lambda i: [names[int(index[i])]]
+
+
+def _nobody(_: int) -> Sequence[str]:
+    return ()

@@ -1,0 +1,138 @@
+"""Events: intervals, their worst values and names."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.audit import audit
+from splatctrl_cli.control.explain import (
+    Event,
+    EventKind,
+    Obstacle,
+    Signal,
+    audit_signals,
+    events_of,
+    first_intervention,
+    runs_of,
+    stale_signal,
+    step_signals,
+)
+from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.step import ControlStep, Intervention, QpIkController, RowKind, RowSlack
+from splatctrl_cli.records import JointState
+from tests.control.fakes import Balls, PlanarArm, far_away
+
+STAMPS = np.arange(6, dtype=np.int64) * 100_000_000
+
+
+def step(**changes: object) -> ControlStep:
+    arm = PlanarArm()
+    controller = QpIkController(arm, ControlConfig(), far_away(), frame="tip")
+    plain = controller.step(np.array([0.3, 0.6]), arm.frame_pose(np.array([0.5, 0.4]), "tip"))
+    return replace(plain, **changes)  # type: ignore[arg-type]
+
+
+def row(name: str, kind: RowKind, multiplier: float) -> Intervention:
+    return Intervention(name=name, kind=kind, multiplier=multiplier)
+
+
+def test_runs_are_cut_where_the_signal_goes_off() -> None:
+    assert runs_of(np.array([True, True, False, True])) == [(0, 2), (3, 4)]
+    assert runs_of(np.zeros(3, np.bool_)) == []
+
+
+def test_an_event_has_the_worst_value_of_its_run_and_every_name_in_order() -> None:
+    signal = Signal(
+        kind=EventKind.SCENE,
+        is_on=np.array([False, True, True, True, False, True]),
+        value=np.array([9.0, 1, 3, 2, 9, 5]),
+        names_at=lambda i: ["a", "b"] if i == 3 else ["b"],
+    )
+    first, second = events_of(STAMPS, [signal])
+    assert (first.start_s, first.end_s, first.num_states) == (pytest.approx(0.1), pytest.approx(0.3), 3)
+    assert (first.worst, first.worst_s, first.state) == (3.0, pytest.approx(0.2), 2)
+    assert first.names == ("b", "a") and first.num_names == 2
+    assert second.first_ns == second.last_ns == 500_000_000 and second.worst == 5.0
+    (low,) = events_of(STAMPS, [replace(signal, is_on=signal.value < 4, is_high_worse=False)])
+    assert low.worst == 1.0
+
+
+def test_many_names_are_counted_and_not_all_listed() -> None:
+    signal = Signal(
+        kind=EventKind.SELF,
+        is_on=np.ones(6, np.bool_),
+        value=np.ones(6),
+        names_at=lambda i: [f"{i}{j}" for j in "abcd"],
+    )
+    (event,) = events_of(STAMPS, [signal])
+    assert len(event.names) == 12 and event.num_names == 24
+
+
+def test_a_clearance_below_the_margin_names_its_sphere_and_a_collision_lies_within_it() -> None:
+    ball, arm = Balls([[0.9, 0.25, 0.0]], [0.1]), PlanarArm()
+    states = [
+        JointState(stamp_ns=int(t), position=np.array([angle, 0.0]), velocity=np.zeros(2))
+        for t, angle in zip(STAMPS, [-1.0, 0.05, 0.15, 0.25, 0.5, 3.0], strict=True)
+    ]
+    trace = audit(arm, states, lambda _: {"exact": lambda points: ball.query(points)[0]})
+    names = ("base[0]", "upper[0]", "upper[1]", "fore[0]", "fore[1]")
+    found = {e.kind: e for e in events_of(trace.stamp_ns, audit_signals(trace, 0.08, names, arm.joint_names))}
+    below, collision, outside = (
+        found[k] for k in (EventKind.BELOW_MARGIN, EventKind.IN_COLLISION, EventKind.OUTSIDE_LIMITS)
+    )
+    assert below.first_ns <= collision.first_ns <= collision.last_ns <= below.last_ns
+    assert below.worst == collision.worst == pytest.approx(trace.clearance["exact"].distance.min())
+    assert "fore[1]" in below.names and below.source == "exact" and collision.worst_s == pytest.approx(0.3)
+    assert outside.names == ("shoulder",) and outside.worst == pytest.approx(-0.1)
+    assert EventKind.UNKNOWN_SPACE not in found and EventKind.WITHOUT_DISTANCE not in found
+
+
+def test_a_state_without_a_distance_is_an_event_and_not_below_the_margin() -> None:
+    states = [JointState(stamp_ns=int(t), position=np.array([0.1, 0.1]), velocity=np.zeros(2)) for t in STAMPS]
+    trace = audit(PlanarArm(), states, lambda _: {"exact": lambda points: np.full(len(points), np.nan)})
+    names = ("base[0]", "upper[0]", "upper[1]", "fore[0]", "fore[1]")
+    (event,) = events_of(trace.stamp_ns, audit_signals(trace, 0.02, names, ("shoulder", "elbow")))
+    assert event.kind is EventKind.WITHOUT_DISTANCE and event.num_states == 6
+
+
+def test_steps_become_events_by_what_shaped_them() -> None:
+    steps = [
+        step(),
+        step(interventions=(row("fore[1]", RowKind.SCENE, 0.5), row("elbow highest", RowKind.LIMIT, 0.1))),
+        step(interventions=(row("fore[0]", RowKind.SCENE, 2.5),), scale=0.5),
+        step(rung=Rung.RELAXED, relaxed=(RowSlack(name="fore[1]", slack=0.03),)),
+        step(rung=Rung.HOLD, scale=0.0),
+        None,
+    ]
+    found = {event.kind: event for event in events_of(STAMPS, step_signals(steps))}
+    assert set(found) == {
+        EventKind.SCENE, EventKind.LIMIT, EventKind.SCALED_BACK, EventKind.RELAXED, EventKind.HOLD
+    }  # fmt: skip
+    assert found[EventKind.SCENE].names == ("fore[1]", "fore[0]") and found[EventKind.SCENE].worst == 2.5
+    assert found[EventKind.LIMIT].names == ("elbow highest",) and found[EventKind.SCALED_BACK].worst == 0.5
+    assert found[EventKind.RELAXED].worst == 0.03 and found[EventKind.HOLD].first_ns == 400_000_000
+
+
+def test_the_first_intervention_is_the_controllers_and_not_the_motions() -> None:
+    signals = [
+        Signal(kind=EventKind.BELOW_MARGIN, is_on=np.arange(6) < 2, value=np.zeros(6), names_at=lambda _: ["a"]),
+        Signal(kind=EventKind.LIMIT, is_on=np.arange(6) > 3, value=np.ones(6), names_at=lambda _: ["elbow highest"]),
+    ]
+    first = first_intervention(events_of(STAMPS, signals))
+    assert isinstance(first, Event) and first.kind is EventKind.LIMIT
+    assert first_intervention(events_of(STAMPS, signals[:1])) is None
+
+
+def test_a_map_is_stale_where_it_is_older_than_allowed() -> None:
+    age = np.array([np.nan, 0.1, 0.6, 1.2, 0.0, 0.4])
+    (event,) = events_of(STAMPS, [stale_signal(age, 0.5)])
+    assert (event.kind, event.num_states, event.worst) == (EventKind.STALE_MAP, 2, 1.2)
+
+
+def test_an_obstacle_says_what_and_where() -> None:
+    assert str(Obstacle(distance=0.1, position=(1, 0, 0.5), splat=7, label="human")) == (
+        "human splat 7 at (1.000, 0.000, 0.500)"
+    )
+    assert str(Obstacle(distance=0.1, position=(1, 0, 0.5), cell=(1, 2, 3))).startswith("cell (1, 2, 3) at")
