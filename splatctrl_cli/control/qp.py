@@ -72,13 +72,15 @@ class ClarabelSolver:
     """Clarabel, an interior point method; one thread, so that the same program gives the same bits."""
 
     def __init__(self, *, tolerance: float | None = None) -> None:
-        """tolerance: of feasibility and gap (default: Clarabel's own, 1e-8)."""
+        """tolerance: of feasibility, gap and the refinement of each linear solve (default: Clarabel's own, 1e-8)."""
         self._settings = clarabel.DefaultSettings()
         self._settings.verbose = False
         self._settings.max_threads = 1
         self._settings.presolve_enable = False  # every row keeps its multiplier
         if tolerance is not None:
             self._settings.tol_feas = self._settings.tol_gap_abs = self._settings.tol_gap_rel = tolerance
+            self._settings.iterative_refinement_reltol = self._settings.iterative_refinement_abstol = 0.1 * tolerance
+            self._settings.iterative_refinement_max_iter = 30
 
     def solve(self, program: QuadraticProgram) -> QpSolution:
         """Solve; a program whose numbers are not finite comes back unsolved."""

@@ -110,25 +110,20 @@ def test_the_same_program_gives_the_same_bits() -> None:
 
 def test_two_solvers_agree_on_random_steps() -> None:
     rng = np.random.default_rng(0)
-    tight, exact = ClarabelSolver(tolerance=1e-12), DaqpSolver()
-    num_active, num_compared = 0, 0
+    tight, exact, num_active = ClarabelSolver(tolerance=1e-14), DaqpSolver(), 0
     for _ in range(300):
         *_, costs = seven_joint_costs(rng)
         num_rows = int(rng.integers(0, 40))
         rows = barrier(0.4 * rng.normal(size=(num_rows, 7)), rng.uniform(-0.2, 0.6, num_rows))
         program = assemble(costs, np.full(7, -1.0), np.full(7, 1.0), [rows])
         ours, theirs = exact.solve(program), tight.solve(program)
-        assert ours.is_solved
+        assert ours.is_solved and theirs.is_solved
         assert ours.residuals.worst < 1e-12
         num_active += int(np.count_nonzero(ours.multipliers > 1e-6))
-        if not theirs.is_solved:  # its last digit is out of reach here and there: AlmostSolved
-            continue
-        num_compared += 1
         value = [0.5 * z @ program.H @ z + program.c @ z for z in (ours.z, theirs.z)]
         assert abs(value[0] - value[1]) < 1e-8 * (1 + abs(value[1]))
-        np.testing.assert_allclose(ours.z[:7], theirs.z[:7], atol=3e-5)
+        np.testing.assert_allclose(ours.z[:7], theirs.z[:7], atol=1e-5)
     assert num_active > 1000
-    assert num_compared > 200
 
 
 @pytest.mark.parametrize("name", ["clarabel", "daqp"])
