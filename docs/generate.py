@@ -50,9 +50,21 @@ def cli_page() -> str:
         EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
     ]
     for name, command in commands.choices.items():
-        lines += ["", f"## {name}", "", _usage(name, command), "", command.description, ""]
-        lines += _table(("argument", "meaning"), _rows(command))
+        lines += _command_section("##", name, command)
     return "\n".join(lines) + "\n"
+
+
+def _command_section(level: str, name: str, parser: argparse.ArgumentParser) -> list[str]:
+    """Heading, usage, summary and arguments; of a command with actions, a section for each action below it."""
+    lines = ["", f"{level} {name}", "", _usage(name, parser), "", parser.description, ""]
+    nested = next((a for a in parser._actions if isinstance(a, argparse._SubParsersAction)), None)
+    if nested is None:
+        return [*lines, *_table(("argument", "meaning"), _rows(parser))]
+    rows = [(f"`{name} {action.dest}`", action.help) for action in nested._choices_actions]
+    lines += _table(("action", "what it does"), rows)
+    for action, below in nested.choices.items():
+        lines += _command_section(f"{level}#", f"{name} {action}", below)
+    return lines
 
 
 def _usage(name: str, parser: argparse.ArgumentParser) -> str:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
-from splatctrl_cli.robot.spheres import matched_links, read_spheres, spheres_of
+from splatctrl_cli.robot.sphere_files import read_spheres
+from splatctrl_cli.robot.spheres import matched_links, spheres_of
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 Index = NDArray[np.int64]
@@ -66,27 +67,28 @@ class RobotModel:
     def from_urdf(
         cls,
         urdf: Path,
-        spheres: Path | None = None,
+        spheres: Path | SphereSet | None = None,
         *,
         T_world_base: Float64 | None = None,
         locked: Mapping[str, float] | None = None,
     ) -> "RobotModel":
-        """The robot of a URDF file, its collision spheres from a YAML file, else from the URDF's own spheres.
+        """The robot of a URDF file with the spheres of a file or a set, else with those that the URDF itself has.
 
         T_world_base (4, 4) places the URDF's root link (default: at the world's origin); locked holds joints still
-        at a value [rad or m], e.g. fingers that no log moves. Raises InputError, naming file and remedy.
+        at a value [rad or m], e.g. fingers that no log moves, and with each the joints that mimic it. Raises
+        InputError, naming file and remedy.
         """
         file = read_urdf(urdf)
         try:
             model = pinocchio.buildModelFromXML(file.text)
         except (ValueError, RuntimeError) as error:
             raise InputError(f"{urdf}: not a URDF that can be built: {error}") from None
-        model = _without(model, dict(locked or {}), urdf)
+        model = _without(model, file.with_followers(locked or {}), urdf)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
             return cls(file, model, spheres_of(file), T, (), are_links_renamed=False)
-        asked = read_spheres(spheres)
-        sphere_set, left_out = matched_links(asked, file, spheres)
+        asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
+        sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
         is_renamed = not set(asked.links) & set(file.links)
         return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed)
 

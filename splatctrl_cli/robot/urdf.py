@@ -1,5 +1,6 @@
-"""What a URDF says apart from its kinematics: links, joints and primitive shapes. Untrusted XML is read safely."""
+"""What a URDF says apart from its kinematics: links, joints and collision shapes. Untrusted XML is read safely."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
 
 MOVABLE = ("revolute", "continuous", "prismatic")
+LIMITED = ("revolute", "prismatic")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,27 +29,94 @@ class Shape:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UrdfFile:
-    """The checked text of a URDF, its link names, (parent, child) links of its joints and its collision shapes.
+class MeshShape:
+    """A collision mesh of one link: the file as the URDF names it, its scale (3,), T_link_mesh (4, 4)."""
 
-    num_meshes counts the collision meshes, which are not among the shapes. solid_links have a collision or visual
-    element: there is something to bump into.
+    link: str
+    filename: str
+    scale: tuple[float, ...]
+    T_link_mesh: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joint:
+    """One joint: T_parent_child (4, 4) at position 0, and whom it mimics: (joint, multiplier, offset) or None."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    T_parent_child: Float64
+    mimic: tuple[str, float, float] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfFile:
+    """The checked text of a URDF, its link names, joints and collision shapes.
+
+    other_shapes: (link, tag) of collision elements that are neither a primitive nor a mesh, such as a capsule.
+    solid_links have a collision or visual element: there is something to bump into.
     """
 
     path: Path
     text: str
     links: tuple[str, ...]
-    parents: tuple[tuple[str, str], ...]
+    joints: tuple[Joint, ...]
     shapes: tuple[Shape, ...]
-    num_meshes: int
+    meshes: tuple[MeshShape, ...]
+    other_shapes: tuple[tuple[str, str], ...]
     solid_links: tuple[str, ...]
+
+    @property
+    def parents(self) -> tuple[tuple[str, str], ...]:
+        """(parent, child) links of the joints."""
+        return tuple((joint.parent, joint.child) for joint in self.joints)
+
+    @property
+    def collision_links(self) -> tuple[str, ...]:
+        """Links with collision geometry, in the file's order."""
+        named = {
+            *(s.link for s in self.shapes),
+            *(m.link for m in self.meshes),
+            *(link for link, _ in self.other_shapes),
+        }
+        return tuple(link for link in self.links if link in named)
+
+    def rigid_bodies(self, movable: Collection[str] | None = None) -> dict[str, tuple[str, Float64]]:
+        """For each link the link that leads its rigid body, and T_leader_link (4, 4).
+
+        Links joined by fixed joints are one body, led by the link nearest to the root. `movable`: the joints that
+        move (default: all that are not fixed); a joint that is locked elsewhere than at 0 does not belong here.
+        """
+        by_child = {joint.child: joint for joint in self.joints}
+        bodies: dict[str, tuple[str, Float64]] = {}
+        for link in self.links:
+            leader, T = link, np.eye(4)
+            while leader in by_child and not _moves(by_child[leader], movable):
+                T = by_child[leader].T_parent_child @ T
+                leader = by_child[leader].parent
+            bodies[link] = (leader, T)
+        return bodies
+
+    def with_followers(self, locked: Mapping[str, float]) -> dict[str, float]:
+        """`locked` joints at their values, and with each the joints that mimic it, where they are not named."""
+        followers = {
+            joint.name: joint.mimic[1] * locked[joint.mimic[0]] + joint.mimic[2]
+            for joint in self.joints
+            if joint.mimic is not None and joint.mimic[0] in locked and joint.kind != "fixed"
+        }
+        return {**followers, **locked}
+
+
+def _moves(joint: Joint, movable: Collection[str] | None) -> bool:
+    return joint.kind != "fixed" if movable is None else joint.name in movable
 
 
 def read_urdf(path: Path) -> UrdfFile:
     """The URDF at `path`, once it is known to be one robot with at least one movable joint.
 
-    Raises InputError for a file that is missing or no URDF, several root links, or no movable joint (which is what
-    an unexpanded xacro looks like).
+    Raises InputError for a file that is missing or no URDF, several root links, a joint without the limits it needs,
+    or no movable joint (which is what an unexpanded xacro looks like).
     """
     text, root = _parse(path)
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
@@ -61,28 +130,24 @@ def read_urdf(path: Path) -> UrdfFile:
             remedy="an unexpanded xacro looks like this; expand it first: xacro FILE.xacro > FILE.urdf",
         )
     _check_tree(path, links, joints)
-    shapes: list[Shape] = []
-    num_meshes = 0
-    for link in root.findall("link"):
-        for collision in link.findall("collision"):
-            shape = _shape(path, link.get("name"), collision)
-            if shape is None:
-                num_meshes += 1
-            else:
-                shapes.append(shape)
+    found = [
+        _shape(path, str(link.get("name")), collision)
+        for link in root.findall("link")
+        for collision in link.findall("collision")
+    ]
     solid = tuple(
         str(link.get("name"))
         for link in root.findall("link")
         if link.find("collision") is not None or link.find("visual") is not None
     )
-    parents = tuple((joint.find("parent").get("link"), joint.find("child").get("link")) for joint in joints)
     return UrdfFile(
         path=path,
         text=text,
         links=links,
-        parents=parents,
-        shapes=tuple(shapes),
-        num_meshes=num_meshes,
+        joints=tuple(_joint(path, joint) for joint in joints),
+        shapes=tuple(shape for shape in found if isinstance(shape, Shape)),
+        meshes=tuple(shape for shape in found if isinstance(shape, MeshShape)),
+        other_shapes=tuple(shape for shape in found if isinstance(shape, tuple)),
         solid_links=solid,
     )
 
@@ -120,12 +185,56 @@ def _check_tree(path: Path, links: tuple[str, ...], joints: list[Any]) -> None:
         raise InputError(f"{path}: expected one root link, got {got}", remedy="join the links with fixed joints")
 
 
-def _shape(path: Path, link: str, collision: Any) -> Shape | None:
+def _joint(path: Path, joint: Any) -> Joint:
+    where = f"{path}: joint '{joint.get('name')}'"
+    kind = _attribute(path, joint, "type")
+    if kind in LIMITED:
+        _check_limits(where, kind, joint.find("limit"))
+    mimic = joint.find("mimic")
+    follows = None
+    if mimic is not None:
+        factor, offset = (
+            _numbers(where, mimic.get(key, text), 1)[0] for key, text in (("multiplier", "1"), ("offset", "0"))
+        )
+        follows = (_attribute(path, mimic, "joint"), factor, offset)
+    return Joint(
+        name=str(joint.get("name")),
+        kind=kind,
+        parent=joint.find("parent").get("link"),
+        child=joint.find("child").get("link"),
+        T_parent_child=_origin(where, joint.find("origin")),
+        mimic=follows,
+    )
+
+
+def _check_limits(where: str, kind: str, limit: Any) -> None:
+    remedy = 'write <limit lower="..." upper="..." velocity="..." effort="..."/>, from the data sheet of the robot'
+    if limit is None:
+        raise InputError(f"{where}: {kind}: expected limits, got none", remedy=remedy)
+    lower, upper = (_numbers(f"{where}: limit {key}", limit.get(key, "0"), 1)[0] for key in ("lower", "upper"))
+    if lower >= upper:
+        raise InputError(f"{where}: limits: expected lower < upper, got {lower:g} and {upper:g}", remedy=remedy)
+    for key in ("velocity", "effort"):
+        if limit.get(key) is None:
+            raise InputError(f"{where}: limits: expected {key}, got none", remedy=remedy)
+    if _numbers(f"{where}: limit velocity", limit.get("velocity"), 1)[0] <= 0:
+        raise InputError(f"{where}: limits: expected a velocity above 0, got {limit.get('velocity')}", remedy=remedy)
+
+
+def _shape(path: Path, link: str, collision: Any) -> Shape | MeshShape | tuple[str, str]:
+    """A primitive, a mesh, or (link, tag) of what is neither."""
     geometry = collision.find("geometry")
     element = None if geometry is None else next(iter(geometry), None)
     if element is None:
         raise InputError(f"{path}: link '{link}': collision without geometry")
     where = f"{path}: link '{link}': {element.tag}"
+    T_link_shape = _origin(where, collision.find("origin"))
+    if element.tag == "mesh":
+        scale = _numbers(f"{where}: scale", element.get("scale", "1 1 1"), 3)
+        if 0 in scale:
+            raise InputError(f"{where}: scale: expected three numbers that are not 0, got {scale}")
+        filename = _attribute(path, element, "filename")
+        return MeshShape(link=link, filename=filename, scale=scale, T_link_mesh=T_link_shape)
     if element.tag == "box":
         size = _numbers(where, element.get("size"), 3)
     elif element.tag == "cylinder":
@@ -133,11 +242,10 @@ def _shape(path: Path, link: str, collision: Any) -> Shape | None:
     elif element.tag == "sphere":
         size = _numbers(where, element.get("radius"), 1)
     else:
-        return None
+        return link, str(element.tag)
     if min(size) <= 0:
         raise InputError(f"{where}: expected sizes above 0, got {size}")
-    origin = collision.find("origin")
-    return Shape(link=link, kind=element.tag, size=size, T_link_shape=_origin(where, origin))
+    return Shape(link=link, kind=element.tag, size=size, T_link_shape=T_link_shape)
 
 
 def _origin(where: str, origin: Any) -> Float64:

@@ -54,6 +54,7 @@ class Work:
             "export": [scene],
             "sdf-bake": [scene, "--voxel", "0.5"],
             "score": [scene, "--reference", self.log, "--cameras", "cam1", "--threads", "1"],
+            "robot": ["spheres", "--urdf", urdf],
             "replay": [self.log, "--scene", scene, "--urdf", urdf, "--max-unknown", "1"],
             "demo": [],
         }
@@ -115,7 +116,8 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c != "info"])
 def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, command: str) -> None:
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--colour")
-    assert_refused(done, 2, f"{command}: unrecognized arguments: --colour; ")
+    action = " spheres" if command == "robot" else ""
+    assert_refused(done, 2, f"{command}{action}: unrecognized arguments: --colour; ")
     assert not list(tmp_path.iterdir())
 
 
@@ -180,12 +182,13 @@ def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command
 
 
 WRITERS = [command for command in COMMANDS if command != "info"]
+FILE_WRITERS = ("export", "robot")  # the others write a folder
 
 
 @pytest.mark.parametrize("command", WRITERS)
 def test_an_output_that_exists_is_kept_without_force(work: Work, tmp_path: Path, command: str) -> None:
     out = tmp_path / "out"
-    file = out if command == "export" else out / "run.json"
+    file = out if command in FILE_WRITERS else out / "run.json"
     file.parent.mkdir(exist_ok=True)
     file.write_text("precious")
     done = splatctrl(*work.arguments(command, out), "-q")
@@ -199,7 +202,7 @@ def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: 
     precious = tmp_path / "out" / "precious"
     precious.parent.mkdir()
     precious.write_text("mine")
-    said = "is a folder, expected a file" if command == "export" else "was not written by splatctrl (no run.json)"
+    said = "is a folder, expected a file" if command in FILE_WRITERS else "was not written by splatctrl (no run.json)"
     assert_refused(splatctrl(*work.arguments(command, precious.parent), "-q", "--force"), 2, said, "another --out")
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [precious]
 

@@ -1,0 +1,293 @@
+"""How much of a robot's collision surface its spheres leave uncovered: proven bounds, not samples.
+
+phi(p) = min_i |p - c_i| - r_i is the signed distance to a union of balls where it matters: positive exactly outside
+it, and then the distance to it. Each term is convex, so over a triangle it is largest at a corner, and
+
+    max over the triangle of phi  <=  min_i max_k |v_k - c_i| - r_i,
+
+which is exact where one ball is nearest to all of it. Triangles are halved until this bound and the largest phi found
+at a corner agree to a tolerance. Triangles (F, 3, 3), centers (S, 3), radii (S,), all [m] in one frame.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.robot.solids import Solid, SolidDistance, read_solids
+from splatctrl_cli.robot.urdf import UrdfFile
+
+TOLERANCE = 1e-4  # [m] between the proven and the found deficit
+RESOLUTION = 2e-3  # [m] longest edge of a triangle that is counted as covered or not by its middle
+PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deficit:
+    """The largest distance of a surface point outside all spheres: found <= truth <= proven [m].
+
+    Negative where all of the surface is inside (by at least ``-proven``). place (3,): where `found` was found.
+    """
+
+    proven: float
+    found: float
+    place: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkCoverage:
+    """How the spheres of one link (and of what is fixed to it) cover its collision surface.
+
+    area [m2]; uncovered_area [m2] and the bounds that hold for certain; deficit is None where there is no sphere;
+    protrusion [m]: no sphere sticks out of the body farther (a bound, exact where the body is convex), worst_sphere
+    its index in the sphere set; is_closed: the collision surface has an inside, else it was taken for its hull.
+    """
+
+    link: str
+    num_spheres: int
+    area: float
+    uncovered_area: float
+    uncovered_bounds: tuple[float, float]
+    deficit: Deficit | None
+    protrusion: float
+    worst_sphere: int
+    is_closed: bool
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether every point of the surface is proven to lie in a sphere."""
+        return self.deficit is not None and self.deficit.proven <= 0
+
+    @property
+    def uncovered_share(self) -> float:
+        """Share of the surface outside all spheres."""
+        return self.uncovered_area / self.area
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoverageReport:
+    """Coverage by link; stray_spheres counts spheres on links without collision geometry, which nothing measures."""
+
+    links: tuple[LinkCoverage, ...]
+    num_spheres: int
+    stray_spheres: int
+
+    @property
+    def bare_links(self) -> tuple[str, ...]:
+        """Links with collision geometry and no sphere: nothing is covered there."""
+        return tuple(link.link for link in self.links if link.deficit is None)
+
+    @property
+    def open_links(self) -> tuple[str, ...]:
+        """Links whose surface is not closed."""
+        return tuple(link.link for link in self.links if not link.is_closed)
+
+    @property
+    def worst(self) -> LinkCoverage | None:
+        """The link with the largest proven deficit; None where a link is bare, for then no distance bounds it."""
+        return None if self.bare_links else max(self.links, key=_proven)
+
+    @property
+    def max_deficit(self) -> float | None:
+        """The largest distance [m] of a surface point outside all spheres, proven; None where a link is bare."""
+        return None if self.worst is None else max(0.0, _proven(self.worst))
+
+    @property
+    def uncovered_share(self) -> float:
+        """Share of the collision surface of all links outside all spheres."""
+        return sum(link.uncovered_area for link in self.links) / sum(link.area for link in self.links)
+
+    @property
+    def max_protrusion(self) -> float:
+        """How far [m] any sphere sticks out of its body, at most."""
+        return max(link.protrusion for link in self.links)
+
+
+def coverage_deficit(
+    urdf: UrdfFile, spheres: SphereSet, *, folders: Sequence[Path] = (), resolution: float = RESOLUTION
+) -> CoverageReport:
+    """How `spheres` (links by the URDF's names) cover the collision surface of each link of `urdf`.
+
+    A link's surface may lie in spheres of any link that fixed joints join to it. folders: see `read_solids`. Raises
+    InputError for a mesh that is missing, no collision geometry, or a sphere on a link that is not there.
+    """
+    return coverage_of_solids(urdf, read_solids(urdf, folders), spheres, resolution=resolution)
+
+
+def coverage_of_solids(
+    urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, *, resolution: float = RESOLUTION
+) -> CoverageReport:
+    """As `coverage_deficit`, of collision geometry that is already read."""
+    bodies = urdf.rigid_bodies()
+    unknown = [link for link in spheres.links if link not in bodies]
+    if unknown:
+        raise InputError(
+            f"sphere set: link '{unknown[0]}' is not in {urdf.path}", remedy=f"links there: {', '.join(urdf.links)}"
+        )
+    leaders = {link: leader for link, (leader, _) in bodies.items()}
+    measured = {leaders[link] for link in solids}
+    links = []
+    for link, parts in solids.items():
+        member = np.array([leaders[owner] == leaders[link] for owner in spheres.links], dtype=bool)
+        centers = np.array(
+            [
+                transform_points(invert_transform(bodies[link][1]) @ bodies[spheres.links[i]][1], spheres.centers[i])
+                for i in np.flatnonzero(member)
+            ]
+        ).reshape(-1, 3)
+        own = np.array([spheres.links[i] == link for i in np.flatnonzero(member)], dtype=bool)
+        links.append(_of_link(link, parts, centers, spheres.radii[member], np.flatnonzero(member), own, resolution))
+    return CoverageReport(
+        links=tuple(links),
+        num_spheres=len(spheres.radii),
+        stray_spheres=sum(leaders[link] not in measured for link in spheres.links),
+    )
+
+
+def largest_deficit(
+    triangles: Float64, centers: Float64, radii: Float64, *, tolerance: float = TOLERANCE, floor: float = 0.0
+) -> Deficit:
+    """The largest phi on `triangles`, between bounds that agree to `tolerance` [m].
+
+    Below `floor` no bound is sought: a triangle certainly below it is done with.
+    """
+    best, place, proven = -np.inf, np.zeros(3), -np.inf
+    pending = triangles
+    while len(pending):
+        upper, at_corners = _bounds(pending, centers, radii)
+        top = np.unravel_index(int(np.argmax(at_corners)), at_corners.shape)
+        if at_corners[top] > best:
+            best, place = float(at_corners[top]), pending[top].copy()
+        is_small = _longest_edges(pending)[0] < tolerance
+        is_done = (upper <= max(floor, best + tolerance if best > floor else floor)) | is_small
+        proven = max(proven, float(upper[is_done].max(initial=-np.inf)))
+        pending = _halves(pending[~is_done])
+    return Deficit(proven=max(proven, best), found=best, place=place)
+
+
+def uncovered_area(
+    triangles: Float64, centers: Float64, radii: Float64, *, resolution: float = RESOLUTION
+) -> tuple[float, float, float]:
+    """Area [m2] with phi > 0: the best guess, and the bounds that hold for certain.
+
+    Triangles are halved until they are certainly in one sphere, certainly outside all, or no longer than
+    `resolution` [m]; the last are counted by their middle.
+    """
+    outside = unsure = guess = 0.0
+    pending = triangles
+    while len(pending):
+        upper, _ = _bounds(pending, centers, radii)
+        middle = pending.mean(axis=1)
+        reach = np.linalg.norm(pending - middle[:, None], axis=2).max(axis=1)
+        phi = _phi(middle, centers, radii)
+        area = areas(pending)
+        is_in, is_out = upper <= 0, phi > reach  # 1-Lipschitz: phi > 0 all over the triangle
+        is_small = ~is_in & ~is_out & (_longest_edges(pending)[0] <= resolution)
+        outside += float(area[is_out].sum())
+        unsure += float(area[is_small].sum())
+        guess += float(area[is_small & (phi > 0)].sum())
+        pending = _halves(pending[~(is_in | is_out | is_small)])
+    return outside + guess, outside, outside + unsure
+
+
+def areas(triangles: Float64) -> Float64:
+    """Area (F,) [m2]."""
+    edges = triangles[:, 1:] - triangles[:, :1]
+    return np.asarray(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
+
+
+def refined(triangles: Float64, longest: float) -> tuple[Float64, Float64]:
+    """The same surface in triangles with no edge longer than `longest` [m], and those triangles' areas."""
+    parts = []
+    pending = triangles
+    while len(pending):
+        is_small = _longest_edges(pending)[0] <= longest
+        parts.append(pending[is_small])
+        pending = _halves(pending[~is_small])
+    done = np.concatenate(parts)
+    return done, areas(done)
+
+
+def _of_link(
+    link: str,
+    parts: Sequence[Solid],
+    centers: Float64,
+    radii: Float64,
+    indices: "np.ndarray[tuple[int], np.dtype[np.int64]]",
+    own: Bool,
+    resolution: float,
+) -> LinkCoverage:
+    area = sum(float(areas(part.surface.corners).sum()) for part in parts)
+    deficits, shares = [], []
+    for part in parts if len(radii) else ():
+        deficit = _of_part(part, centers, radii)
+        deficits.append(deficit)
+        is_covered = deficit.proven <= 0
+        corners = part.surface.corners[:0] if is_covered else part.surface.corners
+        shares.append(uncovered_area(corners, centers, radii - part.slack, resolution=resolution))
+    uncovered = tuple(float(sum(column)) for column in zip(*shares, strict=True)) if shares else (area,) * 3
+    sticking = SolidDistance(parts)(centers[own]) + radii[own] if own.any() else np.zeros(1)
+    worst = int(np.argmax(sticking))
+    return LinkCoverage(
+        link=link,
+        num_spheres=int(own.sum()),
+        area=area,
+        uncovered_area=uncovered[0],
+        uncovered_bounds=(uncovered[1], uncovered[2]),
+        deficit=max(deficits, key=lambda deficit: deficit.proven) if deficits else None,
+        protrusion=float(sticking[worst]),
+        worst_sphere=int(indices[own][worst]) if own.any() else -1,
+        is_closed=all(part.is_closed for part in parts),
+    )
+
+
+def _of_part(part: Solid, centers: Float64, radii: Float64) -> Deficit:
+    """The deficit of one solid, its slack added; a ball that lies in one sphere is covered exactly."""
+    found = largest_deficit(part.surface.corners, centers, radii - part.slack)
+    proven = found.proven
+    if part.ball is not None:
+        proven = min(proven, float(np.min(np.linalg.norm(centers - part.ball[0], axis=1) + part.ball[1] - radii)))
+    return Deficit(proven=proven, found=min(proven, found.found - part.slack), place=found.place)
+
+
+def _proven(link: LinkCoverage) -> float:
+    return np.inf if link.deficit is None else link.deficit.proven
+
+
+def _chunks(triangles: Float64, num_spheres: int) -> Iterator[slice]:
+    step = max(1, PAIRS_PER_CHUNK // (3 * num_spheres))
+    return (slice(start, start + step) for start in range(0, len(triangles), step))
+
+
+def _bounds(triangles: Float64, centers: Float64, radii: Float64) -> tuple[Float64, Float64]:
+    """The bound on phi over each triangle (F,), and phi at its corners (F, 3)."""
+    upper, at_corners = np.empty(len(triangles)), np.empty((len(triangles), 3))
+    for part in _chunks(triangles, len(radii)):
+        gap = (cdist(triangles[part].reshape(-1, 3), centers) - radii).reshape(-1, 3, len(radii))
+        upper[part] = gap.max(axis=1).min(axis=1)
+        at_corners[part] = gap.min(axis=2)
+    return upper, at_corners
+
+
+def _phi(points: Float64, centers: Float64, radii: Float64) -> Float64:
+    return np.concatenate([(cdist(points[p], centers) - radii).min(axis=1) for p in _chunks(points, len(radii))])
+
+
+def _longest_edges(triangles: Float64) -> tuple[Float64, "np.ndarray[tuple[int], np.dtype[np.int64]]"]:
+    """Length (F,) of the longest edge, and the corner (F,) at which it starts."""
+    length = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
+    return length.max(axis=1), length.argmax(axis=1)
+
+
+def _halves(triangles: Float64) -> Float64:
+    """Each triangle cut in two at the middle of its longest edge: (2F, 3, 3)."""
+    rows = np.arange(len(triangles))
+    first = _longest_edges(triangles)[1] if len(triangles) else rows
+    a, b, c = (triangles[rows, (first + k) % 3] for k in range(3))
+    middle = 0.5 * (a + b)
+    return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])

@@ -1,0 +1,134 @@
+"""Which pairs of links a self-collision check has to look at, and why it may leave out the others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.srdf import DisabledPair
+
+Int64 = NDArray[np.int64]
+CHUNK = 200  # postures at a time
+NEVER_MARGIN = 0.02  # [m] a pair that comes nearer than this in a sample is kept, though it never collides there
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkPair:
+    """Two links with spheres: why they are left out (None: kept) and, where sampled, how their gap varied.
+
+    gap [m]: smallest distance between their spheres, its least and largest value over the postures (nan: none
+    sampled); hit_share: share of the postures in which they touch.
+    """
+
+    links: tuple[str, str]
+    left_out: str | None
+    num_sphere_pairs: int
+    least_gap: float
+    largest_gap: float
+    hit_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfCollisionPairs:
+    """pairs (P, 2) of spheres to check; every pair of links with spheres, kept or not; the postures sampled."""
+
+    pairs: Int64
+    link_pairs: tuple[LinkPair, ...]
+    num_postures: int
+
+    @property
+    def left_out(self) -> tuple[LinkPair, ...]:
+        """The pairs of links that are not checked."""
+        return tuple(pair for pair in self.link_pairs if pair.left_out is not None)
+
+
+def self_collision_pairs(
+    model: RobotModel,
+    disabled: Sequence[DisabledPair] = (),
+    *,
+    num_postures: int = 2000,
+    seed: int = 0,
+    drop_never: bool = False,
+) -> SelfCollisionPairs:
+    """Pairs of spheres that may collide, by what is known of their links.
+
+    Left out are links of one rigid body, links that one joint joins, and what `disabled` (an SRDF) names. Without
+    `disabled`, `num_postures` postures even within the limits (a joint without limits: a whole turn) decide about the
+    rest: pairs that touch in all of them are left out, for no posture parts them; with `drop_never` also those that
+    never come nearer than NEVER_MARGIN, which is a guess from a sample and not a proof.
+    """
+    links = tuple(dict.fromkeys(model.sphere_set.links))
+    owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
+    known = {frozenset(pair.links): f"SRDF: {pair.reason}" for pair in disabled} | _joined(model)
+    num_postures = 0 if disabled else num_postures
+    a, b = np.triu_indices(len(links), k=1)
+    gaps = _gaps(model, owner, np.stack([a, b], axis=1), num_postures, seed)
+    pairs = []
+    for index, (i, j) in enumerate(zip(a, b, strict=True)):
+        column = gaps[:, index]
+        size = int((owner == i).sum() * (owner == j).sum())
+        pairs.append(
+            LinkPair(
+                links=(links[i], links[j]),
+                left_out=known.get(frozenset((links[i], links[j]))) or _sampled_reason(column, drop_never),
+                num_sphere_pairs=size,
+                least_gap=float(column.min()) if len(column) else np.nan,
+                largest_gap=float(column.max()) if len(column) else np.nan,
+                hit_share=float(np.mean(column <= 0)) if len(column) else np.nan,
+            )
+        )
+    keep = np.zeros((len(links), len(links)), dtype=bool)
+    keep[a, b] = keep[b, a] = [pair.left_out is None for pair in pairs]
+    first, second = np.triu_indices(len(owner), k=1)
+    is_kept = keep[owner[first], owner[second]]
+    return SelfCollisionPairs(
+        pairs=np.stack([first[is_kept], second[is_kept]], axis=1).astype(np.int64),
+        link_pairs=tuple(pairs),
+        num_postures=num_postures,
+    )
+
+
+def _joined(model: RobotModel) -> dict[frozenset[str], str]:
+    """Pairs of links that no posture tells anything about: of one rigid body, or of two bodies with one joint."""
+    bodies = model.urdf.rigid_bodies(model.joint_names)
+    links = dict.fromkeys(model.sphere_set.links)
+    leader = {link: bodies[link][0] for link in links}
+    parent = {joint.child: bodies[joint.parent][0] for joint in model.urdf.joints}
+    reasons = {}
+    for one, other in combinations(links, 2):
+        if leader[one] == leader[other]:
+            reasons[frozenset((one, other))] = "one rigid body"
+        elif leader[one] == parent.get(leader[other]) or leader[other] == parent.get(leader[one]):
+            reasons[frozenset((one, other))] = "adjacent"
+    return reasons
+
+
+def _sampled_reason(gaps: Float64, drop_never: bool) -> str | None:
+    if not len(gaps):
+        return None
+    if (gaps <= 0).all():
+        return f"touch in all {len(gaps)} postures"
+    if drop_never and gaps.min() > NEVER_MARGIN:
+        return f"no nearer than {1e3 * gaps.min():.0f} mm in {len(gaps)} postures"
+    return None
+
+
+def _gaps(model: RobotModel, owner: Int64, pairs: Int64, num_postures: int, seed: int) -> Float64:
+    """Smallest gap (T, P) between the spheres of each pair of links in each posture."""
+    limited = np.isfinite(model.lower) & np.isfinite(model.upper)
+    lower, upper = np.where(limited, model.lower, -np.pi), np.where(limited, model.upper, np.pi)
+    postures = np.random.default_rng(seed).uniform(lower, upper, (num_postures, model.num_joints))
+    radii = model.sphere_set.radii
+    members = [np.flatnonzero(owner == link) for link in range(int(owner.max(initial=-1)) + 1)]
+    gaps = np.empty((num_postures, len(pairs)))
+    for start in range(0, num_postures, CHUNK):
+        centers = model.sphere_centers_batch(postures[start : start + CHUNK])
+        for column, (i, j) in enumerate(pairs):
+            away = centers[:, members[i], None] - centers[:, None, members[j]]
+            gap = np.linalg.norm(away, axis=3) - radii[members[i], None] - radii[None, members[j]]
+            gaps[start : start + CHUNK, column] = gap.min(axis=(1, 2))
+    return gaps

@@ -1,0 +1,225 @@
+"""The collision geometry of a robot's links as closed triangle surfaces: meshes, boxes, cylinders and spheres."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
+
+SIDES = 96  # of the prism that stands for a cylinder: 0.05 % of its radius
+ROUNDS = 4  # of splitting an octahedron's faces by four: 2048 faces stand for a sphere, 0.3 % of its radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solid:
+    """One piece of a link's collision geometry, in the frame of `link` [m].
+
+    surface: its triangles; the true surface is nowhere farther than `slack` from them. body: a closed mesh that tells
+    inside from outside: the surface itself, or its convex hull where the surface is open (is_closed False), or None
+    where an open surface is flat. ball: centre (3,) and radius, where the solid is a ball.
+    """
+
+    link: str
+    surface: TriangleMesh
+    slack: float
+    body: TriangleMesh | None
+    ball: tuple[Float64, float] | None = None
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the surface itself has an inside."""
+        return self.surface.is_closed
+
+
+def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple[Solid, ...]]:
+    """The solids of each link of a URDF that has collision geometry, by link, in the file's order.
+
+    folders: where ``package://`` paths are looked for, before the folders above the URDF. Raises InputError for a
+    mesh that is missing or unreadable, for shapes of another kind, and where no link has collision geometry.
+    """
+    if urdf.other_shapes:
+        link, tag = urdf.other_shapes[0]
+        raise InputError(
+            f"{urdf.path}: link '{link}': expected mesh, box, cylinder or sphere, got <{tag}>",
+            remedy="write it as a cylinder and spheres",
+        )
+    found: dict[str, list[Solid]] = {link: [] for link in urdf.collision_links}
+    if not found:
+        raise InputError(
+            f"{urdf.path}: expected collision geometry, got none", remedy="give a URDF with <collision> elements"
+        )
+    for shape in urdf.shapes:
+        found[shape.link].append(_primitive(shape))
+    meshes: dict[Path, TriangleMesh] = {}
+    for mesh in urdf.meshes:
+        path = mesh_path(urdf.path, mesh, folders)
+        if path not in meshes:
+            meshes[path] = load_mesh(path)
+        found[mesh.link] += _pieces(mesh, meshes[path])
+    return {link: tuple(solids) for link, solids in found.items()}
+
+
+def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path:
+    """The file of a mesh. ``package://NAME/REST`` is NAME/REST, or REST in a folder called NAME, in one of `folders`
+    or in a folder above the URDF; a path without scheme is relative to the URDF.
+
+    Raises InputError where no such file is found, saying where it was looked for.
+    """
+    name = mesh.filename
+    above = [Path(urdf).resolve().parent, *Path(urdf).resolve().parent.parents]
+    if name.startswith("package://"):
+        parts = Path(name.removeprefix("package://")).parts
+        roots = [*folders, *above]
+        tried = [root.joinpath(*parts) for root in roots]
+        tried += [root.joinpath(*parts[1:]) for root in roots if parts and root.name == parts[0]]
+    elif name.startswith("file://"):
+        tried = [Path(name.removeprefix("file://"))]
+    else:
+        tried = [above[0] / name]
+    for path in tried:
+        if path.is_file():
+            return path
+    raise InputError(
+        f"{urdf}: link '{mesh.link}': mesh {name} was not found",
+        remedy="give the folder that holds its package with --packages DIR"
+        if name.startswith("package://")
+        else f"expected {tried[0]}",
+    )
+
+
+class SolidDistance:
+    """A bound on the signed distance to the union of solids: the least of the signed distances to each.
+
+    Outside it is the distance; inside it is negative and no deeper than the truth, so that the ball of that radius
+    lies inside. To an open, flat surface it is the plain distance.
+    """
+
+    def __init__(self, solids: Sequence[Solid]) -> None:
+        meshes = [solid for solid in solids if solid.ball is None]
+        self._meshes = [MeshDistance(solid.surface if solid.body is None else solid.body) for solid in meshes]
+        self._balls = [solid.ball for solid in solids if solid.ball is not None]
+
+    def __call__(self, points: Float64) -> Float64:
+        """points (Q, 3) [m], in the link's frame -> signed distance (Q,) [m] to balls and to triangles."""
+        to_meshes = [mesh.signed(points) for mesh in self._meshes]
+        to_balls = [np.linalg.norm(points - center, axis=1) - radius for center, radius in self._balls]
+        return np.asarray(np.min([*to_meshes, *to_balls], axis=0))
+
+
+def _primitive(shape: Shape) -> Solid:
+    if shape.kind == "box":
+        vertices, faces, slack = *_box(np.array(shape.size)), 0.0
+    elif shape.kind == "cylinder":
+        vertices, faces = _prism(*shape.size)
+        slack = shape.size[0] * (1 - np.cos(np.pi / SIDES))
+    else:
+        vertices, faces, slack = _ball(shape.size[0])
+    mesh = TriangleMesh(vertices=transform_points(shape.T_link_shape, vertices), faces=faces, is_closed=True)
+    ball = (shape.T_link_shape[:3, 3].copy(), shape.size[0]) if shape.kind == "sphere" else None
+    return Solid(link=shape.link, surface=mesh, slack=float(slack), body=mesh, ball=ball)
+
+
+def _pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
+    """The mesh in the link's frame; an open one is taken apart into the pieces that are closed and the rest."""
+    vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
+    faces = mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]
+    whole = replace(mesh, vertices=vertices, faces=np.ascontiguousarray(faces))
+    pieces = [whole] if whole.is_closed else _taken_apart(whole)
+    return [
+        Solid(link=shape.link, surface=piece, slack=0.0, body=piece if piece.is_closed else _hull(piece.vertices))
+        for piece in pieces
+    ]
+
+
+def _taken_apart(mesh: TriangleMesh) -> list[TriangleMesh]:
+    """The connected pieces of a mesh that are closed, each its own, and all the open ones as one."""
+    size = len(mesh.vertices)
+    ends = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
+    _, label = connected_components(coo_matrix((np.ones(len(ends[0])), ends), shape=(size, size)), directed=False)
+    of_face = label[mesh.faces[:, 0]]
+    closed = [value for value in np.unique(of_face) if _is_closed(mesh.faces[of_face == value])]
+    parts = [of_face == value for value in closed]
+    is_open = ~np.isin(of_face, closed)
+    pieces = []
+    for part in [*parts, *([is_open] if is_open.any() else [])]:
+        used, inverse = np.unique(mesh.faces[part], return_inverse=True)
+        local = inverse.reshape(-1, 3).astype(np.int64)
+        pieces.append(TriangleMesh(vertices=mesh.vertices[used], faces=local, is_closed=_is_closed(local)))
+    return pieces
+
+
+def _is_closed(faces: NDArray[np.int64]) -> bool:
+    """Whether every edge has one face on either side, which run through it in opposite directions."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forth = np.unique(edges, axis=0)
+    back = np.unique(edges[:, ::-1], axis=0)
+    return len(forth) == len(edges) and np.array_equal(forth, back)
+
+
+def _hull(vertices: Float64) -> TriangleMesh | None:
+    """The convex hull, its faces seen counter-clockwise from outside; None where the vertices lie in a plane."""
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError:
+        return None
+    faces = hull.simplices.astype(np.int64)
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    is_inward = np.einsum("fa,fa->f", normal, hull.equations[:, :3]) < 0
+    faces[is_inward] = faces[is_inward][:, ::-1]
+    return TriangleMesh(vertices=vertices, faces=faces, is_closed=True)
+
+
+def _box(size: Float64) -> tuple[Float64, NDArray[np.int64]]:
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = [face for a, b, c, d in quads for face in ([a, b, c], [a, c, d])]
+    return corners, np.array(faces, dtype=np.int64)
+
+
+def _prism(radius: float, length: float) -> tuple[Float64, NDArray[np.int64]]:
+    """A prism of SIDES sides inside a cylinder along z, edges on its surface."""
+    angle = 2 * np.pi * np.arange(SIDES) / SIDES
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(SIDES)], axis=1)
+    up = np.array([0.0, 0.0, length / 2])
+    vertices = np.concatenate([ring - up, ring + up, [-up, up]])
+    i = np.arange(SIDES)
+    j = (i + 1) % SIDES
+    low, high = np.full(SIDES, 2 * SIDES), np.full(SIDES, 2 * SIDES + 1)
+    faces = np.concatenate(
+        [
+            np.stack([i, j, j + SIDES], axis=1),
+            np.stack([i, j + SIDES, i + SIDES], axis=1),
+            np.stack([low, j, i], axis=1),
+            np.stack([high, i + SIDES, j + SIDES], axis=1),
+        ]
+    )
+    return vertices, faces.astype(np.int64)
+
+
+def _ball(radius: float) -> tuple[Float64, NDArray[np.int64], float]:
+    """A polyhedron with its corners on a sphere, and how far the sphere is from it at most."""
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    corners = axes[np.array(faces)]
+    for _ in range(ROUNDS):
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))
+        corners = np.concatenate(
+            [np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = np.einsum("fa,fa->f", normal, corners[:, 0])  # of each face's plane above the centre
+    vertices, inverse = np.unique(corners.reshape(-1, 3).round(12), axis=0, return_inverse=True)
+    return radius * vertices, inverse.reshape(-1, 3).astype(np.int64), radius * float(1 - height.min()) + 1e-12

@@ -1,0 +1,133 @@
+"""Sphere sets on disk: YAML as this tool, robometrics and cuRobo write it, and URDFs with collision spheres.
+
+cuRobo's reading (NVlabs/curobo, cuda_robot_generator.py) is kept: `collision_sphere_buffer`, a number or one by link,
+is added to every radius, `collision_spheres` may name a file of its own, and a sphere whose radius is not above 0
+after that is switched off (as for objects not attached yet; older releases made those above -1 m one millimetre).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import SphereSet
+from splatctrl_cli.robot.spheres import spheres_of
+from splatctrl_cli.robot.urdf import read_urdf
+
+LAYOUT = "collision_spheres: {LINK: [{center: [x, y, z], radius: r}, ...]}"
+URDF_SUFFIXES = (".urdf", ".xml")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereFile:
+    """A sphere file: its layout ("YAML", "cuRobo YAML", "URDF"), its spheres, and how many more are switched off."""
+
+    path: Path
+    layout: str
+    spheres: SphereSet
+    num_off: int
+
+
+def read_spheres(path: Path) -> SphereSet:
+    """The spheres of a file [m], by link; see `read_sphere_file`."""
+    return read_sphere_file(path).spheres
+
+
+def read_sphere_file(path: Path) -> SphereFile:
+    """The spheres of a YAML file (`collision_spheres` at the top or under robot_cfg.kinematics) or a URDF.
+
+    Raises InputError for a missing file, another layout, a number that is not finite, or no sphere at all.
+    """
+    if path.suffix.lower() in URDF_SUFFIXES:
+        return SphereFile(path=path, layout="URDF", spheres=spheres_of(read_urdf(path)), num_off=0)
+    tree = _yaml(path)
+    section = _section(tree)
+    table = section.get("collision_spheres")
+    source = path
+    if isinstance(table, str):
+        source = path.parent / table
+        table = _section(_yaml(source)).get("collision_spheres")
+    if not isinstance(table, dict):
+        raise InputError(
+            f"{source}: expected the layout {LAYOUT}", remedy="or a URDF whose collision shapes are spheres"
+        )
+    buffers = _buffers(path, section.get("collision_sphere_buffer", 0.0), table)
+    rows = [
+        (str(link), _sphere(f"{source}: link '{link}': sphere {index}", sphere), buffers.get(str(link), 0.0))
+        for link, spheres in table.items()
+        for index, sphere in enumerate(_listed(source, link, spheres))
+    ]
+    on = [(link, (*row[:3], row[3] + buffer)) for link, row, buffer in rows if row[3] + buffer > 0]
+    if not on:
+        off = f", all {len(rows)} of radius 0 or less" if rows else ""
+        raise InputError(f"{source}: expected collision spheres, got none{off}", remedy=LAYOUT)
+    numbers = np.array([row for _, row in on], dtype=np.float64)
+    return SphereFile(
+        path=path,
+        layout="YAML" if section is tree else "cuRobo YAML",
+        spheres=SphereSet(
+            links=tuple(link for link, _ in on), centers=numbers[:, :3].copy(), radii=numbers[:, 3].copy()
+        ),
+        num_off=len(rows) - len(on),
+    )
+
+
+def spheres_yaml(spheres: SphereSet, comments: Sequence[str] = ()) -> str:
+    """The text of a YAML file of `spheres`, by link, every value as it is, with `comments` on top."""
+    lines = [*(f"# {comment}" for comment in comments), "collision_spheres:"]
+    for link in dict.fromkeys(spheres.links):
+        lines.append(f"  {link}:")
+        for owner, center, radius in zip(spheres.links, spheres.centers, spheres.radii, strict=True):
+            if owner == link:
+                x, y, z = (repr(float(value) + 0.0) for value in center)
+                lines.append(f"    - {{center: [{x}, {y}, {z}], radius: {float(radius)!r}}}")
+    return "\n".join(lines) + "\n"
+
+
+def _yaml(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give a spheres YAML file") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid YAML: {error}", remedy="give a spheres YAML file or a URDF") from None
+
+
+def _section(tree: Any) -> dict[Any, Any]:
+    """The mapping that holds `collision_spheres`: the tree, or what is under robot_cfg and kinematics."""
+    for key in ("robot_cfg", "kinematics"):
+        if isinstance(tree, dict) and key in tree:
+            tree = tree[key]
+    return tree if isinstance(tree, dict) else {}
+
+
+def _buffers(path: Path, buffer: Any, table: dict[Any, Any]) -> dict[str, float]:
+    by_link = buffer if isinstance(buffer, dict) else dict.fromkeys(table, buffer)
+    buffers = {}
+    for link, value in by_link.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise InputError(f"{path}: collision_sphere_buffer: expected numbers [m], got {value!r} for '{link}'")
+        buffers[str(link)] = float(value)
+    return buffers
+
+
+def _listed(path: Path, link: object, spheres: Any) -> list[Any]:
+    if not isinstance(spheres, list):
+        raise InputError(f"{path}: link '{link}': expected a list of spheres, got {spheres!r}", remedy=LAYOUT)
+    return spheres
+
+
+def _sphere(where: str, sphere: Any) -> list[float]:
+    try:
+        row = [float(value) for value in [*sphere["center"], sphere["radius"]]]
+    except (TypeError, KeyError, ValueError):
+        row = []
+    if len(row) != 4 or not np.all(np.isfinite(row)):
+        raise InputError(
+            f"{where}: expected {{center: [x, y, z], radius: r}}, got {sphere!r}", remedy="finite, in metres"
+        )
+    return row

@@ -1,0 +1,293 @@
+"""Spheres that cover all of a robot's collision surface and stick out of it as little as their number allows.
+
+A ball centred at c that may stick out by t has the radius t - d(c), d the signed distance to the body (negative
+inside). The surface is cut into small triangles ("patches"); a ball holds a patch where it holds its three corners.
+So covering patch p from centre c takes the protrusion
+
+    K[c, p] = max_k |v_pk - c| + d(c),
+
+and the best n spheres of a link are a k-centre problem: the n centres for which the largest over p of the least over
+centres of K is smallest. Greedy set cover at a bisected t gives the centres, alternating assignment (each patch to
+the ball that needs the least) and recentring lowers t, and every ball shrinks to what its patches need. Each patch
+ends up inside one ball: covered by construction, and measured afterwards by `coverage`, which knows no patches.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
+from splatctrl_cli.robot.solids import Solid, SolidDistance
+
+Int64 = NDArray[np.int64]
+
+MIN_PATCH = 2e-3  # [m] longest edge of a patch, at the least
+BISECTIONS = 10
+ROUNDS = 12  # of assignment and recentring
+STEPS = (0.5, 0.25, 0.125, 0.0625)  # of the lattice spacing, tried about each centre
+DIGITS = 6  # of a written sphere: micrometres
+TIE = 0.05  # a candidate within this share of the best gain may be picked
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """What is asked of the spheres.
+
+    max_spheres: over all links; or max_protrusion [m], met by as few spheres as are found. max_deficit [m]: how far
+    surface points may stay outside. restarts: greedy covers tried per link and protrusion; num_patches and
+    num_candidates: about so many patches and lattice points in each link.
+    """
+
+    max_spheres: int | None = None
+    max_protrusion: float | None = None
+    max_deficit: float = 0.0
+    restarts: int = 3
+    num_patches: int = 2000
+    num_candidates: int = 2500
+    seed: int = 0
+
+
+def fit_spheres(solids: Mapping[str, Sequence[Solid]], options: FitOptions) -> SphereSet:
+    """Spheres for each link of `solids`, rounded outward to micrometres; the same for the same options and seed.
+
+    Raises UsageError where the options contradict each other or ask for fewer spheres than links; InputError for a
+    link whose surface has no area.
+    """
+    _check(options, len(solids))
+    links = [_Link(name, parts, options, index) for index, (name, parts) in enumerate(solids.items())]
+    if options.max_protrusion is not None:
+        fitted = [link.within(options.max_protrusion) for link in links]
+    else:
+        fitted = _shared_out(links, options.max_spheres or 0)
+    owners = [link.name for link, (centers, _) in zip(links, fitted, strict=True) for _ in centers]
+    return SphereSet(
+        links=tuple(owners),
+        centers=np.concatenate([centers for centers, _ in fitted]),
+        radii=np.concatenate([radii for _, radii in fitted]),
+    )
+
+
+def _check(options: FitOptions, num_links: int) -> None:
+    if (options.max_spheres is None) == (options.max_protrusion is None):
+        raise UsageError("sphere fit: expected a number of spheres or a protrusion, not both")
+    if options.max_spheres is not None and options.max_spheres < num_links:
+        raise UsageError(
+            f"sphere fit: {options.max_spheres} spheres for {num_links} links with collision geometry",
+            remedy=f"allow at least {num_links}, one for each",
+        )
+    lengths = {"protrusion": options.max_protrusion, "deficit": options.max_deficit}
+    for name, value in lengths.items():
+        if value is not None and not (np.isfinite(value) and value >= 0):
+            raise UsageError(f"sphere fit: largest {name}: expected 0 m or more, got {value:g}")
+
+
+def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Float64]]:
+    """Centres and radii by link, `budget` of them, so that the largest protrusion is small.
+
+    One t for all links takes most of them; the rest go one by one to the link that sticks out most.
+    """
+    low, high = 0.0, max(link.single for link in links)
+    chosen = [np.array([link.middle]) for link in links]
+    for _ in range(BISECTIONS):
+        t = 0.5 * (low + high)
+        covers = _covers(links, t, budget)
+        if covers is None:
+            low = t
+        else:
+            high, chosen = t, covers
+    counts = [len(cover) for cover in chosen]
+    states = [link.improved(cover) for link, cover in zip(links, chosen, strict=True)]
+    for _ in range(budget - sum(counts)):
+        worst = int(np.argmax([protrusion for _, protrusion in states]))
+        counts[worst] += 1
+        states[worst] = links[worst].best(counts[worst], states[worst])
+    return [link.rounded(*state) for link, state in zip(links, states, strict=True)]
+
+
+def _covers(links: Sequence["_Link"], t: float, budget: int) -> list[Int64] | None:
+    """A cover of each link at protrusion t; None as soon as all together take more than `budget` spheres."""
+    covers: list[Int64] = []
+    for index, link in enumerate(links):
+        left = budget - sum(len(cover) for cover in covers) - (len(links) - index - 1)
+        cover = link.cover(t, at_most=left)
+        if cover is None:
+            return None
+        covers.append(cover)
+    return covers
+
+
+class _Link:
+    """Patches, candidate centres and the matrix K of one link."""
+
+    def __init__(self, name: str, parts: Sequence[Solid], options: FitOptions, index: int) -> None:
+        self.name = name
+        self._options = options
+        self._seed = (options.seed, index)
+        self._parts = parts
+        self._distance = SolidDistance(parts)
+        surface = np.concatenate([part.surface.corners for part in parts])
+        area = float(areas(surface).sum())
+        if not area > 0:
+            raise InputError(f"link '{name}': expected a collision surface, got none of any area")
+        longest = max(MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))
+        cut = [refined(part.surface.corners, longest)[0] for part in parts]
+        self._slack = np.concatenate([np.full(len(t), p.slack) for t, p in zip(cut, parts, strict=True)])
+        patches = np.concatenate(cut)
+        self._vertices, faces = np.unique(patches.reshape(-1, 3), axis=0, return_inverse=True)
+        self._faces = faces.reshape(-1, 3)
+        self._candidates, self._spacing = self._lattice(patches)
+        self._depth = self._distance(self._candidates)
+        self._cost = self._reach(self._candidates) + self._depth[:, None]
+        alone = self._cost.max(axis=1)
+        self.middle = int(np.argmin(alone))  # the candidate that covers the link alone at the least protrusion
+        self.single = float(alone[self.middle])
+
+    def cover(self, t: float, *, at_most: int) -> Int64 | None:
+        """Candidates (n,) whose balls of protrusion t hold every patch, as few as a few greedy passes find.
+
+        None where these are more than `at_most`, or t is less than a single patch needs.
+        """
+        holds = self._cost <= t
+        if not holds.any(axis=0).all():
+            return None
+        by_patch = np.ascontiguousarray(holds.T)
+        rng = np.random.default_rng(self._seed)
+        best: list[int] | None = None
+        for attempt in range(self._options.restarts):
+            limit = at_most if best is None else len(best) - 1
+            best = _greedy(by_patch, rng if attempt else None, limit) or best
+        return None if best is None else np.array(best, dtype=np.int64)
+
+    def within(self, max_protrusion: float) -> tuple[Float64, Float64]:
+        """Few spheres that stick out no more. Raises UsageError where its patches are too coarse for that."""
+        cover = self.cover(max_protrusion + self._options.max_deficit, at_most=self._cost.shape[1])
+        if cover is None:
+            least = float(self._cost.min(axis=0).max()) - self._options.max_deficit
+            raise UsageError(
+                f"sphere fit: link '{self.name}': largest protrusion: expected at least {1e3 * least:.1f} mm, "
+                f"got {1e3 * max_protrusion:g} mm",
+                remedy="allow more",
+            )
+        return self.rounded(*self.improved(cover))
+
+    def best(self, count: int, state: tuple[Float64, float]) -> tuple[Float64, float]:
+        """Centres (n, 3), n <= count, and their protrusion: the best found, not worse than `state`."""
+        low, high = 0.0, state[1]
+        for _ in range(BISECTIONS // 2):
+            t = 0.5 * (low + high)
+            cover = self.cover(t, at_most=count)
+            if cover is None:
+                low = t
+                continue
+            found = self.improved(cover)
+            high = min(t, found[1])
+            if found[1] < state[1]:
+                state = found
+        return state
+
+    def improved(self, chosen: Int64) -> tuple[Float64, float]:
+        """Centres (n, 3) after alternating assignment and recentring, and their protrusion [m]."""
+        centers = self._candidates[chosen]
+        for _ in range(ROUNDS):
+            owner, worst = self._assigned(centers)
+            moved = centers.copy()
+            for ball in range(len(centers)):
+                mine = owner == ball
+                if mine.any():
+                    needed = self._cost[:, mine].max(axis=1)
+                    moved[ball] = self._candidates[int(np.argmin(needed))]
+            if self._assigned(moved)[1] >= worst:
+                break
+            centers = moved
+        return self._polished(centers)
+
+    def rounded(self, centers: Float64, _protrusion: float) -> tuple[Float64, Float64]:
+        """Spheres with rounded centres, as small as their patches and then the whole surface allow."""
+        owner, _ = self._assigned(centers)
+        centers = centers[np.unique(owner)].round(DIGITS)
+        owner, _ = self._assigned(centers)
+        reach = self._reach(centers)
+        radii = np.array(
+            [reach[k, owner == k].max(initial=0.0) for k in range(len(centers))]
+        )  # 0: rounded to idleness
+        spare = -max(
+            largest_deficit(part.surface.corners, centers, radii - part.slack, floor=-np.inf).proven
+            for part in self._parts
+        )
+        radii = np.maximum(radii - max(spare, 0.0) - self._options.max_deficit, 10**-DIGITS)
+        return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
+
+    def _polished(self, centers: Float64) -> tuple[Float64, float]:
+        """Each centre moved by fractions of the lattice spacing while that lowers what its patches need."""
+        offsets = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
+        for step in STEPS:
+            owner, worst = self._assigned(centers)
+            tried = (centers[:, None] + step * self._spacing * offsets).reshape(-1, 3)
+            cost = (self._reach(tried) + self._distance(tried)[:, None]).reshape(len(centers), len(offsets), -1)
+            moved = centers.copy()
+            for ball in range(len(centers)):
+                mine = owner == ball
+                if mine.any():
+                    needed = cost[ball][:, mine].max(axis=1)
+                    moved[ball] = tried.reshape(len(centers), -1, 3)[ball, int(np.argmin(needed))]
+            if self._assigned(moved)[1] < worst:
+                centers = moved
+        return centers, self._assigned(centers)[1]
+
+    def _assigned(self, centers: Float64) -> tuple[Int64, float]:
+        """The ball (P,) that holds each patch at the least protrusion, and the largest such protrusion."""
+        cost = self._reach(centers) + self._distance(centers)[:, None]
+        owner = cost.argmin(axis=0)
+        return owner.astype(np.int64), float(cost[owner, np.arange(cost.shape[1])].max())
+
+    def _reach(self, centers: Float64) -> Float64:
+        """Radius (C, P) a ball at each centre needs to hold each patch."""
+        apart = cdist(centers, self._vertices)
+        return np.asarray(apart[:, self._faces].max(axis=2) + self._slack)
+
+    def _lattice(self, patches: Float64) -> tuple[Float64, float]:
+        """Points in the body on a lattice, about `num_candidates`, and its spacing [m].
+
+        Of a body too thin for many, the middles of the patches too.
+        """
+        lower, upper = self._vertices.min(axis=0), self._vertices.max(axis=0)
+        size, wanted = np.maximum(upper - lower, 1e-3), self._options.num_candidates
+        spacing = float(np.cbrt(np.prod(size) / wanted))
+        for _ in range(3):  # the body fills only a part of its box
+            counts = np.maximum(np.ceil(size / spacing).astype(int), 1)
+            axes = [lower[k] + size[k] * (np.arange(counts[k]) + 0.5) / counts[k] for k in range(3)]
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+            inside = points[self._distance(points) < 0]
+            if len(inside) > wanted // 2:
+                break
+            spacing *= float(np.cbrt(max(len(inside), 100) / wanted))
+        if len(inside) < wanted // 20:
+            inside = np.concatenate([inside, patches.mean(axis=1)])
+        return inside, spacing
+
+
+def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> list[int] | None:
+    """Candidates picked one by one for the most patches not yet held, by_patch (P, C) telling who holds which.
+
+    With `rng` one of the nearly best is picked. None beyond `at_most`.
+    """
+    pending = np.ones(len(by_patch), dtype=np.bool_)
+    gain = by_patch.sum(axis=0, dtype=np.int32)
+    picked: list[int] = []
+    while pending.any():
+        if len(picked) >= at_most:
+            return None
+        if rng is None:
+            choice = int(np.argmax(gain))
+        else:
+            choice = int(rng.choice(np.flatnonzero(gain >= (1 - TIE) * gain.max())))
+        picked.append(choice)
+        newly = pending & by_patch[:, choice]
+        gain = gain - by_patch[newly].sum(axis=0, dtype=np.int32)
+        pending &= ~newly
+    return picked

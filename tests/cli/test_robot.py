@@ -1,0 +1,142 @@
+"""``splatctrl robot``: fits, measures, lists, and fails well."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.robot.sphere_files import read_spheres
+from tests.robot.shapes import BALL, BOX, arm_of, l_shape, written
+
+
+@pytest.fixture
+def urdf(tmp_path: Path) -> Path:
+    return written(tmp_path, arm_of(BOX, BALL))
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    code = main(["robot", *map(str, arguments)])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def result(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, object]:
+    code, out, err = run(capsys, *arguments, "--json", "-q")
+    assert (code, err) == (0, "")
+    loaded: dict[str, object] = json.loads(out)
+    return loaded
+
+
+def test_a_fit_writes_spheres_that_a_check_finds_complete(
+    capsys: pytest.CaptureFixture[str], urdf: Path, tmp_path: Path
+) -> None:
+    out, picture = tmp_path / "s.yaml", tmp_path / "s.png"
+    fitted = result(capsys, "spheres", "--urdf", urdf, "--max-spheres", 5, "-o", out, "--picture", picture)
+    checked = result(capsys, "check", "--urdf", urdf, "--spheres", out, "--require", "max_deficit<=0")
+    assert fitted["metrics"] == checked["metrics"]
+    assert fitted["links"] == checked["links"]
+    assert checked["metrics"]["uncovered_share"] == 0  # type: ignore[index]
+    assert len(read_spheres(out).radii) == checked["metrics"]["num_spheres"] <= 5  # type: ignore[index]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "# 5 spheres cover all of it (proven); they stick out by" in out.read_text()
+
+
+def test_the_table_names_links_and_what_sticks_out(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
+    spheres = written(urdf.parent, "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.07}]}", "s.yaml")
+    code, out, err = run(capsys, "check", "--urdf", urdf, "--spheres", spheres)
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].split()[:2] == ["link", "spheres"]
+    assert lines[2].split()[0] == "base"
+    assert "no sphere" in lines[2]
+    assert "10.0" in lines[3]
+    assert "1 spheres: 100.0 % of the surface outside" in out
+    assert "no sphere stands for base" in out
+
+
+def test_gates_hold_a_set_to_its_figures(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
+    spheres = written(urdf.parent, "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.07}]}", "s.yaml")
+    check = ("check", "--urdf", urdf, "--spheres", spheres, "-q", "--require")
+    code, _, err = run(capsys, *check, "uncovered_share<=0.2")
+    assert (code, err) == (1, "splatctrl: gate failed: uncovered_share is 1, required <= 0.2\n")
+    code, _, err = run(capsys, *check, "max_deficit<=0.2")
+    assert (code, err) == (1, "splatctrl: gate failed: max_deficit is unknown, required <= 0.2\n")
+    code, _, err = run(capsys, *check, "deficit<=0.2")
+    assert (code, "did you mean max_deficit?" in err) == (2, True)
+
+
+def test_an_open_mesh_says_what_guarantee_remains(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    mesh = l_shape()
+    mesh.update_faces([True] * 19 + [False])
+    mesh.export(tmp_path / "ell.stl")
+    urdf = written(tmp_path, arm_of('<mesh filename="ell.stl"/>', BALL))
+    code, out, _ = run(capsys, "spheres", "--urdf", urdf, "--max-spheres", 3, "-o", tmp_path / "s.yaml", "-q")
+    assert code == 0
+    assert "cover all of the collision surface (proven)" in out
+    assert "not closed: base: what is said of the surface holds; an inside there is not" in out
+
+
+def test_spheres_that_are_off_or_of_other_links_are_counted(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
+    text = """collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.1}, {center: [0, 0, 0], radius: -1}],
+      hand: [{center: [0, 0, 0], radius: 0.1}]}"""
+    code, out, _ = run(capsys, "check", "--urdf", urdf, "--spheres", written(urdf.parent, text, "s.yaml"))
+    assert code == 0
+    assert "1 spheres are switched off (radius 0 or less) and cover nothing" in out
+    assert "spheres of hand are left out: robot.urdf has no such link" in out
+
+
+def test_info_shows_limits_locks_and_bodies(capsys: pytest.CaptureFixture[str], urdf: Path) -> None:
+    code, out, err = run(capsys, "info", "--urdf", urdf)
+    assert (code, err) == (0, "")
+    assert out.splitlines()[2].split() == ["hinge", "revolute", "-1.0000", "1.0000", "1.0000"]
+    shown = result(capsys, "info", "--urdf", urdf)
+    assert shown["joints"] == [{"name": "hinge", "lower": -1.0, "upper": 1.0, "velocity": 1.0}]
+    assert (shown["collision_links"], shown["num_spheres"]) == (["base", "tip"], 0)
+
+
+def test_pairs_are_listed_with_the_reason_of_those_left_out(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    urdf = written(tmp_path, arm_of(BALL, BALL))
+    code, out, _ = run(capsys, "pairs", "--urdf", urdf, "--postures", 10)
+    assert code == 0
+    assert out.splitlines()[2].split() == ["base", "tip", "1", "140", "to", "140", "0.0", "adjacent"]
+    srdf = written(tmp_path, '<robot name="r"><disable_collisions link1="base" link2="tip"/></robot>', "r.srdf")
+    listed = result(capsys, "pairs", "--urdf", urdf, "--srdf", srdf)
+    assert (listed["num_sphere_pairs"], listed["num_postures"]) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ((), 2, "required: ACTION"),
+        (("sphere",), 2, "did you mean spheres?"),
+        (("spheres", "--urdf", "none.urdf"), 4, "none.urdf: cannot be read"),
+        (("spheres", "--urdf", "URDF", "--max-spheres", "1"), 2, "1 spheres for 2 links"),
+        (("spheres", "--urdf", "URDF", "--max-protrusion", "1e-4"), 2, "largest protrusion: expected at least"),
+        (("spheres", "--urdf", "URDF", "--max-spheres", "9", "--max-protrusion", "1"), 2, "not allowed with"),
+        (("spheres", "--urdf", "URDF", "--max-deficit=-1"), 2, "expected 0 m or more, got -1"),
+        (("spheres", "--urdf", "URDF", "--seed=-1"), 2, "--seed: expected 0 to"),
+        (("check", "--urdf", "URDF"), 4, "expected collision geometry of spheres only, got 1 other shapes"),
+        (("check", "--urdf", "URDF", "--spheres", "none.yaml"), 4, "none.yaml: cannot be read"),
+        (("info", "--urdf", "URDF", "--lock", "elbow=0"), 4, "no joint 'elbow' to lock; movable joints there: hinge"),
+        (("info", "--urdf", "URDF", "--lock", "hinge"), 2, "expected JOINT=VALUE"),
+        (("info", "--urdf", "URDF", "--lock", "hinge=0"), 4, "every joint is locked"),
+        (("pairs", "--urdf", "URDF", "--postures", "0"), 2, "--postures: expected 1 or more, got 0"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    urdf: Path,
+    arguments: tuple[str, ...],
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(urdf.parent)
+    got, out, err = run(capsys, *[str(urdf) if word == "URDF" else word for word in arguments])
+    lines = [line for line in err.splitlines() if not line.startswith("robot spheres: fitting")]
+    assert (got, out, len(lines)) == (code, "", 1), err
+    assert words in lines[0]
+    assert list(urdf.parent.iterdir()) == [urdf]

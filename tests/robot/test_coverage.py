@@ -1,0 +1,184 @@
+"""Coverage by spheres: proven bounds hold against dense samples, against adversarial points and against formulas."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import look_at, transform_points
+from splatctrl_cli.records import SphereSet
+from splatctrl_cli.robot.coverage import areas, coverage_deficit, largest_deficit, refined, uncovered_area
+from splatctrl_cli.robot.urdf import read_urdf
+from tests.robot.shapes import BALL, BOX, arm_of, written
+
+CUBE = trimesh.creation.box(extents=(0.2, 0.2, 0.2)).triangles
+
+
+def phi(points: np.ndarray, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """Reference: signed distance to the union of balls, one point and one ball at a time."""
+    return np.array([min(np.linalg.norm(p - c) - r for c, r in zip(centers, radii, strict=True)) for p in points])
+
+
+def samples(triangles: np.ndarray, count: int, seed: int) -> np.ndarray:
+    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+
+
+def test_one_ball_in_a_cube_leaves_the_corners_by_a_known_distance() -> None:
+    found = largest_deficit(CUBE, np.zeros((1, 3)), np.array([0.12]))
+    expected = np.sqrt(3) * 0.1 - 0.12
+    assert found.found == pytest.approx(expected, abs=1e-12)
+    assert expected <= found.proven <= expected + 1e-4
+    np.testing.assert_allclose(np.abs(found.place), 0.1)
+
+
+def test_the_uncovered_area_of_a_cube_with_one_ball_is_that_of_six_squares_less_discs() -> None:
+    disc = np.pi * (0.12**2 - 0.1**2)
+    best, lower, upper = uncovered_area(CUBE, np.zeros((1, 3)), np.array([0.12]))
+    assert lower <= 6 * (0.04 - disc) <= upper
+    assert upper - lower < 0.03 * 0.24
+    assert best == pytest.approx(6 * (0.04 - disc), rel=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_dense_sample_and_no_climb_from_it_beats_the_proven_deficit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centers, radii = rng.uniform(-0.1, 0.1, (6, 3)), rng.uniform(0.03, 0.11, 6)
+    found = largest_deficit(CUBE, centers, radii)
+    points = samples(CUBE, 3000, seed)
+    value = phi(points, centers, radii)
+    assert value.max() <= found.proven
+    assert found.proven - found.found <= 1e-4 + 1e-12
+    assert phi(found.place[None], centers, radii)[0] == pytest.approx(found.found, abs=1e-12)
+    best = points[np.argsort(value)[-5:]]  # adversary: walk on the cube's faces from the best samples
+    for step in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
+        tried = best[:, None] + step * rng.normal(size=(5, 60, 3))
+        fixed = np.abs(np.abs(best) - 0.1) < 1e-12
+        tried = np.clip(np.where(fixed[:, None], best[:, None], tried), -0.1, 0.1)
+        climbed = phi(tried.reshape(-1, 3), centers, radii).reshape(5, 60)
+        best = np.where(
+            (climbed.max(axis=1) > phi(best, centers, radii))[:, None],
+            tried[np.arange(5), climbed.argmax(axis=1)],
+            best,
+        )
+        assert phi(best, centers, radii).max() <= found.proven
+    assert phi(best, centers, radii).max() >= found.found - 0.02
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bounds_on_the_uncovered_area_hold_a_dense_sample(seed: int) -> None:
+    rng = np.random.default_rng(10 + seed)
+    centers, radii = rng.uniform(-0.1, 0.1, (5, 3)), rng.uniform(0.05, 0.12, 5)
+    best, lower, upper = uncovered_area(CUBE, centers, radii)
+    share = np.mean(phi(samples(CUBE, 8000, seed), centers, radii) > 0)
+    assert lower - 0.006 <= share * 0.24 <= upper + 0.006
+    assert best == pytest.approx(share * 0.24, abs=0.006)
+
+
+def test_a_hole_between_two_spheres_that_no_corner_sees_is_found() -> None:
+    centers = np.array([[-0.06, 0, 0], [0.06, 0, 0]])
+    sheet = np.array([[[-0.1, -0.02, 0], [0.1, -0.02, 0], [0, 0.03, 0]]])
+    found = largest_deficit(sheet, centers, np.array([0.0599, 0.0599]))
+    assert found.found > 0
+    assert max(phi(sheet[0], centers, np.array([0.0599, 0.0599]))[:2]) < 0
+
+
+def test_coverage_moves_rigidly_and_scales() -> None:
+    rng = np.random.default_rng(5)
+    centers, radii = rng.uniform(-0.1, 0.1, (6, 3)), rng.uniform(0.03, 0.09, 6)
+    T = look_at([0.3, 1.0, -2.0], [0, 0, 0.5])
+    here = largest_deficit(CUBE, centers, radii)
+    there = largest_deficit(transform_points(T, CUBE), transform_points(T, centers), radii)
+    assert there.proven == pytest.approx(here.proven, abs=2e-4)
+    order = rng.permutation(6)
+    assert largest_deficit(CUBE, centers[order], radii[order]).proven == here.proven
+    double = largest_deficit(2 * CUBE, 2 * centers, 2 * radii, tolerance=2e-4)
+    assert double.proven == pytest.approx(2 * here.proven, rel=1e-12)
+
+
+def test_refined_triangles_are_the_same_surface() -> None:
+    parts, area = refined(CUBE, 0.03)
+    assert np.linalg.norm(parts - np.roll(parts, 1, axis=1), axis=2).max() <= 0.03
+    assert area.sum() == pytest.approx(areas(CUBE).sum(), rel=1e-12)
+
+
+def spheres(*rows: tuple[str, list[float], float]) -> SphereSet:
+    return SphereSet(
+        links=tuple(row[0] for row in rows),
+        centers=np.array([row[1] for row in rows], dtype=np.float64),
+        radii=np.array([row[2] for row in rows], dtype=np.float64),
+    )
+
+
+def test_a_report_says_deficit_share_and_protrusion_of_each_link(tmp_path: Path) -> None:
+    urdf = read_urdf(written(tmp_path, arm_of(BOX, BALL)))
+    half = np.array([0.15, 0.1, 0.05])
+    report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.15), ("tip", [0.01, 0, 0], 0.1)))
+    base, tip = report.links
+    assert base.deficit is not None
+    assert base.deficit.proven == pytest.approx(np.linalg.norm(half) - 0.15, abs=1e-4)
+    assert base.protrusion == pytest.approx(0.1)
+    assert 0 < base.uncovered_share < 1
+    assert (tip.is_covered, tip.uncovered_share) == (True, 0.0)
+    assert tip.protrusion == pytest.approx(0.1 + 0.01 - 0.08)
+    assert report.worst is base
+    assert (report.max_protrusion, report.num_spheres, report.stray_spheres) == (base.protrusion, 2, 0)
+
+
+def test_a_ball_in_a_sphere_of_its_size_is_covered_exactly(tmp_path: Path) -> None:
+    urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
+    exact = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.08), ("tip", [0, 0, 0], 0.08 - 1e-6)))
+    assert exact.links[0].is_covered
+    assert not exact.links[1].is_covered
+    assert exact.links[1].deficit is not None
+    assert exact.links[1].deficit.proven == pytest.approx(1e-6)
+
+
+def test_a_link_without_a_sphere_has_no_bound(tmp_path: Path) -> None:
+    urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
+    report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.08)))
+    assert report.bare_links == ("tip",)
+    assert (report.worst, report.max_deficit) == (None, None)
+    assert report.uncovered_share == pytest.approx(0.5)
+
+
+def test_spheres_of_a_link_fixed_to_another_cover_it(tmp_path: Path) -> None:
+    text = arm_of(BALL, BALL).replace(
+        "</robot>",
+        '<link name="pad"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
+        '<joint name="glue" type="fixed"><parent link="tip"/><child link="pad"/>'
+        '<origin xyz="0 0 0.05" rpy="0 1 0"/></joint></robot>',
+    )
+    urdf = read_urdf(written(tmp_path, text))
+    report = coverage_deficit(urdf, spheres(("base", [0, 0, 0], 0.1), ("tip", [0, 0, 0.02], 0.101)))
+    assert report.bare_links == ()
+    assert all(link.is_covered for link in report.links)
+    assert [link.num_spheres for link in report.links] == [1, 1, 0]
+
+
+def test_spheres_on_unknown_links_are_refused(tmp_path: Path) -> None:
+    urdf = read_urdf(written(tmp_path, arm_of(BALL, BALL)))
+    with pytest.raises(InputError, match=r"sphere set: link 'wing' is not in .*; links there: base, tip"):
+        coverage_deficit(urdf, spheres(("wing", [0, 0, 0], 0.1)))
+
+
+@pytest.mark.parametrize(
+    ("name", "share", "deficit"),
+    [
+        ("robot_spheres/curobo/curobo/content/configs/robot/franka.yml", 0.736, 0.1002),
+        ("robot_spheres/robometrics/robometrics/content/robot/franka_spheres.yml", 0.501, 0.0695),
+        ("vamp_panda/resources/panda/panda_spherized.urdf", 0.482, 0.0825),
+    ],
+)
+def test_public_panda_sets_leave_much_of_the_collision_hulls_uncovered(
+    real_data: Path, name: str, share: float, deficit: float
+) -> None:
+    from splatctrl_cli.robot.sphere_files import read_spheres
+
+    urdf = read_urdf(real_data / "vamp_panda/resources/panda/panda.urdf")
+    report = coverage_deficit(urdf, read_spheres(real_data / name), resolution=5e-3)
+    assert report.uncovered_share == pytest.approx(share, abs=0.005)
+    assert report.max_deficit == pytest.approx(deficit, abs=2e-4)
+    assert report.open_links == ("panda_link6",)

@@ -1,0 +1,100 @@
+"""Sphere files: every layout in use is read, what is written is read back, and the rest is refused by name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.robot.sphere_files import read_sphere_file, spheres_yaml
+from tests.robot.shapes import BALL, BOX, arm_of, written
+
+CUROBO = """robot_cfg:
+  kinematics:
+    collision_sphere_buffer: {buffer}
+    collision_spheres: {spheres}
+"""
+THREE = """
+  a:
+    - {center: [0.1, 0, 0], radius: 0.05}
+    - {center: [0.2, 0, 0], radius: -10.0}
+  b:
+    - {center: [0, 0.3, 0], radius: 0.01}
+"""
+
+
+def test_a_plain_file_is_read_and_spheres_of_no_size_are_off(tmp_path: Path) -> None:
+    file = read_sphere_file(written(tmp_path, "collision_spheres:" + THREE, "s.yaml"))
+    assert (file.layout, file.spheres.links, file.num_off) == ("YAML", ("a", "b"), 1)
+    np.testing.assert_array_equal(file.spheres.centers, [[0.1, 0, 0], [0, 0.3, 0]])
+    np.testing.assert_array_equal(file.spheres.radii, [0.05, 0.01])
+
+
+@pytest.mark.parametrize(
+    ("buffer", "radii", "num_off"),
+    [("0.0", [0.05, 0.01], 1), ("0.002", [0.052, 0.012], 1), ("-0.01", [0.04], 2), ("{b: 0.03}", [0.05, 0.04], 1)],
+)
+def test_curobo_adds_its_buffer_and_may_keep_spheres_elsewhere(
+    tmp_path: Path, buffer: str, radii: list[float], num_off: int
+) -> None:
+    written(tmp_path, "collision_spheres:" + THREE, "spheres/arm.yml")
+    file = read_sphere_file(written(tmp_path, CUROBO.format(buffer=buffer, spheres="spheres/arm.yml"), "arm.yml"))
+    assert (file.layout, file.num_off) == ("cuRobo YAML", num_off)
+    np.testing.assert_allclose(file.spheres.radii, radii, rtol=1e-12)
+
+
+def test_a_urdf_of_spheres_is_a_sphere_file(tmp_path: Path) -> None:
+    file = read_sphere_file(written(tmp_path, arm_of(BALL, BALL)))
+    assert (file.layout, file.spheres.links, file.num_off) == ("URDF", ("base", "tip"), 0)
+
+
+def test_what_is_written_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
+    file = read_sphere_file(written(tmp_path, "collision_spheres:" + THREE, "s.yaml"))
+    centers = np.random.default_rng(0).normal(size=(2, 3))
+    spheres = type(file.spheres)(links=("a", "b"), centers=centers, radii=np.array([1 / 3, 1e-6]))
+    again = read_sphere_file(written(tmp_path, spheres_yaml(spheres, ["of a test"]), "t.yaml")).spheres
+    assert again.links == spheres.links
+    np.testing.assert_array_equal(again.centers, centers)
+    np.testing.assert_array_equal(again.radii, spheres.radii)
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "count"),
+    [
+        ("robot_spheres/curobo/curobo/content/configs/robot/franka.yml", "cuRobo YAML", 61),
+        ("robot_spheres/curobo/curobo/content/configs/robot/ur10e.yml", "cuRobo YAML", 21),
+        ("robot_spheres/robometrics/robometrics/content/robot/franka_spheres.yml", "YAML", 61),
+        ("vamp_panda/resources/panda/panda_spherized.urdf", "URDF", 59),
+    ],
+)
+def test_public_sets_are_read(real_data: Path, name: str, layout: str, count: int) -> None:
+    file = read_sphere_file(real_data / name)
+    assert (file.layout, len(file.spheres.radii) + file.num_off) == (layout, count)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: [", "not valid YAML"),
+        ("- 1", "expected the layout collision_spheres: .*; or a URDF whose collision shapes are spheres"),
+        ("spheres: {}", "expected the layout collision_spheres"),
+        ("collision_spheres: none.yml", "none.yml: cannot be read"),
+        ("collision_spheres: {a: 3}", "link 'a': expected a list of spheres, got 3"),
+        ("collision_spheres: {a: [{center: [0, 0, .nan], radius: 1}]}", "link 'a': sphere 0: expected .*finite"),
+        ("collision_spheres: {a: [{center: [0, 0, 0], radius: .inf}]}", "link 'a': sphere 0: expected .*finite"),
+        ("collision_spheres: {a: [{center: [0, 0, 0]}]}", "link 'a': sphere 0: expected"),
+        ("collision_spheres: {a: [{center: [0, 0, 0], radius: -1}]}", "got none, all 1 of radius 0 or less"),
+        ("collision_spheres: {}", "expected collision spheres, got none"),
+        (CUROBO.format(buffer="wide", spheres="{a: []}"), "collision_sphere_buffer: expected numbers .* got 'wide'"),
+    ],
+)
+def test_other_files_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_sphere_file(written(tmp_path, text, "s.yaml"))
+
+
+def test_a_urdf_with_other_shapes_is_no_sphere_file(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"spheres only, got 1 other shapes; .* fit one with: splatctrl robot spheres"
+    ):
+        read_sphere_file(written(tmp_path, arm_of(BOX, BALL)))
