@@ -144,6 +144,8 @@ class ControlConfig:
     pose_gain: float = 2.0  # [1/s] pose error to end-effector velocity
     max_linear_speed: float = 0.25  # [m/s] cap of the reference: a usual speed beside people
     max_angular_speed: float = 1.0  # [rad/s]
+    distance_rate: str = "none"  # dd/dt of the rows; or snapshots: what distances lost between the two newest scenes
+    max_distance_rate: float = 1.6  # [m/s] that a scene is taken to approach with at most: a walking person
     max_residual: float = 1e-5  # a solution whose relative KKT residual exceeds this is not used
     slack_tolerance: float = 1e-4  # [m/s] slack above which a row counts as relaxed
     promise_tolerance: float = 1e-4  # [m] a step may fall short of what its rows promised before it is scaled back
@@ -233,6 +235,7 @@ _CHOICES = {
     "field.unknown": ("free", "obstacle", "nan"),
     "field.probability": ("calibrated", "paper"),
     "control.solver": ("clarabel", "daqp"),
+    "control.distance_rate": ("none", "snapshots"),
 }
 _AT_MOST_ONE = (
     *("scene.lambda_dssim", "scene.hole_opacity", "scene.gap_reserve", "scene.fill", "scene.final_rate"),

@@ -113,6 +113,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
     return lines
 
 
+FirstTime = Callable[[str, Callable[[float], bool]], float | None]
+"""Metric name, whether a value holds -> the first time [s] that does not."""
+
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 
 
@@ -129,19 +132,36 @@ def check_gate_names(requirements: Sequence[str], names: Collection[str]) -> Non
             )
 
 
-def check_gates(requirements: Sequence[str], metrics: Mapping[str, float | None]) -> None:
-    """Raise GateFailed naming every requirement that does not hold; a metric that is None fails its gate."""
+def check_gates(
+    requirements: Sequence[str],
+    metrics: Mapping[str, float | None],
+    *,
+    first_time: "FirstTime | None" = None,
+) -> None:
+    """Raise GateFailed naming every requirement that does not hold; a metric that is None fails its gate.
+
+    first_time gives the first time [s] at which a metric's own states break a requirement, None where it has none.
+    """
     check_gate_names(requirements, metrics)
     failed = []
     for requirement in requirements:
         name, comparison, bound = _parse_gate(requirement)
         value = metrics[name]
         if value is None or not _COMPARISONS[comparison](value, bound):
+            when = None if first_time is None else first_time(name, _holding(comparison, bound))
             failed.append(
                 f"{name} is {'unknown' if value is None else f'{value:.6g}'}, required {comparison} {bound:g}"
+                + ("" if when is None else f", first at {when:.3f} s")
             )
     if failed:
         raise GateFailed("gate failed: " + "; ".join(failed))
+
+
+def _holding(comparison: str, bound: float) -> Callable[[float], bool]:
+    def holds(value: float) -> bool:
+        return bool(_COMPARISONS[comparison](value, bound))
+
+    return holds
 
 
 def _gate(text: str) -> str:

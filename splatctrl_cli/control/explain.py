@@ -66,7 +66,7 @@ class Event:
     """An interval of consecutive states: first and last stamp [ns] and time [s], how many, the worst value and when,
     its names in the order they came up (at most MAX_NAMES of num_names), and the obstacle at the worst.
 
-    source: the field it is by, empty where none is; state: index of the worst.
+    source: the field it is by, empty where none is; state: index of the worst, worst_name: who it is of.
     """
 
     kind: EventKind
@@ -79,6 +79,7 @@ class Event:
     worst: float
     worst_s: float
     state: int
+    worst_name: str
     names: tuple[str, ...]
     num_names: int
     obstacle: Obstacle | None = None
@@ -86,7 +87,9 @@ class Event:
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """What makes events of one kind: is_on (T,), value (T,), the names at a state, and which end is the worse."""
+    """What makes events of one kind: is_on (T,), value (T,), the names at a state (the one that the value is of comes
+    first), and which end is the worse.
+    """
 
     kind: EventKind
     is_on: Bool
@@ -148,7 +151,7 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
             kind=EventKind.RELAXED,
             is_on=slack > 0,
             value=slack,
-            names_at=lambda i: [row.name for row in _asked(steps, i).relaxed],
+            names_at=lambda i: [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)],
         )
     )
     residual, clearance = _of(steps, lambda step: step.residual), _of(steps, lambda step: step.clearance)
@@ -190,6 +193,7 @@ def _event(stamp_ns: Stamps, signal: Signal, first: int, end: int) -> Event:
         worst=float(signal.value[worst]),
         worst_s=float(seconds[worst]),
         state=worst,
+        worst_name=next(iter(signal.names_at(worst)), ""),
         names=names[:MAX_NAMES],
         num_names=len(names),
     )
@@ -199,13 +203,12 @@ def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> 
     def largest(step: ControlStep) -> float:
         return max((row.multiplier for row in step.interventions if row.kind is kind), default=0.0)
 
+    def names_at(index: int) -> Sequence[str]:
+        rows = [row for row in _asked(steps, index).interventions if row.kind is kind]
+        return [row.name for row in sorted(rows, key=lambda row: -row.multiplier)]
+
     value = _of(steps, largest)
-    return Signal(
-        kind=EventKind(kind.value),
-        is_on=value > 0,
-        value=value,
-        names_at=lambda i: [row.name for row in _asked(steps, i).interventions if row.kind is kind],
-    )
+    return Signal(kind=EventKind(kind.value), is_on=value > 0, value=value, names_at=names_at)
 
 
 def _low(

@@ -19,9 +19,12 @@ from splatctrl_cli.control.checks import (
     sphere_clearance,
     static_violations,
 )
+from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
+from splatctrl_cli.control.rates import SceneStepAt, distance_rate
 from splatctrl_cli.control.step import ControlStep, QpIkController
+from splatctrl_cli.control.target import Guide, pose_error
 from splatctrl_cli.records import DistanceField, Float64
 
 FieldAt = Callable[[int], DistanceField]
@@ -33,6 +36,15 @@ class Outcome(StrEnum):
     GOAL_REACHED = "goal-reached"
     STALLED = "stalled"
     TIMEOUT = "timeout"
+    LOG_ENDED = "log-ended"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waypoint:
+    """A pose (4, 4) to reach, and the posture (J,) [rad] to lean to on the way there (None: the task's home)."""
+
+    T_world_goal: Float64
+    posture: Float64 | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +52,8 @@ class ReplayTask:
     """Where a closed loop starts, (J,) [rad] at a stamp [ns], and the pose (4, 4) its frame should reach.
 
     home (J,) [rad] is the posture the arm leans to where the task leaves it free; None is the middle of the limits.
+    via: poses to reach before the goal, one after the other. follow: the goal is the logged pose of each time, and
+    the run ends with the log. anchors: every anchor_period [s] the arm is put back into the posture logged then.
     """
 
     start: Float64
@@ -47,6 +61,10 @@ class ReplayTask:
     frame: str
     stamp_ns: int = 0
     home: Float64 | None = None
+    via: tuple[Waypoint, ...] = ()
+    follow: LoggedMotion | None = None
+    anchors: LoggedMotion | None = None
+    anchor_period: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +86,10 @@ class SceneChange:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayTrace:
-    """T steps: stamp_ns (T,), position (T, J) [rad] at which each step was taken, and the steps themselves."""
+    """T steps: stamp_ns (T,), position (T, J) [rad] at which each step was taken, and the steps themselves.
+
+    anchored: indices of the steps before which the arm was put back into the logged posture; num_reached: goals.
+    """
 
     stamp_ns: Stamps
     position: Float64
@@ -76,6 +97,8 @@ class ReplayTrace:
     outcome: Outcome
     static_violations: tuple[StaticViolation, ...]
     scene_changes: tuple[SceneChange, ...]
+    anchored: tuple[int, ...] = ()
+    num_reached: int = 0
 
 
 def closed_loop(
@@ -84,37 +107,49 @@ def closed_loop(
     task: ReplayTask,
     field_at: FieldAt,
     *,
+    scene_step_at: SceneStepAt | None = None,
     solver: QpSolver | None = None,
 ) -> ReplayTrace:
     """Integrate the controller's velocities at `config.period` until the goal, a stall or `config.max_time`.
 
-    field_at gives the field known at a stamp [ns], the same object for the same scene. Raises InputError for a start
-    outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
+    field_at gives the field known at a stamp [ns], the same object for the same scene; scene_step_at the two newest
+    scenes, for `config.distance_rate`. Raises InputError for a start outside the limits or a goal out of reach,
+    NotEvaluableError for a start in collision or outside the field.
     """
     check_config(config)
     q = checked_posture(model, task.start, what="start")
     check_within_limits(model, q, config.limit_tolerance)
-    check_goal(model, task.T_world_goal)
+    for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):
+        check_goal(model, waypoint.T_world_goal)
     field = field_at(task.stamp_ns)
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
     check_free(model, field, q)
     statics = static_violations(model, field, q, config.margin)
-    stamps, positions, steps, changes = [], [], [], []
-    outcome = Outcome.TIMEOUT
-    for index in range(max(round(config.max_time / config.period), 1)):
+    course, moving = _Course(model, config, task), np.flatnonzero(model.moving_spheres)
+    stamps, positions, steps, changes, anchored = [], [], [], [], []
+    outcome = Outcome.LOG_ENDED if task.follow is not None else Outcome.TIMEOUT
+    for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
+        if course.is_anchor(index):
+            q = course.anchor(stamp)
+            anchored.append(index)
         if field_at(stamp) is not field:
             changes.append(_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
             controller = controller.with_field(field)
-        step = controller.step(q, task.T_world_goal)
+        rate: float | Float64 = 0.0
+        if config.distance_rate == "snapshots" and scene_step_at is not None:
+            points = np.ascontiguousarray(model.sphere_centers(q)[moving])
+            rate = distance_rate(scene_step_at(stamp), points, config.max_distance_rate)
+        goal, guide = course.goal(stamp)
+        step = controller.step(q, goal, distance_rate=rate, guide=guide)
         stamps.append(stamp)
         positions.append(q)
         steps.append(step)
-        if is_at_goal(step.pose_error, config):
+        if course.has_ended(stamp, index, step):
             outcome = Outcome.GOAL_REACHED
             break
-        if _has_stalled(positions, config):
+        if task.follow is None and _has_stalled(positions[course.since :], config):
             outcome = Outcome.STALLED
             break
         q = q + config.period * step.velocity
@@ -125,7 +160,76 @@ def closed_loop(
         outcome=outcome,
         static_violations=statics,
         scene_changes=tuple(changes),
+        anchored=tuple(anchored),
+        num_reached=course.num_reached,
     )
+
+
+class _Course:
+    """Which goal holds at a step: one waypoint after the other, or the logged motion."""
+
+    def __init__(self, model: ArmModel, config: ControlConfig, task: ReplayTask) -> None:
+        self._model, self._config, self._task = model, config, task
+        self._waypoints = (*task.via, Waypoint(T_world_goal=task.T_world_goal, posture=None))
+        self.num_reached = 0
+        self.since = 0  # the step from which a stall counts: the last anchor or waypoint
+        left = (
+            config.max_time if task.follow is None else (task.follow.last_ns - task.stamp_ns) * 1e-9 + config.period
+        )
+        self.num_steps = max(round(left / config.period), 1)
+
+    def is_anchor(self, index: int) -> bool:
+        """True at every anchor period but the first step, as long as the log lasts."""
+        task = self._task
+        if task.anchors is None or index == 0 or task.anchor_period <= 0:
+            return False
+        every = max(round(task.anchor_period / self._config.period), 1)
+        is_logged = task.stamp_ns + round(index * self._config.period * 1e9) <= task.anchors.last_ns
+        if index % every or not is_logged:
+            return False
+        self.since = index
+        return True
+
+    def anchor(self, stamp_ns: int) -> Float64:
+        """The posture that was logged at a stamp."""
+        assert self._task.anchors is not None
+        return self._task.anchors.at(stamp_ns)[0]
+
+    def goal(self, stamp_ns: int) -> tuple[Float64, Guide | None]:
+        """The goal's pose at a stamp, and how it moves."""
+        task = self._task
+        if task.follow is not None:
+            return task.follow.goal_at(self._model, task.frame, stamp_ns)
+        waypoint = self._waypoints[self.num_reached]
+        if waypoint.posture is None:
+            return waypoint.T_world_goal, None
+        still = np.zeros(len(waypoint.posture))
+        return waypoint.T_world_goal, Guide(twist=np.zeros(6), posture=waypoint.posture, velocity=still)
+
+    def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
+        """True at the last goal; on the way there a goal that is reached gives way to the next."""
+        if not is_at_goal(step.pose_error, self._config):
+            return False
+        if self._task.follow is not None:
+            return stamp_ns >= self._task.follow.last_ns
+        self.num_reached += 1
+        self.since = index
+        return self.num_reached == len(self._waypoints)
+
+
+def divergence(
+    model: ArmModel, frame: str, stamp_ns: Stamps, position: Float64, motion: LoggedMotion
+) -> tuple[Float64, Float64, Float64]:
+    """How far T postures (T, J) are from those logged at the same stamps: joint norm [rad], and of the frame position
+    [m] and rotation [rad], each (T,); NaN after the log's end.
+    """
+    joints, linear, angular = (np.full(len(stamp_ns), np.nan) for _ in range(3))
+    for index in np.flatnonzero(stamp_ns <= motion.last_ns):
+        logged = motion.at(int(stamp_ns[index]))[0]
+        error = pose_error(model.frame_pose(position[index], frame), model.frame_pose(logged, frame))
+        joints[index] = np.linalg.norm(position[index] - logged)
+        linear[index], angular[index] = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+    return joints, linear, angular
 
 
 def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:

@@ -168,7 +168,7 @@ def clearance_picture(
                 color="#555555",
                 fontsize=10,
             )
-        axes.set(xlabel="time [s]", ylabel="clearance [cm]", xlim=(float(seconds[0]), float(seconds[-1])))
+        axes.set(xlabel="time [s]", ylabel="clearance [cm]", xlim=span_of(seconds))
         axes.set_ylim(bottom=bottom)
         axes.set_title(title, pad=12)
         axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
@@ -176,6 +176,11 @@ def clearance_picture(
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(len(curves), 3))
         save_figure(figure, path)
+
+
+def span_of(seconds: Float64) -> tuple[float, float]:
+    """First and last time [s] of an axis, never the same."""
+    return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
 
 
 @contextmanager

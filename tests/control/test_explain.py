@@ -53,7 +53,7 @@ def test_an_event_has_the_worst_value_of_its_run_and_every_name_in_order() -> No
     first, second = events_of(STAMPS, [signal])
     assert (first.start_s, first.end_s, first.num_states) == (pytest.approx(0.1), pytest.approx(0.3), 3)
     assert (first.worst, first.worst_s, first.state) == (3.0, pytest.approx(0.2), 2)
-    assert first.names == ("b", "a") and first.num_names == 2
+    assert first.names == ("b", "a") and first.num_names == 2 and first.worst_name == "b"
     assert second.first_ns == second.last_ns == 500_000_000 and second.worst == 5.0
     (low,) = events_of(STAMPS, [replace(signal, is_on=signal.value < 4, is_high_worse=False)])
     assert low.worst == 1.0
@@ -101,18 +101,20 @@ def test_steps_become_events_by_what_shaped_them() -> None:
     steps = [
         step(),
         step(interventions=(row("fore[1]", RowKind.SCENE, 0.5), row("elbow highest", RowKind.LIMIT, 0.1))),
-        step(interventions=(row("fore[0]", RowKind.SCENE, 2.5),), scale=0.5),
+        step(interventions=(row("upper[1]", RowKind.SCENE, 0.5), row("fore[1]", RowKind.SCENE, 3.0))),
+        step(interventions=(row("fore[1]", RowKind.SCENE, 2.5),), scale=0.5),
         step(rung=Rung.RELAXED, relaxed=(RowSlack(name="fore[1]", slack=0.03),)),
         step(rung=Rung.HOLD, scale=0.0),
-        None,
     ]
     found = {event.kind: event for event in events_of(STAMPS, step_signals(steps))}
     assert set(found) == {
         EventKind.SCENE, EventKind.LIMIT, EventKind.SCALED_BACK, EventKind.RELAXED, EventKind.HOLD
     }  # fmt: skip
-    assert found[EventKind.SCENE].names == ("fore[1]", "fore[0]") and found[EventKind.SCENE].worst == 2.5
+    assert found[EventKind.SCENE].names == ("fore[1]", "upper[1]") and found[EventKind.SCENE].worst == 3.0
+    assert found[EventKind.SCENE].worst_name == "fore[1]"
     assert found[EventKind.LIMIT].names == ("elbow highest",) and found[EventKind.SCALED_BACK].worst == 0.5
-    assert found[EventKind.RELAXED].worst == 0.03 and found[EventKind.HOLD].first_ns == 400_000_000
+    assert found[EventKind.RELAXED].worst == 0.03 and found[EventKind.HOLD].first_ns == 500_000_000
+    assert not events_of(STAMPS, step_signals([None] * 6))
 
 
 def test_the_first_intervention_is_the_controllers_and_not_the_motions() -> None:

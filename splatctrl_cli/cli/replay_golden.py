@@ -1,0 +1,111 @@
+"""``--golden``: the commands of this replay against those of an earlier one, step by step."""
+
+import argparse
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.errors import GateFailed, InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.cli.replay_modes import Replay
+
+TOLERANCE = 1e-6  # [rad/s]: steps.csv keeps nine digits; another machine or solver needs more
+
+
+@dataclass(frozen=True, kw_only=True)
+class Golden:
+    """The commands of an earlier run: joint names (J,), and per step its stamp [ns] and velocities (J,), None where
+    there was no command.
+    """
+
+    path: Path
+    joints: tuple[str, ...]
+    stamps_ns: tuple[int, ...]
+    velocity: tuple[tuple[float, ...] | None, ...]
+
+
+def add_golden(parser: argparse.ArgumentParser) -> None:
+    """``--golden`` and ``--golden-tolerance``."""
+    parser.add_argument(
+        "--golden",
+        type=Path,
+        metavar="FILE",
+        help="fail (exit 1) where a command differs from an earlier replay's (its folder, run.json or steps.csv)",
+    )
+    parser.add_argument(
+        "--golden-tolerance",
+        type=float,
+        default=TOLERANCE,
+        metavar="RAD/S",
+        help=f"by more than this, per joint (default: {TOLERANCE:g})",
+    )
+
+
+def read_golden(args: argparse.Namespace) -> Golden | None:
+    """The earlier run that --golden names, None without one. Raises UsageError for an audit, which commands nothing,
+    InputError for a file without commands.
+    """
+    if args.golden is None:
+        return None
+    if args.mode == "audit":
+        raise UsageError("--golden: an audit commands nothing", remedy="give --mode open-loop or closed-loop")
+    if not args.golden_tolerance >= 0:
+        raise UsageError(f"--golden-tolerance: expected 0 rad/s or more, got {args.golden_tolerance:g}")
+    path: Path = args.golden
+    file = path / "steps.csv" if path.is_dir() else path.with_name("steps.csv") if path.suffix == ".json" else path
+    try:
+        with file.open(encoding="utf-8", newline="") as stream:
+            reader = csv.DictReader(stream)
+            joints = tuple(name[2:] for name in reader.fieldnames or () if name.startswith("v_"))
+            rows = [(int(row["stamp_ns"]), _velocity([row[f"v_{joint}"] for joint in joints])) for row in reader]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: cannot be read: {error}", remedy="give --golden an earlier replay") from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: not the steps of a replay: {error}") from None
+    if not joints or not rows:
+        raise InputError(f"{file}: expected commands (columns v_JOINT), got none", remedy="an audit has none")
+    stamps, velocity = zip(*rows, strict=True)
+    return Golden(path=file, joints=joints, stamps_ns=stamps, velocity=velocity)
+
+
+def check_golden(golden: Golden, replay: "Replay", tolerance: float) -> None:
+    """Raise GateFailed naming the first step and joint that differ by more than `tolerance` [rad/s], else a number of
+    steps that does; InputError where the joints are others.
+    """
+    joints = tuple(replay.model.joint_names)
+    if set(joints) != set(golden.joints):
+        raise InputError(f"{golden.path}: expected the joints {', '.join(joints)}, got {', '.join(golden.joints)}")
+    order = [golden.joints.index(joint) for joint in joints]
+    stamps = replay.audit.stamp_ns
+    for index, step in enumerate(replay.steps[: len(golden.velocity)]):
+        when = f"step {index} at {float(stamps[index] - stamps[0]) * 1e-9:.3f} s"
+        if int(stamps[index]) != golden.stamps_ns[index]:
+            raise GateFailed(f"golden: {when}: expected stamp {golden.stamps_ns[index]} ns, got {stamps[index]} ns")
+        expected = golden.velocity[index]
+        if expected is None or step is None:
+            if (expected is None) != (step is None):
+                raise GateFailed(f"golden: {when}: expected {_is_there(expected)}, got {_is_there(step)}")
+            continue
+        for joint, at, value in zip(joints, order, step.velocity, strict=True):
+            if not abs(value - expected[at]) <= tolerance:
+                raise GateFailed(
+                    f"golden: {when}: joint {joint}: expected {expected[at]:.9g} rad/s within {tolerance:g}, "
+                    f"got {value:.9g}",
+                    remedy="if the change is meant, keep this run as the golden one",
+                )
+    if len(replay.steps) != len(golden.velocity):
+        raise GateFailed(
+            f"golden: expected {len(golden.velocity)} steps, got {len(replay.steps)}; those in common agree"
+        )
+
+
+def _velocity(cells: Sequence[str]) -> tuple[float, ...] | None:
+    """The command of a row, None where every cell is empty."""
+    return None if not any(cells) else tuple(float(cell) for cell in cells)
+
+
+def _is_there(command: object) -> str:
+    return "no command" if command is None else "a command"

@@ -1,0 +1,33 @@
+"""How fast a scene that comes in snapshots approaches: the rate dd/dt of the rows, from the past alone."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.records import DistanceField, Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneStep:
+    """The two newest scenes known at a time, and the seconds between them."""
+
+    newer: DistanceField
+    older: DistanceField
+    seconds: float
+
+
+SceneStepAt = Callable[[int], SceneStep | None]
+"""What was known at a stamp [ns], None where there was only one scene; never anything later."""
+
+
+def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> float | Float64:
+    """dd/dt (Q,) [m/s] at points (Q, 3) [m] that stand still: what the distance lost per second from the older to the
+    newer scene, at most `limit`; 0 where the scene went away, so that a row is only ever tightened.
+
+    The rate is that of the past interval, held until the next scene; where a distance is missing it is 0.
+    """
+    if step is None:
+        return 0.0
+    change = (step.newer.query(points)[0] - step.older.query(points)[0]) / step.seconds
+    return np.asarray(np.clip(np.nan_to_num(change), -limit, 0.0))

@@ -1,0 +1,105 @@
+"""A log of joint states, scenes with a known answer, and a folder to replay one against the other in."""
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.io.scene_writer import SceneWriter
+from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
+from splatctrl_cli.robot.model import RobotModel
+
+SECOND = 1_000_000_000
+START = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
+BALL = ((0.75, 0.45, 0.40), 0.05)
+
+
+@dataclass(kw_only=True)
+class FakeSource:
+    """A recording of joint states alone."""
+
+    states: Sequence[JointState]
+    joint_names: tuple[str, ...] = tuple(f"joint{i}" for i in range(1, 8))
+    cameras: tuple[str, ...] = ("cam0",)
+    name: str = "fake.mcap"
+    has_clock: bool = True
+    loss: LossReport = field(default_factory=LossReport)
+
+    def records(self) -> Iterator[Record]:
+        yield from self.states
+
+    def digests(self) -> dict[str, str]:
+        return {"fake.mcap": "0" * 64}
+
+
+def logged(end: Float64 = START, num: int = 11, start_ns: int = 0) -> list[JointState]:
+    """States at 10 Hz on the straight way from START to `end`."""
+    return [
+        JointState(stamp_ns=start_ns + i * SECOND // 10, position=START + f * (end - START), velocity=np.zeros(7))
+        for i, f in enumerate(np.linspace(0, 1, num))
+    ]
+
+
+def splats_of(*balls: tuple[tuple[float, float, float], float]) -> SplatSet:
+    num = len(balls)
+    return SplatSet(
+        centers=np.array([ball[0] for ball in balls], np.float32),
+        radii=np.array([ball[1] for ball in balls], np.float32),
+        colors=np.zeros((num, 3), np.float32),
+        opacities=np.full(num, 0.9, np.float32),
+        labels=np.zeros(num, np.uint8),
+        density=np.zeros(num, np.float32),
+    )
+
+
+def grid_seen(is_seen: bool = True) -> OccupancyGrid:
+    shape = (40, 40, 40)
+    return OccupancyGrid(
+        origin=np.array([-1.5, -1.5, -1.0]),
+        voxel=0.1,
+        log_odds=np.full(shape, -1.0, np.float32),
+        num_updates=np.full(shape, int(is_seen), np.uint16),
+        entity=np.zeros(shape, np.uint8),
+    )
+
+
+def write_scene(folder: Path, *snapshots: tuple[int, SplatSet], is_seen: bool = True) -> Path:
+    folder.mkdir()
+    writer = SceneWriter(folder, {"frame": "world"})
+    for stamp_ns, splats in snapshots:
+        writer.snapshot(stamp_ns, splats, grid_seen(is_seen), grid_seen(is_seen).states(0.3, 0.7))
+    writer.finish(*snapshots[-1], grid_seen(is_seen))
+    metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": snapshots[-1][0]}
+    (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
+    return folder
+
+
+@dataclass(kw_only=True)
+class Desk:
+    """A folder to work in, a source that stands for the log, and the robot's files."""
+
+    folder: Path
+    source: FakeSource
+    robot: list[str]
+
+    def replay(self, *arguments: str, out: str = "out") -> int:
+        log = str(self.folder / "fake.mcap")
+        return main(["replay", log, *self.robot, "-o", str(self.folder / out), *arguments])
+
+    def metrics(self, out: str = "out") -> dict[str, Any]:
+        metrics: dict[str, Any] = json.loads((self.folder / out / "summary.json").read_text())["metrics"]
+        return metrics
+
+    def rows(self, out: str = "out") -> list[dict[str, str]]:
+        with (self.folder / out / "steps.csv").open() as stream:
+            return list(csv.DictReader(stream))
+
+
+def clearance(arm: RobotModel, q: Float64, ball: tuple[tuple[float, float, float], float] = BALL) -> float:
+    gap = np.linalg.norm(arm.sphere_centers(q) - np.array(ball[0]), axis=1) - arm.sphere_set.radii - ball[1]
+    return float(gap[arm.moving_spheres].min())

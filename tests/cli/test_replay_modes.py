@@ -1,0 +1,247 @@
+"""Open loop, golden commands, explanations, gates, and what a closed loop may be asked for."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.cli.replay_metrics import metric_names
+from splatctrl_cli.records import JointState
+from splatctrl_cli.robot.model import RobotModel
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, splats_of, write_scene
+
+MOVE = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def moving(desk: Desk, move: np.ndarray = MOVE) -> None:
+    """A log of one second from START, with its velocity."""
+    desk.source.states = [
+        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move)
+    ]
+
+
+def ball_ahead(arm: RobotModel, gap: float) -> tuple[tuple[float, float, float], float]:
+    """A ball ahead of the hand at the log's end, `gap` from the nearest sphere to the millimetre."""
+    end, tip = START + MOVE, arm.sphere_centers(START + MOVE)[-1]
+    out = tip - arm.sphere_centers(START)[-1]
+    out /= np.linalg.norm(out)
+    for way in np.arange(0.4, 0.0, -0.001):
+        ball = (tuple(tip + way * out), 0.05)
+        if clearance(arm, end, ball) < gap:  # type: ignore[arg-type]
+            return ball  # type: ignore[return-value]
+    raise AssertionError
+
+
+def events(desk: Desk, out: str = "out") -> list[dict[str, object]]:
+    document: list[dict[str, object]] = json.loads((desk.folder / out / "events.json").read_text())["events"]
+    return document
+
+
+def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05))))
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "open-loop") == 0
+    metrics = desk.metrics()
+    assert metrics["intervention_share"] == 0 and metrics["max_velocity_difference"] < 1e-5
+    assert metrics["min_barrier_margin_logged"] > 0 and metrics["first_intervention_s"] is None
+    assert [float(row["v_joint1"]) for row in desk.rows()] == pytest.approx([0.5] * 11, abs=1e-5)
+    assert (desk.folder / "out" / "open_loop.png").is_file()
+
+
+def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05), ball_ahead(arm, 0.01))))
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "open-loop") == 0
+    metrics, rows = desk.metrics(), desk.rows()
+    assert 0 < metrics["intervention_share"] < 1 and metrics["num_barrier_broken_logged"] > 0
+    broken = [float(row["barrier_margin_logged"]) < 0 for row in rows]
+    assert sum(broken) == metrics["num_barrier_broken_logged"]
+    assert all(row["intervening"] for row, is_broken in zip(rows, broken, strict=True) if is_broken)
+    last = rows[-1]
+    difference = [float(last[f"dv_joint{j}"]) for j in range(1, 8)]
+    assert float(last["velocity_difference"]) == pytest.approx(np.linalg.norm(difference))
+    assert [float(last[f"v_joint{j}"]) for j in range(1, 8)] == pytest.approx(MOVE + difference, abs=1e-7)
+    (scene_event,) = [event for event in events(desk) if event["kind"] == "scene"]
+    assert scene_event["obstacle"]["splat"] == 1 and scene_event["obstacle"]["label"] == "object"  # type: ignore[index]
+    assert scene_event["start_s"] == pytest.approx(metrics["first_intervention_s"])
+    assert str(scene_event["worst_name"]).startswith("hand[")
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith(f"first intervention: {scene_event['start_s']:.2f} to 1.00 s, scene row hand[")
+    assert "near object splat 1 at (" in first
+    assert json.loads((desk.folder / "out" / "summary.json").read_text())["when_and_why"][0] == first
+
+
+def test_open_loop_may_ask_for_a_goal_instead_of_the_log(desk: Desk) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    goal = "--goal-joints=" + ",".join(str(v) for v in START)
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "open-loop", goal) == 0
+    assert float(desk.rows()[-1]["v_joint1"]) < 0 and desk.metrics()["max_velocity_difference"] > 0.5
+
+
+def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(desk: Desk, arm: RobotModel) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05), ball_ahead(arm, -0.01))))
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    found = {(event["kind"], event["source"]): event for event in events(desk)}
+    below, hit = found["below-margin", "exact"], found["in-collision", "exact"]
+    assert below["end_s"] == hit["end_s"] == 1.0 and below["start_s"] < hit["start_s"]
+    assert below["worst"] == pytest.approx(desk.metrics()["min_clearance"]) and below["unit"] == "m"
+    assert below["obstacle"]["splat"] == 1  # type: ignore[index]
+
+
+def test_an_old_scene_is_stale(desk: Desk) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), (SECOND // 2, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", "--max-map-age", "0.25") == 0
+    stale = [event for event in events(desk) if event["kind"] == "stale-map"]
+    assert [(event["start_s"], event["end_s"]) for event in stale] == [
+        (pytest.approx(0.3), pytest.approx(0.4)),
+        (pytest.approx(0.8), 1.0),
+    ]
+    assert desk.metrics()["max_map_age_s"] == pytest.approx(0.5)
+
+
+def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_joint(
+    desk: Desk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    drive = ("--scene", str(scene), "-q", "--mode", "closed-loop")
+    golden = str(desk.folder / "golden")
+    assert desk.replay(*drive, out="golden") == 0
+    assert desk.replay(*drive, "--golden", golden + "/run.json") == 0
+    assert desk.replay(*drive, "--golden", golden + "/steps.csv", "--golden-tolerance", "0", "--force") == 1
+    capsys.readouterr()
+    other = ("--set", "control.posture_gain=0.6", "--golden", golden)
+    assert desk.replay(*drive, *other, out="other") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "golden: step 0 at 0.000 s: joint joint" in line and "within 1e-06, got" in line
+    assert desk.replay(*drive, *other, "--golden-tolerance", "10", out="loose") == 0
+    assert desk.metrics("loose")["num_steps"] == desk.metrics()["num_steps"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--golden", "nowhere.csv"), 2, "--golden: an audit commands nothing"),
+        (("--mode", "closed-loop", "--golden", "nowhere.csv"), 4, "nowhere.csv: cannot be read"),
+        (("--mode", "open-loop", "--golden", "x", "--golden-tolerance", "-1"), 2, "--golden-tolerance"),
+        (("--mode", "closed-loop", "--waypoints", "nowhere.toml"), 4, "nowhere.toml: cannot be read"),
+        (("--mode", "closed-loop", "--re-anchor", "0"), 2, "expected seconds above 0"),
+        (("--require", "intervention_share<=0"), 2, "unknown metric"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_words(
+    desk: Desk, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", *arguments) == code
+    assert words in capsys.readouterr().err
+
+
+def test_a_golden_file_without_commands_is_refused(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", out="audit") == 0
+    arguments = ("--mode", "open-loop", "--golden", str(desk.folder / "audit"))
+    assert desk.replay("--scene", str(scene), "-q", *arguments) == 4
+    assert "expected commands (columns v_JOINT), got none" in capsys.readouterr().err
+
+
+def test_an_unknown_gate_is_refused_before_anything_is_read(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    assert desk.replay("--scene", "nowhere", "-q", "--require", "min_clearence>=0") == 2
+    assert "unknown metric; did you mean min_clearance" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
+def test_the_names_of_gates_are_those_of_the_metrics(desk: Desk, mode: str) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", "--mode", mode, out=mode) == 0
+    names = metric_names(mode, ("exact", "barrier"), has_truth=False)
+    assert set(desk.metrics(mode)) == set(names) and len(set(names)) == len(names)
+
+
+def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(ball_ahead(arm, 0.01))))
+    gates = ("--require", "min_clearance>=0.03", "--require", "num_below_margin<=0", "--require", "unknown_share>=2")
+    assert desk.replay("--scene", str(scene), "-q", *gates) == 1
+    message = capsys.readouterr().err
+    rows = desk.rows()
+    first = next(row for row in rows if float(row["clearance_exact"]) < 0.03)
+    second = next(row for row in rows if float(row["clearance_exact"]) < 0.02)
+    assert f"required >= 0.03, first at {float(first['time_s']):.3f} s" in message
+    assert f"required <= 0, first at {float(second['time_s']):.3f} s" in message
+    assert message.rstrip().endswith("required >= 2")
+
+
+def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05))))
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", "--follow") == 0
+    metrics = desk.metrics()
+    assert metrics["num_steps"] == 101 and metrics["goal_reached"] == 1
+    assert metrics["max_divergence_joints"] < 0.01 and metrics["max_divergence_position"] < 0.005
+    assert float(desk.rows()[-1]["divergence_joints"]) == pytest.approx(metrics["end_divergence_joints"])
+    assert (desk.folder / "out" / "divergence.png").is_file()
+
+
+def test_an_anchor_puts_the_arm_back_into_the_log(desk: Desk) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    stay = "--goal-joints=" + ",".join(str(v) for v in START + np.array([0, 0, 0, 0, 0, 0, 0.5]))
+    drive = ("--scene", str(scene), "-q", "--mode", "closed-loop", stay)
+    assert desk.replay(*drive, "--re-anchor", "0.25", out="anchored") == 0
+    assert desk.replay(*drive) == 0
+    found = [float(row["divergence_joints"] or "nan") for row in desk.rows("anchored")]
+    assert found[25] == found[50] == 0.0 < found[24]
+    assert json.loads((desk.folder / "anchored" / "events.json").read_text())["anchored"][:2] == [25, 50]
+    assert np.nanmax(found) < desk.metrics()["max_divergence_joints"]
+
+
+@pytest.mark.parametrize("form", ["toml", "csv"])
+def test_waypoints_are_reached_one_after_the_other(desk: Desk, arm: RobotModel, form: str) -> None:
+    moving(desk)
+    postures = [START + f * MOVE for f in (0.6, 0.0)]
+    file = desk.folder / f"way.{form}"
+    if form == "toml":
+        file.write_text("\n".join(f"[[waypoint]]\njoints = {q.tolist()}" for q in postures))
+    else:
+        rows = [",".join(arm.joint_names), *(",".join(str(v) for v in q) for q in postures)]
+        file.write_text("\n".join(rows) + "\n")
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", "--waypoints", str(file)) == 0
+    assert desk.metrics()["num_goals_reached"] == 2
+    frame = arm.frame_names[-1]
+    places = [
+        arm.frame_pose(np.array([float(row[f"q_joint{j}"]) for j in range(1, 8)]), frame)[:3, 3]
+        for row in desk.rows()
+    ]
+    for posture, rows in zip(postures, (places, places[-1:]), strict=True):
+        assert np.linalg.norm(rows - arm.frame_pose(posture, frame)[:3, 3], axis=1).min() <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.toml", "waypoint = 3", "waypoint 0: expected pose"),
+        ("b.toml", "[[waypoint]]\npose = [1, 2]", "waypoint 0: expected 7 numbers"),
+        ("c.toml", "[[waypoint]]\njoints = [1, 2]", "waypoint 0: expected 7 joints"),
+        ("d.toml", "", "expected at least one waypoint, got none"),
+        ("e.toml", "x = [", "not valid TOML"),
+        ("f.csv", "a,b\n1,2\n", "expected the columns x,y,z,qx,qy,qz,qw or joint1"),
+        ("g.csv", "x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,a\n", "waypoint 0: expected numbers"),
+    ],
+)
+def test_a_file_of_waypoints_that_is_none_is_refused(
+    desk: Desk, capsys: pytest.CaptureFixture[str], name: str, text: str, words: str
+) -> None:
+    file: Path = desk.folder / name
+    file.write_text(text)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", "--waypoints", str(file)) == 4
+    assert words in capsys.readouterr().err
