@@ -75,11 +75,18 @@ class RgbdFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class JointState:
-    """Joint positions (J,) float64 [rad or m] and velocities (J,) float64 [1/s], in the source's joint order."""
+    """Joint positions (J,) float64 [rad or m] and velocities (J,) float64 [1/s], in the source's joint order.
+
+    Where a log has them: commanded_velocity (J,) [1/s], and the end effector's pose (4, 4) as the robot itself
+    reported it, in its base or in the world.
+    """
 
     stamp_ns: int
     position: Float64
     velocity: Float64
+    commanded_velocity: Float64 | None = None
+    T_base_ee: Float64 | None = None
+    T_world_ee: Float64 | None = None
 
 
 Record = RgbdFrame | JointState
@@ -90,6 +97,8 @@ class LossReport:
     """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted.
 
     invalid_depth: pixels whose depth is NaN, infinite or negative, which count as having none.
+    differentiated_velocities: joint states with a velocity that is the change of the positions; unsorted_states,
+    duplicate_states: stamps that went back, or came again; state_gaps: times without joint states.
     """
 
     unpaired_color: int = 0
@@ -98,6 +107,10 @@ class LossReport:
     without_intrinsics: int = 0
     damaged: int = 0
     invalid_depth: int = 0
+    differentiated_velocities: int = 0
+    unsorted_states: int = 0
+    duplicate_states: int = 0
+    state_gaps: int = 0
     notes: list[str] = field(default_factory=list)
 
 

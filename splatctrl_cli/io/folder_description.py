@@ -125,6 +125,18 @@ def read_description(path: Path, root: Path | None = None) -> Description:
     return _read(_content(path), path, root)
 
 
+def read_table(kind: type[T], path: Path, name: str) -> T:
+    """The table [name] of a TOML file that holds no other. Raises InputError as `read_description`."""
+    content = _content(path)
+    _check_keys(content, {name}, str(path), "")
+    return _required(kind, content, name, path)
+
+
+def has_table(path: Path, name: str) -> bool:
+    """Whether a TOML file has a table [name]. Raises InputError where it is no TOML."""
+    return name in _content(path)
+
+
 def read_rig(path: Path, root: Path | None = None) -> list[Description]:
     """One description per ``[[cameras]]`` of a file that has them: its keys are those of [camera], and `color`,
     `depth` and `poses` for its files; all else is common to them. Empty where the file has none.

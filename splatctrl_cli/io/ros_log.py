@@ -4,7 +4,7 @@ Two passes: the first takes all but the images (transforms may follow the images
 frame; the second decodes only planned images and holds no more of them than the log's disorder demands.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -42,7 +42,7 @@ class RosLogSource:
 
     has_clock = True
 
-    def __init__(self, log: RawLog, options: SourceOptions) -> None:
+    def __init__(self, log: RawLog, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
         options.refuse(("root", "holdout"), "a log", log.path)
         self.name = log.path.name
         self._log = log
@@ -53,7 +53,7 @@ class RosLogSource:
         self._rig = build_cameras(log, found, options)
         self.cameras = tuple(camera.name for camera in self._rig)
         self.world_frame = self._rig[0].world_frame
-        self.joint_names, self._joints = joint_records(found, options, self._loss)
+        self.joint_names, self._joints = joint_records(found, options, self._loss, joints)
         self._plan = self._planned(found)
         self._damage = Damage()
         self._num_invalid = 0

@@ -9,7 +9,6 @@ from splatctrl_cli.io.decoder import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
-    JOINT_STATE,
     TRANSFORMS,
     MessageDecoder,
     UndecodableMessageError,
@@ -19,6 +18,7 @@ from splatctrl_cli.io.decoder import (
 )
 from splatctrl_cli.io.messages import ImageMessage, read_image
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.io.state_messages import STANDARD_TYPES, STATE_TYPES, RawJoints, read_states
 from splatctrl_cli.io.tf_tree import TfTree
 from splatctrl_cli.records import Float64
 
@@ -36,16 +36,6 @@ class Calibration:
     distortion_model: str
     distortion: Float64
     frame_id: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class RawJoints:
-    """One JointState as recorded; velocity may be empty."""
-
-    stamp_ns: int
-    names: tuple[str, ...]
-    position: Float64
-    velocity: Float64
 
 
 @dataclass(kw_only=True)
@@ -111,8 +101,8 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
             entry.first_image = read_image(decoder.decode(message), kind)
     elif kind == CAMERA_INFO and entry.calibration is None:
         entry.calibration = _calibration(decoder.decode(message))
-    elif kind == JOINT_STATE:
-        entry.joints.append(_joints(decoder.decode(message)))
+    elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
+        entry.joints.extend(read_states(decoder.decode(message), kind, message.log_time_ns))
     elif kind in TRANSFORMS:
         _add_transforms(result.tf, decoder.decode(message), static=message.topic.name.endswith("tf_static"))
 
@@ -131,17 +121,6 @@ def _calibration(message: Any) -> Calibration | None:
         distortion=np.asarray(fields["d"], dtype=np.float64),
         frame_id=message.header.frame_id.strip("/"),
     )
-
-
-def _joints(message: Any) -> RawJoints:
-    names = tuple(str(name) for name in message.name)
-    position = np.asarray(message.position, dtype=np.float64)
-    velocity = np.asarray(message.velocity, dtype=np.float64)
-    if len(position) != len(names) or len(velocity) not in {0, len(names)}:
-        raise UndecodableMessageError(
-            f"a JointState with {len(names)} names, {len(position)} positions and {len(velocity)} velocities"
-        )
-    return RawJoints(stamp_ns=stamp_ns(message.header), names=names, position=position, velocity=velocity)
 
 
 def _add_transforms(tree: TfTree, message: Any, *, static: bool) -> None:
