@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.robot.levers import lever_arms
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.spheres import matched_links, spheres_of
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
@@ -156,6 +157,10 @@ class RobotModel:
         there = self._model.frames[self._frame(frame)]
         in_body = np.ascontiguousarray(there.placement.homogeneous[:3])
         return self._chain.frame(self._checked(q), there.parentJoint, in_body)
+
+    def lever_arms(self) -> Float64:
+        """(S, J) upper bounds, over every posture, of how far a centre moves per radian (or metre) of a joint."""
+        return lever_arms(self._chain, self.lower, self.upper)
 
     def reach(self) -> float:
         """Radius [m] of a ball about the base that holds every sphere in every posture (sum of link lengths)."""
