@@ -128,6 +128,7 @@ class FieldConfig:
 class ControlConfig:
     """III-E: QP inverse kinematics with control barrier functions."""
 
+    preset: str = "reduced"  # the program; or paper: III-E as printed, with barrier_gain = 1 and without a second look
     solver: str = "clarabel"  # of the QP; or daqp: an active-set method, several times as fast
     margin: float = 0.02  # [m] epsilon, IV-C
     period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
@@ -144,7 +145,7 @@ class ControlConfig:
     pose_gain: float = 2.0  # [1/s] pose error to end-effector velocity
     max_linear_speed: float = 0.25  # [m/s] cap of the reference: a usual speed beside people
     max_angular_speed: float = 1.0  # [rad/s]
-    distance_rate: str = "none"  # dd/dt of the rows; or snapshots: what distances lost between the two newest scenes
+    distance_rate: str = "snapshots"  # dd/dt of the rows: what distances lost between the two newest scenes; or none
     max_distance_rate: float = 1.6  # [m/s] that a scene is taken to approach with at most: a walking person
     max_residual: float = 1e-5  # a solution whose relative KKT residual exceeds this is not used
     slack_tolerance: float = 1e-4  # [m/s] slack above which a row counts as relaxed
@@ -155,6 +156,25 @@ class ControlConfig:
     max_time: float = 30.0  # [s] of a closed-loop replay
     stall_time: float = 2.0  # [s] a local minimum: over this long ...
     stall_speed: float = 2e-3  # [rad/s] ... the joints moved on average slower than this
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """IV: the sampling-based planner (BiRRT) that the controller is compared with."""
+
+    contact: float = 1e-4  # [m] clearance above the margin that a posture needs; bounds the checks of a grazing edge
+    batch: int = 8  # samples per iteration, whose edges are checked together
+    reach: float = 1.5  # [rad] longest edge grown towards a sample, in joint space
+    shortest: float = 0.1  # [rad] shortest edge that is worth a node
+    max_iterations: int = 4000
+    max_time: float = 10.0  # [s]
+    shortcut_rounds: int = 4  # of random shortcuts, after the greedy ones
+    shortcut_batch: int = 8  # shortcuts tried per round
+    max_acceleration: float = 7.5  # [rad/s^2] of every joint: the least of the Panda's
+    period: float = 0.01  # [s] of the loop that follows a path
+    follow_gain: float = 10.0  # [1/s] joint error to joint velocity, where a path is followed in joint space
+    wait_distance: float = 0.05  # [m] the reference waits while the end effector is this far behind it
+    limit_tolerance: float = 1e-3  # [rad] a start or goal this far outside a joint limit is encoder noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,6 +254,7 @@ _CHOICES = {
     "scene.when_idle": ("detail", "clone", "leave"),
     "field.unknown": ("free", "obstacle", "nan"),
     "field.probability": ("calibrated", "paper"),
+    "control.preset": ("reduced", "paper"),
     "control.solver": ("clarabel", "daqp"),
     "control.distance_rate": ("none", "snapshots"),
 }

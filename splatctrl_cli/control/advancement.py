@@ -8,13 +8,13 @@ is covered or a posture is in collision. Shapes: E edges, J joints, R rows of th
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.control.clearance import Clearance
 from splatctrl_cli.records import Bool, Float64
 
-Index = NDArray[np.int64]
 ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
+STILL = 1e-9  # [m] a row that an edge does not move is taken to lose this much
+SHORTEST = 1e-9  # [rad] that the search for where an edge stops being free goes down to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,20 +40,19 @@ def check_edges(
     contact: float,
     give_up: float = 0.0,
     only_whole: bool = True,
-    stride: float = np.inf,
 ) -> EdgeCheck:
     """Prove edges start (E, J) to end (E, J) free.
 
     A posture with less than `contact` [m] to go counts as in collision: it bounds the number of checks, and makes the
-    check refuse edges that graze, never accept one that does not hold. What is uncovered and shorter than
-    `give_up` [rad] is left unproved. Where `only_whole`, an edge is dropped at its first collision, and its
-    free_share is 0. `stride` [m]: edges are first cut so that no row can lose more in a piece.
+    check refuse edges that graze, never accept one that does not hold. Less than `give_up`
+    [rad] before a collision is left unproved. Where `only_whole`, an edge is dropped at its first collision, and its
+    free_share is 0.
     """
     motion = end - start
-    speeds = np.maximum(clearance.speeds(motion), 1e-300)
+    speeds = np.maximum(clearance.speeds(motion), STILL)
     length = np.linalg.norm(motion, axis=1)
     free = np.ones(len(start))
-    edge, low, high = _pieces(np.max(speeds, axis=1), stride)
+    edge, low, high = np.arange(len(start)), np.zeros(len(start)), np.ones(len(start))
     num_checks = 0
     while len(edge):
         middle = (low + high) / 2
@@ -67,16 +66,9 @@ def check_edges(
         low, high = np.concatenate([low, middle + covered]), np.concatenate([middle - covered, high])
         high = np.minimum(high, free[edge])
         is_open = low < high
-        is_short = is_open & ((high - low) * length[edge] < give_up)
+        is_last = (high >= free[edge]) & (free[edge] < 1.0)  # what is left before a collision
+        is_short = is_open & is_last & ((high - low) * length[edge] < max(give_up, SHORTEST))
         np.minimum.at(free, edge[is_short], 0.0 if only_whole else low[is_short])
         keep = is_open & ~is_short & (low < free[edge])
         edge, low, high = edge[keep], low[keep], high[keep]
     return EdgeCheck(free_share=free, num_checks=num_checks)
-
-
-def _pieces(speed: Float64, stride: float) -> tuple[Index, Float64, Float64]:
-    """Edge, start and end share of the pieces that edges of a speed (E,) [m] are first cut into."""
-    num = np.maximum(np.ceil(speed / stride), 1).astype(np.int64)
-    edge = np.repeat(np.arange(len(speed)), num)
-    nth = np.arange(len(edge)) - np.repeat(np.cumsum(num) - num, num)
-    return edge, nth / num[edge], (nth + 1) / num[edge]

@@ -1,6 +1,6 @@
 """The clearance of many postures at once, and how fast a motion can use it up.
 
-B postures, J joints; R rows: first the moving spheres against the scene, then the pairs of spheres that could collide.
+B postures, J joints; R rows: the moving spheres against the scene, then the pairs of spheres that could collide.
 """
 
 from dataclasses import dataclass, replace
@@ -101,8 +101,9 @@ class Clearance:
         centers = self.model.sphere_centers_batch(q)
         points = np.ascontiguousarray(centers[:, self.moving]).reshape(-1, 3)
         distance = self.scene.distance(points)
-        if not np.all(distance == distance):  # NaN is not itself
-            first = int(np.argmax(np.isnan(distance)))
+        is_missing = np.isnan(distance)
+        if np.any(is_missing):
+            first = int(np.argmax(is_missing))
             where = ", ".join(f"{v:.3f}" for v in points[first])
             raise NotEvaluableError(
                 f"sphere {self.names[first % len(self.moving)]} at ({where}) m: the field has no distance there",
@@ -112,9 +113,7 @@ class Clearance:
         rows = np.empty((len(q), len(self.names)))
         rows[:, :num_moving] = distance.reshape(len(q), -1) - self.radii[self.moving]
         if len(self.pairs):
-            offset = centers[:, self.pairs[:, 0]] - centers[:, self.pairs[:, 1]]
-            between = np.sqrt(np.einsum("bpk,bpk->bp", offset, offset))
-            rows[:, num_moving:] = between - self.radii[self.pairs].sum(axis=1)
+            rows[:, num_moving:] = _apart(centers, self.pairs) - self.radii[self.pairs].sum(axis=1)
         return rows - self.margin
 
     def at(self, q: Float64) -> Float64:
@@ -129,6 +128,19 @@ class Clearance:
         """Name and distance less margin [m] of the least row at q (J,)."""
         row = self.rows(q[None])[0]
         return self.names[int(np.argmin(row))], float(np.min(row))
+
+
+def _apart(centers: Float64, pairs: NDArray[np.integer]) -> Float64:
+    """(B, P) how far the centres (B, S, 3) of pairs are apart, from ``|a|^2 + |b|^2 - 2 a b``: good to 1e-8 m where
+    the centres coincide, 1e-14 m at a centimetre.
+    """
+    B, S = centers.shape[:2]
+    squares = np.einsum("bsk,bsk->bs", centers, centers)
+    apart = centers @ np.swapaxes(-2.0 * centers, 1, 2)
+    apart += squares[:, :, None]
+    apart += squares[:, None, :]
+    chosen = np.take(apart.reshape(B, -1), pairs[:, 0] * S + pairs[:, 1], axis=1)
+    return np.asarray(np.sqrt(np.maximum(chosen, 0.0, out=chosen), out=chosen))
 
 
 def _between(levers: Float64, pairs: NDArray[np.integer]) -> Float64:

@@ -47,7 +47,7 @@ Solid = Ball | Cuboid | Rod
 
 @dataclass(frozen=True, kw_only=True)
 class Solids:
-    """A `DistanceField` of solids: the signed distance to the nearest, negative inside, exact outside and 1-Lipschitz.
+    """A `DistanceField` of solids: the signed distance to the nearest, negative inside; 1-Lipschitz.
 
     Inside several solids at once it is the depth in the deepest, which is at most the way out.
     Raises InputError for a solid with a size that is not above zero.
@@ -69,17 +69,18 @@ class Solids:
         object.__setattr__(self, "_balls", (centers, np.array([s.radius for s in balls], dtype=np.float64)))
         half = np.array([s.size for s in boxes], dtype=np.float64).reshape(-1, 3).T / 2
         object.__setattr__(self, "_boxes", (*_into([s.T_world_shape for s in boxes]), half))
-        # rounding (P,): how far the surface lies outside the flat-ended core; radius, half length of that core
-        shape = np.array([[0.0, s.length / 2, s.radius] if s.is_round else [s.radius, s.length / 2, 0.0] for s in rods])
+        shape = np.array([_core(s) for s in rods], dtype=np.float64)
         object.__setattr__(self, "_rods", (*_into([s.T_world_shape for s in rods]), shape.reshape(-1, 3).T))
 
     def distance(self, points: Float64) -> Float64:
         """points (Q, 3) -> signed distance (Q,) to the nearest solid, inf without any."""
         least = np.full(len(points), np.inf)
-        for of_kind in (_to_balls, _to_boxes, _to_rods):
-            table = {_to_balls: self._balls, _to_boxes: self._boxes, _to_rods: self._rods}[of_kind]
-            if table[-1].size:
-                np.minimum(least, np.min(of_kind(points, *table), axis=0), out=least)  # type: ignore[operator]
+        if len(self._balls[0]):
+            least = np.minimum(least, np.min(_to_balls(points, *self._balls), axis=0))
+        if len(self._boxes[0]):
+            least = np.minimum(least, np.min(_to_boxes(points, *self._boxes), axis=0))
+        if len(self._rods[0]):
+            least = np.minimum(least, np.min(_to_rods(points, *self._rods), axis=0))
         return least
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
@@ -120,6 +121,11 @@ def _into(placements: Sequence[Float64]) -> tuple[Float64, Float64]:
     """Rotation rows (3 P, 3) and shifts (3, P) of the maps from world into P frames, axis by axis."""
     maps = np.array([invert_transform(T) for T in placements]).reshape(-1, 4, 4)
     return np.ascontiguousarray(np.swapaxes(maps[:, :3, :3], 0, 1)).reshape(-1, 3), maps[:, :3, 3].T
+
+
+def _core(rod: Rod) -> tuple[float, float, float]:
+    """Radius and half length of a cylinder, and how far the rod's surface lies outside it."""
+    return (0.0, rod.length / 2, rod.radius) if rod.is_round else (rod.radius, rod.length / 2, 0.0)
 
 
 def _sizes(solid: Solid) -> tuple[float, ...]:

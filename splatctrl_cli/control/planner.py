@@ -1,0 +1,232 @@
+"""BiRRT: two trees, from the start and from the goals, that grow towards samples and towards each other.
+
+RRT-Connect (Kuffner and LaValle, ICRA 2000) on batches: an iteration draws K samples and proves the K edges towards
+them together. Every edge is proved free by conservative advancement. J joints, G goals, W waypoints.
+"""
+
+import time
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import PlannerConfig
+from splatctrl_cli.control.advancement import check_edges
+from splatctrl_cli.control.checks import checked_posture
+from splatctrl_cli.control.clearance import Clearance
+from splatctrl_cli.control.shortcut import shortened
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.records import Float64
+
+Index = NDArray[np.int64]
+
+
+class PlanOutcome(StrEnum):
+    """How a search ended."""
+
+    SOLVED = "solved"
+    OUT_OF_ITERATIONS = "out-of-iterations"
+    OUT_OF_TIME = "out-of-time"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a search found: waypoints (W, J) [rad] from the start to goal number `goal`, none unless it is solved.
+
+    found (V, J) is the path before it was shortened. num_checks postures were asked, on num_edges edges, over
+    num_iterations; num_nodes stand in both trees; search_time and shortcut_time [s] are wall clock.
+    """
+
+    outcome: PlanOutcome
+    waypoints: Float64
+    found: Float64
+    goal: int
+    num_iterations: int
+    num_nodes: int
+    num_edges: int
+    num_checks: int
+    search_time: float
+    shortcut_time: float
+
+    @property
+    def is_solved(self) -> bool:
+        """True with a path."""
+        return self.outcome is PlanOutcome.SOLVED
+
+
+@dataclass
+class _Tree:
+    """Nodes q (size, J) with the index of their parent, -1 for a root; grows in place."""
+
+    roots: Float64
+    q: Float64 = field(init=False)
+    squares: Float64 = field(init=False)
+    parent: Index = field(init=False)
+    size: int = 0
+
+    def __post_init__(self) -> None:
+        self.q, self.squares = np.empty((256, self.roots.shape[1])), np.empty(256)
+        self.parent = np.empty(256, dtype=np.int64)
+        self.add(self.roots, np.full(len(self.roots), -1))
+
+    def add(self, q: Float64, parent: Index) -> Index:
+        """The indices of new nodes (K, J) under their parents (K,)."""
+        while self.size + len(q) > len(self.q):
+            self.q, self.squares = np.concatenate([self.q, self.q]), np.concatenate([self.squares, self.squares])
+            self.parent = np.concatenate([self.parent, self.parent])
+        new = np.arange(self.size, self.size + len(q))
+        self.q[new], self.parent[new] = q, parent
+        self.squares[new] = np.einsum("kj,kj->k", q, q)
+        self.size += len(q)
+        return new
+
+    def nearest(self, q: Float64) -> Index:
+        """The node (K,) nearest to each of q (K, J) in joint space."""
+        return np.asarray(np.argmin(self.squares[: self.size] - 2.0 * (q @ self.q[: self.size].T), axis=1))
+
+    def branch(self, node: int) -> tuple[Float64, int]:
+        """The nodes (V, J) from a root to `node`, and the root's index."""
+        rows = [node]
+        while self.parent[rows[-1]] >= 0:
+            rows.append(int(self.parent[rows[-1]]))
+        return self.q[rows[::-1]], rows[-1]
+
+
+@dataclass
+class _Search:
+    """The state of one search: both trees, the random stream, the counts, the clock."""
+
+    clearance: Clearance
+    config: PlannerConfig
+    trees: tuple[_Tree, _Tree]
+    random: np.random.Generator
+    start_time: float
+    num_edges: int = 0
+    num_checks: int = 0
+    num_iterations: int = 0
+
+    def free_shares(self, start: Float64, end: Float64, *, only_whole: bool) -> Float64:
+        """(E,) of `check_edges`, counted."""
+        config = self.config
+        check = check_edges(
+            self.clearance,
+            start,
+            end,
+            contact=config.contact,
+            only_whole=only_whole,
+            give_up=0.0 if only_whole else config.shortest,
+        )
+        self.num_edges += len(start)
+        self.num_checks += check.num_checks
+        return check.free_share
+
+    def grown(self, tree: _Tree, targets: Float64) -> Index:
+        """New nodes of `tree` from its nearest ones towards targets (K, J), at most `reach` long, where all is free.
+
+        Not as far as it is free: nodes at the brink of contact would be nearest to most samples, and lead nowhere.
+        """
+        near = tree.nearest(targets)
+        way = targets - tree.q[near]
+        length = np.linalg.norm(way, axis=1)
+        way *= np.minimum(1.0, self.config.reach / np.maximum(length, 1e-12))[:, None]
+        is_free = self.free_shares(tree.q[near], tree.q[near] + way, only_whole=True) >= 1.0
+        return tree.add(tree.q[near[is_free]] + way[is_free], near[is_free])
+
+    def met(self, tree: _Tree, other: _Tree, new: Index) -> tuple[int, int] | None:
+        """Grow `other` towards the new nodes of `tree`, as far as it is free; where one is reached, it and the node
+        it was reached from.
+        """
+        near = other.nearest(tree.q[new])
+        way = tree.q[new] - other.q[near]
+        share = self.free_shares(other.q[near], tree.q[new], only_whole=False)
+        length = np.linalg.norm(way, axis=1)
+        if np.any(share >= 1.0):
+            nth = int(np.argmin(np.where(share >= 1.0, length, np.inf)))
+            return int(new[nth]), int(near[nth])
+        is_long = share * length > self.config.shortest
+        other.add(other.q[near[is_long]] + (share[:, None] * way)[is_long], near[is_long])
+        return None
+
+    def run(self) -> tuple[PlanOutcome, Float64, int]:
+        """The outcome, the path (V, J) and the goal's index."""
+        first, second = self.trees
+        model = self.clearance.model
+        direct = self.free_shares(
+            np.repeat(first.q[:1], second.size, axis=0), second.q[: second.size], only_whole=True
+        )
+        if np.any(direct >= 1.0):
+            return PlanOutcome.SOLVED, *self._joined(0, int(np.argmax(direct)))
+        while self.num_iterations < self.config.max_iterations:
+            if time.perf_counter() - self.start_time > self.config.max_time:
+                return PlanOutcome.OUT_OF_TIME, np.empty((0, first.q.shape[1])), -1
+            self.num_iterations += 1
+            tree, other = (first, second) if first.size <= second.size else (second, first)
+            new = self.grown(
+                tree, self.random.uniform(model.lower, model.upper, (self.config.batch, len(model.lower)))
+            )
+            meeting = self.met(tree, other, new) if len(new) else None
+            if meeting is not None:
+                return PlanOutcome.SOLVED, *self._joined(*(meeting if tree is first else meeting[::-1]))
+        return PlanOutcome.OUT_OF_ITERATIONS, np.empty((0, first.q.shape[1])), -1
+
+    def _joined(self, in_first: int, in_second: int) -> tuple[Float64, int]:
+        out, back = self.trees[0].branch(in_first)[0], self.trees[1].branch(in_second)
+        return np.concatenate([out, back[0][::-1]]), back[1]
+
+
+def plan(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig, *, seed: int = 0) -> Plan:
+    """A path from start (J,) to one of goals (G, J) or (J,) [rad]; the same seed gives the same path.
+
+    The iterations and the time of `config` bound the search; running out of either is an outcome, not an error, and
+    only running out of time depends on the machine. Raises InputError for a start or goal outside the limits and
+    NotEvaluableError for one in collision, naming the sphere and how deep it is.
+    """
+    began = time.perf_counter()
+    roots = checked_postures(clearance, start, goals, config)
+    trees = _Tree(roots[:1]), _Tree(roots[1:])
+    search = _Search(clearance, config, trees, np.random.default_rng(seed), began)
+    outcome, found, goal = search.run()
+    searched = time.perf_counter()
+    waypoints = found
+    if outcome is PlanOutcome.SOLVED:
+        waypoints, num_edges, num_checks = shortened(clearance, found, config, search.random)
+        search.num_edges += num_edges
+        search.num_checks += num_checks
+    return Plan(
+        outcome=outcome,
+        waypoints=waypoints,
+        found=found,
+        goal=goal,
+        num_iterations=search.num_iterations,
+        num_nodes=trees[0].size + trees[1].size,
+        num_edges=search.num_edges,
+        num_checks=search.num_checks,
+        search_time=searched - began,
+        shortcut_time=time.perf_counter() - searched,
+    )
+
+
+def checked_postures(clearance: Clearance, start: Float64, goals: Float64, config: PlannerConfig) -> Float64:
+    """Start and goals (1 + G, J), once they are within the limits and free. Raises as `plan` says."""
+    model = clearance.model
+    rows = [checked_posture(model, start, what="start")]
+    several = np.atleast_2d(np.asarray(goals, dtype=np.float64))
+    names = ["start", *(["goal"] if len(several) == 1 else [f"goal {g}" for g in range(len(several))])]
+    rows += [checked_posture(model, goal, what=name) for name, goal in zip(names[1:], several, strict=True)]
+    for name, q in zip(names, rows, strict=True):
+        outside = np.maximum(q - model.upper, model.lower - q)
+        joint = int(np.argmax(outside))
+        if outside[joint] > config.limit_tolerance:
+            raise InputError(
+                f"{name}: joint {model.joint_names[joint]}: expected within [{model.lower[joint]:.4f}, "
+                f"{model.upper[joint]:.4f}] rad, got {q[joint]:.4f}",
+                remedy="give a posture within the limits, or check that the URDF is of this robot",
+            )
+        row, distance = clearance.worst(q)
+        if distance < config.contact:
+            raise NotEvaluableError(
+                f"{name}: expected a posture {config.contact:g} m clear of its margin, got {row} at {distance:.4f} m",
+                remedy="give another posture or a smaller margin, or check the scene and --base",
+            )
+    return np.array(rows)

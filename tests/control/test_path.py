@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig, PlannerConfig
+from splatctrl_cli.control.path import effector_length, joint_length, least_clearance, resampled, timed
+from splatctrl_cli.control.planner import plan
+from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
+from splatctrl_cli.errors import InputError
+from tests.control.fakes import Balls
+from tests.control.walls import LeveredArm, clearance, one_wall, thin_post
+
+PATH = np.array([[0.7, 0.2], [0.9, 2.0], [-0.4, 1.5], [-0.42, 1.5]])
+ARM = LeveredArm()
+
+
+def test_lengths_are_those_of_an_arc() -> None:
+    turn = resampled(np.array([[-0.5, 0.0], [0.5, 0.0]]), 0.01)
+    assert joint_length(turn) == pytest.approx(1.0)
+    moved, turned = effector_length(ARM, turn, "tip")
+    assert moved == pytest.approx(0.9, rel=1e-4)
+    assert turned == pytest.approx(np.degrees(1.0))
+
+
+def test_resampling_keeps_waypoints_length_and_spacing() -> None:
+    rows = resampled(PATH, 0.05)
+    assert joint_length(rows) == pytest.approx(joint_length(PATH))
+    assert np.max(np.linalg.norm(np.diff(rows, axis=0), axis=1)) <= 0.05 + 1e-12
+    assert all(np.any(np.all(np.abs(rows - q) < 1e-12, axis=1)) for q in PATH)
+
+
+@pytest.mark.parametrize("room", [one_wall(), thin_post()], ids=["wall", "needle"])
+def test_the_least_clearance_lies_between_its_bounds(room: object) -> None:
+    free = clearance(room)  # type: ignore[arg-type]
+    proved = least_clearance(free, PATH, tolerance=1e-4)
+    dense = float(np.min(free.at(resampled(PATH, 1e-4))))
+    assert proved.lower <= dense <= proved.upper + 1e-6
+    assert proved.upper - proved.lower <= 1e-4
+    assert proved.num_checks < 2000
+
+
+def test_a_timed_path_keeps_its_limits_and_its_edges() -> None:
+    path = timed(PATH, ARM.velocity_limit, 3.0)
+    clock = np.linspace(0, path.duration, 20_001)
+    position, velocity = path.at(clock)
+    assert np.all(np.abs(velocity) <= ARM.velocity_limit + 1e-12)
+    acceleration = np.diff(velocity, axis=0) / np.diff(clock)[:, None]
+    assert np.max(np.abs(acceleration)) <= 3.0 + 1e-6
+    middle = (velocity[1:] + velocity[:-1]) / 2 * np.diff(clock)[:, None]
+    np.testing.assert_allclose(np.diff(position, axis=0), middle, atol=1e-6)
+    np.testing.assert_allclose(position[[0, -1]], PATH[[0, -1]], atol=1e-12)
+    np.testing.assert_allclose(path.at(path.start_time)[0], PATH, atol=1e-12)
+    assert joint_length(position) == pytest.approx(joint_length(PATH))
+    assert np.max(np.abs(velocity), axis=0) == pytest.approx(np.array([1.5, 1.5]), rel=0.2)  # and it uses them
+
+
+def test_a_path_of_one_place_or_without_limits_is_refused() -> None:
+    with pytest.raises(InputError, match="expected at least 2 waypoints, got 1"):
+        timed(PATH[:1], ARM.velocity_limit, 3.0)
+    with pytest.raises(InputError, match="limits above 0"):
+        timed(PATH, np.zeros(2), 3.0)
+
+
+def test_a_path_is_followed_to_its_end_by_the_joints() -> None:
+    room = clearance(one_wall(), margin=0.02)
+    planned = plan(room, PATH[0], np.array([-0.7, -0.2]), PlannerConfig())
+    path = timed(planned.waypoints, ARM.velocity_limit, 7.5)
+    run = follow_joints(path, room, "tip", PlannerConfig(), ControlConfig())
+    assert run.is_success
+    assert run.joint_length == pytest.approx(joint_length(planned.waypoints), rel=1e-3)
+    assert run.duration == pytest.approx(path.duration, abs=0.011)
+    assert run.least_clearance >= least_clearance(room, planned.waypoints).lower - 1e-3
+
+
+def test_a_path_is_followed_to_its_end_by_the_controller() -> None:
+    room = clearance(thin_post(), margin=0.03)  # more than the controller's own margin, which may not give way
+    field = Balls([[0.62, 0.31, 0.0]], [0.002])
+    planned = plan(room, np.array([1.2, 0.3]), np.array([-0.4, 0.5]), PlannerConfig())
+    path = timed(planned.waypoints, ARM.velocity_limit / 3, 3.0)
+    run = follow_with_controller(path, room, field, "tip", PlannerConfig(), ControlConfig())
+    assert run.has_arrived
+    assert run.least_clearance > -0.01 - 1e-3  # of 0.03: the controller keeps 0.02
