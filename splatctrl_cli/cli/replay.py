@@ -1,7 +1,6 @@
 """``splatctrl replay``: the clearance of logged motion, what a controller says of it, or what it does instead."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,12 +18,13 @@ from splatctrl_cli.cli.common import (
 from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.robot_options import locked_joints
-from splatctrl_cli.cli.source_options import add_source, source_options
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.cli.source_options import add_source
+from splatctrl_cli.errors import NotEvaluableError
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_metrics import Metrics
     from splatctrl_cli.cli.replay_modes import Replay, ReplayInputs
+    from splatctrl_cli.cli.replay_states import LoggedStates
     from splatctrl_cli.config import Config
     from splatctrl_cli.records import RecordSource
 
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.cli.replay_metrics import metric_names, metrics_of
     from splatctrl_cli.cli.replay_modes import replayed, with_truth
     from splatctrl_cli.cli.replay_report import lines_of, write_replay
-    from splatctrl_cli.io.output import Stopwatch, output_path
+    from splatctrl_cli.io.output import Stopwatch, output_path, write_json
 
     config, console, stopwatch = configured(args), Console(args), Stopwatch()
     fields = ("exact", "barrier", *(("certified",) if args.field is not None else ()))
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path("replay")
     with output_path(out, force=args.force, is_folder=True) as folder:
         with stopwatch.stage("read"):
-            inputs = _read(args, config)
+            inputs, logged = _read(args, config)
         for doubt in inputs.model.doubts:
             console.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
@@ -96,19 +96,19 @@ def run(args: argparse.Namespace) -> int:
         with stopwatch.stage("truth"):
             replay = with_truth(inputs, replay)
         metrics = metrics_of(replay)
+        write_json(folder / "states.json", logged.as_dict())
         write_replay(folder, replay, metrics, config=config, inputs=inputs.digests, stopwatch=stopwatch)
-    lines = lines_of(replay, metrics, with_steps=args.steps or args.verbose > 0)
+    lines = [*lines_of(replay, metrics, with_steps=args.steps or args.verbose > 0), *logged.lines()]
     console.result({"out": str(out), **metrics}, lines)
     return _verdict(args, replay, metrics, golden, inputs.source)
 
 
-def _read(args: argparse.Namespace, config: "Config") -> "ReplayInputs":
+def _read(args: argparse.Namespace, config: "Config") -> "tuple[ReplayInputs, LoggedStates]":
     from splatctrl_cli.cli.known_scene import from_grid, from_splats
     from splatctrl_cli.cli.replay_modes import ReplayInputs
+    from splatctrl_cli.cli.replay_states import read_states
     from splatctrl_cli.geometry import transform_from
     from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.source import open_source
-    from splatctrl_cli.records import JointState
     from splatctrl_cli.robot.model import RobotModel
     from splatctrl_cli.simulate.truth import load_truth
 
@@ -116,20 +116,12 @@ def _read(args: argparse.Namespace, config: "Config") -> "ReplayInputs":
     model = RobotModel.from_urdf(args.urdf, args.spheres, T_world_base=T_world_base, locked=locked_joints(args.lock))
     truth = None if args.truth is None else load_truth(args.truth)
     scene = from_grid(args.field) if args.field is not None else from_splats(args.scene, config, args.threads)
-    source = open_source(args.log, source_options(args))
-    if not source.joint_names:
-        raise InputError(
-            f"{args.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
-        )
-    order = model.joint_order(source.joint_names)
-    states = tuple(
-        replace(record, position=record.position[order], velocity=record.velocity[order])
-        for record in source.records()
-        if isinstance(record, JointState)
-    )
+    logged = read_states(args, model)
+    source = logged.source
     files = [path for path in (args.urdf, args.spheres, args.truth) if path is not None]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
-    return ReplayInputs(source=source, states=states, model=model, scene=scene, truth=truth, digests=digests)
+    inputs = ReplayInputs(source=source, states=logged.states, model=model, scene=scene, truth=truth, digests=digests)
+    return inputs, logged
 
 
 def _verdict(

@@ -11,7 +11,7 @@ from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 
-FAR = 0.5  # [rad] beyond a limit that no calibration explains
+FAR = 0.5  # [rad] beyond the limits, and beyond a whole turn: not the limits of another joint
 MANY = 0.5  # of the states that must be there
 SLACK = 0.1  # [rad] by which degrees may exceed the limits
 MAX_POSES = 200  # that are compared, spread over the log
@@ -95,7 +95,7 @@ def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> 
         return
     q = np.array([state.position for state in states])[:, limited]
     lower, upper = model.lower[limited], model.upper[limited]
-    beyond = np.maximum(q - upper, lower - q)
+    beyond = np.abs(q) - np.maximum(np.maximum(np.abs(lower), np.abs(upper)), 2 * np.pi)
     as_degrees = np.radians(q)
     would_fit = ((as_degrees > lower - SLACK) & (as_degrees < upper + SLACK)).all(axis=1)
     if (beyond.max(axis=1) > FAR).mean() < MANY or would_fit.mean() < 1 - (1 - MANY) / 5:

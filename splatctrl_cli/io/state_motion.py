@@ -12,7 +12,7 @@ from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8
 DEPTH_STEP = 0.05  # [m] at which the change of a pixel's depth counts in full
 COLOR_STEP = 64.0  # [grey levels] likewise
 COLUMNS = 64  # that images are reduced to
-MAX_FRAMES = 600  # of a camera; later ones are not looked at
+MAX_FRAMES = 300  # of a camera; later ones are not looked at
 FIXED = 1e-3  # [m, rad] within which a camera stands still
 _NEAR = 0.05  # [m] in front of the camera
 

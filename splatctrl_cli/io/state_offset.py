@@ -71,6 +71,14 @@ def estimate_clock_offset(
     num = sum(len(camera.changes) for camera in cameras)
     if len(states) < 3 or num < MIN_INTERVALS:
         return _unknown(num, f"expected at least {MIN_INTERVALS} times between frames and 3 states")
+    first = min(camera.stamps_ns[0] for camera in cameras) - round(MAX_OFFSET * 1e9)
+    last = max(camera.stamps_ns[-1] for camera in cameras) + round(MAX_OFFSET * 1e9)
+    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
+    if len(near) < 3:
+        return _unknown(num, f"no joint states within {MAX_OFFSET:g} s of the frames")
+    states = [states[index] for index in near]
+    if robot is not None:
+        robot = RobotPoints(centers=robot.centers[near], radii=robot.radii)
     position = np.array([state.position for state in states])
     if np.ptp(position, axis=0).max() < MIN_MOTION:
         return _unknown(num, "no joint moves")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.io import source
+from splatctrl_cli.io import state_source
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import Desk, FakeSource, logged
 
@@ -21,5 +21,10 @@ def desk(tmp_path: Path, sample_data: Path, monkeypatch: pytest.MonkeyPatch) -> 
     tabletop = sample_data / "tabletop"
     robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
     desk = Desk(folder=tmp_path, source=FakeSource(states=logged()), robot=robot)
-    monkeypatch.setattr(source, "open_source", lambda path, options=None: desk.source)
+    opened = state_source.open_states
+    monkeypatch.setattr(
+        state_source,
+        "open_states",
+        lambda path, *rest: desk.source if path.name == desk.source.name else opened(path, *rest),
+    )
     return desk
