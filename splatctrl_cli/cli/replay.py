@@ -79,9 +79,10 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.cli.replay_metrics import metric_names, metrics_of
     from splatctrl_cli.cli.replay_modes import replayed, with_truth
     from splatctrl_cli.cli.replay_report import lines_of, write_replay
+    from splatctrl_cli.control.presets import with_preset
     from splatctrl_cli.io.output import Stopwatch, output_path, write_json
 
-    config, console, stopwatch = configured(args), Console(args), Stopwatch()
+    config, console, stopwatch = with_preset(configured(args)), Console(args), Stopwatch()
     fields = ("exact", "barrier", *(("certified",) if args.field is not None else ()))
     check_gate_names(args.require, metric_names(args.mode, fields, has_truth=args.truth is not None))
     golden = read_golden(args)

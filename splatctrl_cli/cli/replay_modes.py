@@ -143,7 +143,13 @@ def _asked(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", con
     has_distance = np.all([np.isfinite(c.distance) for c in trace.clearance.values()], axis=0)
     console.log(f"replay: asking the controller at {len(trace.stamp_ns)} states")
     asked = open_loop(
-        model, config.control, motion, task, lambda stamp: scene.at(stamp).barrier, has_distance=has_distance
+        model,
+        config.control,
+        motion,
+        task,
+        lambda stamp: scene.at(stamp).barrier,
+        has_distance=has_distance,
+        scene_step_at=scene.step_at,
     )
     return replace(replay, open_loop=asked)
 

@@ -123,8 +123,9 @@ def told(event: "Event") -> str:
     who = f" {event.worst_name}" if event.worst_name else ""
     more = f" and {event.num_names - 1} more" if event.num_names > 1 else ""
     near = "" if event.obstacle is None else f", near {event.obstacle}"
-    kind = event.kind if event.kind not in ("scene", "self", "limit") else f"{event.kind} row"
-    worst = f"{event.worst:.4g} {unit}".rstrip()
+    is_row = event.kind in ("scene", "self", "limit")
+    kind = f"{event.kind} row" if is_row else event.kind
+    worst = f"{'multiplier ' if is_row else ''}{event.worst:.4g} {unit}".rstrip()
     return f"{span}, {kind}{who}{more}, worst {worst} at {event.worst_s:.2f} s{near}"
 
 

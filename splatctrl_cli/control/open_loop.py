@@ -10,6 +10,7 @@ from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.course import LoggedMotion, guided_goal
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
+from splatctrl_cli.control.rates import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController, RowKind, VelocityMargin
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
@@ -54,12 +55,14 @@ def open_loop(
     field_at: FieldAt,
     *,
     has_distance: Bool,
+    scene_step_at: SceneStepAt | None = None,
     solver: QpSolver | None = None,
 ) -> OpenLoopTrace:
     """Ask the controller at every logged state, each in the field known at its stamp; nothing is integrated.
 
     Asked for the logged motion itself, the command is the logged velocity wherever no row shapes it: what differs is
-    the intervention. has_distance (T,): where it is False the controller is not asked.
+    the intervention. has_distance (T,): where it is False the controller is not asked;
+    scene_step_at as in `closed_loop`.
     """
     field = field_at(int(motion.stamp_ns[0]))
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
@@ -77,10 +80,11 @@ def open_loop(
         goal, guide = (task.T_world_goal, None)
         if goal is None:
             goal, guide = guided_goal(model, task.frame, q, v)
-        step = controller.step(q, goal, guide=guide)
+        rate = rate_of(config, model, scene_step_at, int(stamp), q)
+        step = controller.step(q, goal, distance_rate=rate, guide=guide)
         commanded[index] = step.velocity
         steps.append(step)
-        margins.append(controller.margin_of(q, v))
+        margins.append(controller.margin_of(q, v, distance_rate=rate))
     return OpenLoopTrace(logged=motion.velocity, commanded=commanded, steps=tuple(steps), margins=tuple(margins))
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.records import DistanceField, Float64
 
 
@@ -31,3 +33,14 @@ def distance_rate(step: SceneStep | None, points: Float64, limit: float) -> floa
         return 0.0
     change = (step.newer.query(points)[0] - step.older.query(points)[0]) / step.seconds
     return np.asarray(np.clip(np.nan_to_num(change), -limit, 0.0))
+
+
+def rate_of(
+    config: ControlConfig, model: ArmModel, scene_step_at: SceneStepAt | None, stamp_ns: int, q: Float64
+) -> float | Float64:
+    """dd/dt of the moving spheres at a posture (J,) and stamp, as the configuration wants it."""
+    step = None if scene_step_at is None or config.distance_rate == "none" else scene_step_at(stamp_ns)
+    if step is None:
+        return 0.0
+    points = np.ascontiguousarray(model.sphere_centers(q)[np.flatnonzero(model.moving_spheres)])
+    return distance_rate(step, points, config.max_distance_rate)

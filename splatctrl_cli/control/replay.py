@@ -22,7 +22,7 @@ from splatctrl_cli.control.checks import (
 from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
-from splatctrl_cli.control.rates import SceneStepAt, distance_rate
+from splatctrl_cli.control.rates import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.control.target import Guide, pose_error
 from splatctrl_cli.records import DistanceField, Float64
@@ -125,7 +125,7 @@ def closed_loop(
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
     check_free(model, field, q)
     statics = static_violations(model, field, q, config.margin)
-    course, moving = _Course(model, config, task), np.flatnonzero(model.moving_spheres)
+    course = _Course(model, config, task)
     stamps, positions, steps, changes, anchored = [], [], [], [], []
     outcome = Outcome.LOG_ENDED if task.follow is not None else Outcome.TIMEOUT
     for index in range(course.num_steps):
@@ -137,10 +137,7 @@ def closed_loop(
             changes.append(_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
             controller = controller.with_field(field)
-        rate: float | Float64 = 0.0
-        if config.distance_rate == "snapshots" and scene_step_at is not None:
-            points = np.ascontiguousarray(model.sphere_centers(q)[moving])
-            rate = distance_rate(scene_step_at(stamp), points, config.max_distance_rate)
+        rate = rate_of(config, model, scene_step_at, stamp, q)
         goal, guide = course.goal(stamp)
         step = controller.step(q, goal, distance_rate=rate, guide=guide)
         stamps.append(stamp)

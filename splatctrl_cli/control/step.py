@@ -13,6 +13,7 @@ from splatctrl_cli.control.barriers import Barrier
 from splatctrl_cli.control.checks import check_config, check_model, checked_posture
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import velocity_box
+from splatctrl_cli.control.presets import PAPER, PrintedTask, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named
 from splatctrl_cli.control.target import Guide, pose_error, reference_velocity
 from splatctrl_cli.errors import NotEvaluableError
@@ -179,7 +180,11 @@ class QpIkController:
         error = pose_error(model.frame_pose(q, self._frame), T_world_goal)
         box = velocity_box(q, model.lower, model.upper, model.velocity_limit, config.barrier_gain)
         rows = self._rows(q, box, distance_rate)
-        choice = descend(self._solver, self._costs(q, error, guide), box, rows.for_qp, config)
+        aim = self._aim(q, error, guide)
+        if config.preset == PAPER:
+            printed = self._printed(q, aim, box, rows)
+            return self._reported(error, rows, printed, float(printed.rung is not Rung.HOLD))
+        choice = descend(self._solver, self._costs(q, *aim), box, rows.for_qp, config)
         return self._reported(error, rows, choice, self._kept_scale(q, choice, rows))
 
     def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
@@ -209,19 +214,34 @@ class QpIkController:
             limit_row=self._limit_names[limit],
         )
 
-    def _costs(self, q: Float64, error: Float64, guide: Guide | None) -> list[tasks.Cost]:
-        """The terms of III-E's objective: reach for the goal, lean home; both on top of the goal's own motion."""
+    def _aim(self, q: Float64, error: Float64, guide: Guide | None) -> tuple[Float64, Float64]:
+        """The velocity (6,) to reach for and that (J,) of the posture, on top of the goal's own motion."""
         config = self._config
         reference = reference_velocity(
             error, gain=config.pose_gain, max_linear=config.max_linear_speed, max_angular=config.max_angular_speed
         )
         lean = config.posture_gain * ((self._home if guide is None else guide.posture) - q)
-        if guide is not None:
-            reference, lean = reference + guide.twist, lean + guide.velocity
+        return (reference, lean) if guide is None else (reference + guide.twist, lean + guide.velocity)
+
+    def _costs(self, q: Float64, reference: Float64, lean: Float64) -> list[tasks.Cost]:
+        """The terms of III-E's objective: reach for the goal, lean home."""
         return [
             tasks.velocity_task(self._model.frame_jacobian(q, self._frame), reference, self._weight),
-            tasks.posture_task(lean, config.posture_weight),
+            tasks.posture_task(lean, self._config.posture_weight),
         ]
+
+    def _printed(self, q: Float64, aim: tuple[Float64, Float64], box: tuple[Float64, Float64], rows: _Rows) -> Choice:
+        """The answer of the program as the paper prints it."""
+        config = self._config
+        weight = np.repeat([config.weight_linear, config.weight_angular], 3)
+        task = PrintedTask(
+            reference=aim[0],
+            jacobian=self._model.frame_jacobian(q, self._frame),
+            weight_task=weight,
+            weight_kinematics=config.weight_kinematics * weight,
+        )
+        posture = tasks.posture_task(aim[1], config.posture_weight)
+        return solve_printed(self._solver, task, posture, box, rows.for_qp, config)
 
     def _rows(self, q: Float64, box: tuple[Float64, Float64], distance_rate: float | Float64) -> _Rows:
         """Every barrier row at q: gradient and distance come from one query of one function."""
