@@ -23,12 +23,13 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.io.image_folder import HOLDOUT
     from splatctrl_cli.io.output import Stopwatch, output_path, write_run
     from splatctrl_cli.io.source import open_source
+    from splatctrl_cli.io.state_watch import WatchedSource
 
     console, stopwatch = Console(args), Stopwatch()
     options = source_options(args)
     out = args.out or Path(args.source.stem + ".capture")
     with stopwatch.stage("survey"):
-        source = open_source(args.source, options)
+        source = WatchedSource(open_source(args.source, options))
     if set(source.cameras) == {HOLDOUT}:
         raise UsageError(
             f"--cameras {args.cameras}: leaves no camera to train with", remedy="name another, or leave it out"
@@ -46,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
             "frames": summary.num_frames,
             "joint_states": summary.num_joint_states,
             "loss": asdict(summary.loss),
+            "clock_offset": None if (offset := source.clock_offset()) is None else asdict(offset),
         }
         write_run(
             partial,
@@ -60,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
         f"{key.replace('_', ' ')}: {value}" for key, value in asdict(summary.loss).items() if value and key != "notes"
     ]
     lines += [f"note: {note}" for note in summary.loss.notes]
+    lines += [] if offset is None else [f"note: {offset.sentence}"]
     console.result(
         {"capture": str(out), **metrics}, [*lines, f"joint states: {summary.num_joint_states}", f"wrote {out}"]
     )

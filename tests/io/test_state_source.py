@@ -349,3 +349,14 @@ def test_real_bags_without_joint_states_say_so() -> None:
     for bag in bags:
         if bag.suffix in {".mcap", ".db3"}:
             assert "expected joint states, got none" in refusal(bag)
+
+
+@pytest.mark.skipif(REAL is None, reason="SPLATCTRL_REAL_DATA is not set")
+def test_a_real_log_gives_its_states_and_tells_a_velocity_that_nobody_filled() -> None:
+    assert REAL is not None
+    log = Path(REAL, "rosbag2_mcap_sensor_msgs", "rosbag2_2025_09_10-13_03_56_0.mcap")
+    source = opened(log, ("shoulder_joint", "wrist_joint"))
+    assert source.joint_names == ("shoulder_joint", "elbow_joint", "wrist_joint", "gripper_joint")
+    assert len(states(source)) == 15
+    assert source.loss.damaged == 0
+    assert any("velocities of gripper_joint are zero throughout" in note for note in source.loss.notes)
