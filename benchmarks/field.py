@@ -18,7 +18,7 @@ from splatctrl_cli.field.layout import GridLayout
 from splatctrl_cli.records import Box, Float64, SplatSet
 
 NUM_SPLATS, MANY_SPLATS, NUM_POINTS, MANY_POINTS, VOXEL = 5000, 50_000, 60, 1_000_000, 0.01
-TREE_EVERY, TORCH_EVERY = 8, 200  # of the cells, and of the points, that the references are asked
+TREE_EVERY, TORCH_EVERY = 32, 200  # of the cells, and of the points, that the references are asked
 CENTER = np.array([0.0, 0.0, 0.3])
 THREADS = 2
 
