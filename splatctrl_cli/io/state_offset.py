@@ -71,14 +71,9 @@ def estimate_clock_offset(
     num = sum(len(camera.changes) for camera in cameras)
     if len(states) < 3 or num < MIN_INTERVALS:
         return _unknown(num, f"expected at least {MIN_INTERVALS} times between frames and 3 states")
-    first = min(camera.stamps_ns[0] for camera in cameras) - round(MAX_OFFSET * 1e9)
-    last = max(camera.stamps_ns[-1] for camera in cameras) + round(MAX_OFFSET * 1e9)
-    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
-    if len(near) < 3:
+    states, robot = _near(states, robot, cameras)
+    if len(states) < 3:
         return _unknown(num, f"no joint states within {MAX_OFFSET:g} s of the frames")
-    states = [states[index] for index in near]
-    if robot is not None:
-        robot = RobotPoints(centers=robot.centers[near], radii=robot.radii)
     position = np.array([state.position for state in states])
     if np.ptp(position, axis=0).max() < MIN_MOTION:
         return _unknown(num, "no joint moves")
@@ -97,6 +92,17 @@ def estimate_clock_offset(
         return _peak(offsets, np.array(scores), num, MIN_PIXEL_CORRELATION, PIXEL_ERROR * interval)
     scores = [_sum_scores(seconds, position, camera, start, offsets) for camera in cameras]
     return _peak(offsets, np.array(scores), num, MIN_CORRELATION, SUM_ERROR * interval)
+
+
+def _near(
+    states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
+) -> tuple[list[JointState], RobotPoints | None]:
+    """The states, and the robot's points at them, that an offset within `MAX_OFFSET` can bring to a frame."""
+    first = min(camera.stamps_ns[0] for camera in cameras) - round(MAX_OFFSET * 1e9)
+    last = max(camera.stamps_ns[-1] for camera in cameras) + round(MAX_OFFSET * 1e9)
+    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
+    points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
+    return [states[index] for index in near], points
 
 
 def _grid(seconds: Float64, robot: RobotPoints, step: float) -> RobotPoints:

@@ -110,7 +110,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     if others:
         taken = ", ".join(dict.fromkeys(used))
         loss.notes.append(f"joint states are taken from {taken}, not from {', '.join(others)}")
-    return track
+    return track if missing else track.of_joints(wanted)
 
 
 def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
@@ -195,6 +195,11 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
         return np.asarray((1 - share) * rows[order][before] + share * rows[order][after])
 
     names = ", ".join(other.names)
+    if not keep.any():
+        raise InputError(
+            f"{track.where} and {other.where}: mixed clocks: at no state of {track.where} is {names} known",
+            remedy="give another --joint-topic, or record both by one clock",
+        )
     loss.notes.append(f"{track.where}: {names} of {other.where} are interpolated at its {len(stamps)} states")
     if not keep.all():
         lost = f"{int((~keep).sum())} of {len(stamps)} states left out"

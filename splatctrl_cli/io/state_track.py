@@ -1,6 +1,7 @@
 """Joint states of one source, cleaned: in time order, one per stamp, with velocities; what was wrong is counted."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from splatctrl_cli.records import Bool, Float64, JointState, LossReport
 STILL = 1e-3  # [rad or m] of motion under which a velocity of zero is believed
 CONFLICT = 1e-6  # [rad or m] between states of one stamp
 SPEED_RATIO = 3.0  # of logged to differentiated speeds beyond which their units differ
+COMPARED = 5000  # states at most, spread over the log
 MOVING = 0.05  # [1/s] speeds that are compared
 
 
@@ -46,6 +48,18 @@ class RawTrack:
             T_world_ee=None if world is None else world[keep],
         )
 
+    def of_joints(self, names: Sequence[str]) -> "RawTrack":
+        """The columns of these joints, in that order."""
+        order = [self.names.index(name) for name in names]
+        commanded = self.commanded_velocity
+        return replace(
+            self,
+            names=tuple(names),
+            position=self.position[:, order],
+            velocity=self.velocity[:, order],
+            commanded_velocity=None if commanded is None else commanded[:, order],
+        )
+
 
 def cleaned(raw: RawTrack, loss: LossReport) -> list[JointState]:
     """The states by stamp, each stamp once, each with velocities; every change is noted in `loss`.
@@ -62,6 +76,9 @@ def cleaned(raw: RawTrack, loss: LossReport) -> list[JointState]:
     velocity = _with_velocity(ordered, loss) if len(ordered.stamp_ns) else ordered.velocity
     commanded = _optional(ordered.commanded_velocity, len(ordered.stamp_ns))
     base, world = (_optional(T, len(ordered.stamp_ns)) for T in (ordered.T_base_ee, ordered.T_world_ee))
+    num_without = sum(a is None and b is None for a, b in zip(base, world, strict=True))
+    if 0 < num_without < len(base):
+        loss.notes.append(f"{raw.where}: {num_without} of {len(base)} states have no valid end-effector pose")
     return [
         JointState(
             stamp_ns=int(stamp),
@@ -117,13 +134,13 @@ def _with_velocity(raw: RawTrack, loss: LossReport) -> Float64:
     is_still = np.asarray((np.where(missing, 0.0, raw.velocity) == 0).all(axis=0))
     is_zero = is_still & ~missing.all(axis=0) & moved
     taken = missing | is_zero
-    slopes = differentiated(raw.stamp_ns, raw.position) if len(raw.stamp_ns) > 1 else np.zeros_like(raw.position)
-    if taken.any():
-        loss.differentiated_velocities += int(taken.any(axis=1).sum())
-        loss.notes.append(f"{raw.where}: {_reason(raw, missing, is_zero)}; they are differences of the positions")
-    else:
-        _compare_units(raw, slopes, loss)
-    return np.where(taken, slopes, raw.velocity)
+    if not taken.any():
+        thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // COMPARED))
+        _compare_units(thinned, differentiated(thinned.stamp_ns, thinned.position), loss)
+        return raw.velocity
+    loss.differentiated_velocities += int(taken.any(axis=1).sum())
+    loss.notes.append(f"{raw.where}: {_reason(raw, missing, is_zero)}; they are differences of the positions")
+    return np.where(taken, differentiated(raw.stamp_ns, raw.position), raw.velocity)
 
 
 def _reason(raw: RawTrack, missing: Bool, is_zero: Bool) -> str:

@@ -109,6 +109,8 @@ def test_too_little_to_judge_is_said(sample: tuple[list[JointState], ImageMotion
     assert "expected at least" in refused(estimate_clock_offset(states, ImageMotion()))
     assert "expected at least" in refused(estimate_clock_offset(states[:2], motion))
     assert refused(estimate_clock_offset(states[:30], motion)) in {"the log is too short", "no joint moves"}
+    other_clock = shifted(states, 1e6)
+    assert refused(estimate_clock_offset(other_clock, motion)) == "no joint states within 2 s of the frames"
 
 
 def test_a_silhouette_is_the_sphere_that_is_nearest() -> None:
