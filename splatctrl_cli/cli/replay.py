@@ -15,6 +15,7 @@ from splatctrl_cli.cli.common import (
     check_gates,
     configured,
 )
+from splatctrl_cli.cli.replay_baseline import add_baseline, read_zone
 from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.robot_options import locked_joints
@@ -67,6 +68,7 @@ def register(subparsers: Subparsers) -> None:
         "--max-map-age", type=float, default=1.0, metavar="S", help="a scene older than this is an event (default: 1)"
     )
     add_golden(parser)
+    add_baseline(parser)
     parser.add_argument("--steps", action="store_true", help="print a row per step as well")
     add_source(parser)
     add_output(parser, default="replay", what="folder to write")
@@ -84,8 +86,12 @@ def run(args: argparse.Namespace) -> int:
 
     config, console, stopwatch = with_preset(configured(args)), Console(args), Stopwatch()
     fields = ("exact", "barrier", *(("certified",) if args.field is not None else ()))
-    check_gate_names(args.require, metric_names(args.mode, fields, has_truth=args.truth is not None))
+    check_gate_names(
+        args.require,
+        metric_names(args.mode, fields, has_truth=args.truth is not None, has_baseline=args.baseline is not None),
+    )
     golden = read_golden(args)
+    read_zone(args)
     out = args.out or Path("replay")
     with output_path(out, force=args.force, is_folder=True) as folder:
         with stopwatch.stage("read"):

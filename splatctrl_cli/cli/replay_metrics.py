@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from splatctrl_cli.cli.replay_baseline import BESIDE, FIGURES, separation_figures
+
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_modes import Replay
     from splatctrl_cli.control.step import ControlStep
@@ -35,11 +37,13 @@ _CLOSED_LOOP = (
 _TRUTH = ("num_compared", "median", "p95", "largest", "largest_over", "share_within")
 
 
-def metric_names(mode: str, fields: Sequence[str], *, has_truth: bool) -> tuple[str, ...]:
+def metric_names(mode: str, fields: Sequence[str], *, has_truth: bool, has_baseline: bool = False) -> tuple[str, ...]:
     """The names that `metrics_of` gives for a --mode, with fields by name ("exact" first)."""
     names = [*_HEAD, *(f"min_clearance_{name}" for name in fields if name != "exact"), *_TAIL]
     names += [] if mode == "audit" else _STEPS
     names += {"audit": (), "open-loop": _OPEN_LOOP, "closed-loop": _CLOSED_LOOP}[mode]
+    if has_baseline:
+        names += [f"{motion}_{figure}" for motion in BESIDE for figure in FIGURES]
     if has_truth:
         names += [*(f"truth_{figure}_{name}" for name in fields for figure in _TRUTH), "truth_tolerance"]
     return tuple(names)
@@ -75,6 +79,9 @@ def metrics_of(replay: "Replay") -> Metrics:
         metrics |= _open_loop_metrics(replay)
     if replay.closed_loop is not None:
         metrics |= _closed_loop_metrics(replay)
+    for motion, separation in replay.separations.items():
+        figures = separation_figures(separation, replay.period)
+        metrics |= {f"{motion}_{figure}": value for figure, value in figures.items()}
     for name, agreement in replay.agreement.items():
         metrics[f"truth_num_compared_{name}"] = agreement.num_states
         metrics[f"truth_median_{name}"] = agreement.median

@@ -9,6 +9,7 @@ import numpy as np
 
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.known_scene import KnownScene
+from splatctrl_cli.cli.replay_baseline import read_zone, separations
 from splatctrl_cli.cli.replay_goal import goal_waypoints
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, audit, checked_states
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from splatctrl_cli.config import Config
     from splatctrl_cli.control.explain import Obstacle
+    from splatctrl_cli.control.standstill import Separation
     from splatctrl_cli.evaluate.clearance import ClearanceAgreement
     from splatctrl_cli.robot.model import RobotModel
     from splatctrl_cli.simulate.truth import Truth
@@ -58,7 +60,8 @@ class Replay:
     """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
 
     num_before_scene: logged states earlier than the first scene, left out; start_time_s: of the first state in the
-    log [s]; obstacles (T,): what is nearest to the nearest sphere; map_age_s (T,): of the scene in use.
+    log [s]; obstacles (T,): what is nearest to the nearest sphere; map_age_s (T,): of the scene in use; separations:
+    with a baseline the distances from people, by name of the motion, sampled at `period` [s].
     """
 
     model: "RobotModel"
@@ -76,6 +79,8 @@ class Replay:
     true_clearance: Float64 | None = None
     agreement: "Mapping[str, ClearanceAgreement]" = field(default_factory=dict)
     events: tuple[Event, ...] = ()
+    separations: "Mapping[str, Separation]" = field(default_factory=dict)
+    period: float = 0.0
 
     @property
     def mode(self) -> str:
@@ -92,8 +97,14 @@ class Replay:
 def replayed(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
     """The replay that --mode asks for, with its events."""
     mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[args.mode]
+    zone = read_zone(args)
     replay = mode(args, inputs, config, console)
-    return replace(replay, events=_explained(replay, inputs, args.max_map_age))
+    return replace(
+        replay,
+        events=_explained(replay, inputs, args.max_map_age),
+        separations=separations(args, zone, inputs, replay, config),
+        period=config.control.period,
+    )
 
 
 def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
@@ -157,7 +168,7 @@ def _asked(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", con
 def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
     """The closed loop, the audit of the states it went through, and how far they are from the log."""
     scene, model = inputs.scene, inputs.model
-    motion = _logged(inputs)
+    motion = logged_motion(inputs)
     task = _task(args, inputs, motion)
     start_s = (task.stamp_ns - inputs.states[0].stamp_ns) * 1e-9
     limit = "to the log's end" if task.follow else f"at most {config.control.max_time:g} s"
@@ -212,7 +223,8 @@ def _known_states(inputs: ReplayInputs) -> list[JointState]:
     return states
 
 
-def _logged(inputs: ReplayInputs) -> LoggedMotion:
+def logged_motion(inputs: ReplayInputs) -> LoggedMotion:
+    """Every logged state, whether a scene was known or not."""
     stamps, positions = checked_states(inputs.model, inputs.states)
     return LoggedMotion(
         stamp_ns=stamps, position=positions, velocity=np.array([state.velocity for state in inputs.states])

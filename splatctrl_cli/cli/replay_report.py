@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import table
+from splatctrl_cli.cli.replay_baseline import FIGURES
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_metrics import Metrics
@@ -135,6 +136,11 @@ def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> list[
 
     lines = when_and_why(replay)
     lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in metrics.items()])]
+    if replay.separations:
+        rows = [
+            (figure, *(_shown(metrics[f"{motion}_{figure}"]) for motion in replay.separations)) for figure in FIGURES
+        ]
+        lines += ["", "Beside people, from the same moment:", *table(("", *replay.separations), rows)]
     if replay.static_violations:
         rows = [(violation.sphere, f"{violation.clearance:.4f}") for violation in replay.static_violations]
         lines += ["", "Spheres that no joint moves, within the margin:", *table(("sphere", "clearance"), rows)]

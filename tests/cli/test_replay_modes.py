@@ -1,13 +1,14 @@
 """Open loop, golden commands, explanations, gates, and what a closed loop may be asked for."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.cli.replay_metrics import metric_names
-from splatctrl_cli.records import JointState
+from splatctrl_cli.records import JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, splats_of, write_scene
 
@@ -244,4 +245,56 @@ def test_a_file_of_waypoints_that_is_none_is_refused(
     file.write_text(text)
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", "--waypoints", str(file)) == 4
+    assert words in capsys.readouterr().err
+
+
+def with_person(arm: RobotModel, *, is_there: bool = True) -> tuple[SplatSet, SplatSet]:
+    """Nobody, then a person 30 cm ahead of the arm at the log's end."""
+    ball = ball_ahead(arm, 0.3)
+    alone, beside = splats_of(BALL), splats_of(BALL, ball)
+    return alone, replace(beside, labels=np.array([0, Label.HUMAN if is_there else 0], np.uint8))
+
+
+def test_the_standstill_waits_where_the_controller_goes_on(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moving(desk)
+    alone, beside = with_person(arm)
+    scene = write_scene(
+        desk.folder / "scene", (0, alone), (3 * SECOND // 10, beside), (2 * SECOND, alone), (3 * SECOND, alone)
+    )
+    drive = ("--scene", str(scene), "-q", "--mode", "closed-loop", "--baseline", "standstill", "--zone", "0.9,1.0")
+    assert desk.replay(*drive, "--require", "standstill_num_stops<=1") == 0
+    metrics = desk.metrics()
+    assert metrics["standstill_completed"] == metrics["closed_loop_completed"] == 1
+    assert metrics["standstill_duration_s"] == pytest.approx(1.0 + 1.7, abs=0.02)
+    assert metrics["standstill_longest_stop_s"] == metrics["standstill_stopped_s"] == pytest.approx(1.7, abs=0.02)
+    assert metrics["closed_loop_num_stops"] == 0
+    assert 0.25 < metrics["closed_loop_min_human_distance"] < 0.9
+    assert "Beside people, from the same moment:" in capsys.readouterr().out
+    names = metric_names("closed-loop", ("exact", "barrier"), has_truth=False, has_baseline=True)
+    assert set(metrics) == set(names)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ((), 2, "--baseline: expected --mode closed-loop"),
+        (("--mode", "closed-loop", "--zone", "1"), 2, "--zone 1: expected STOP,RESUME"),
+        (("--mode", "closed-loop", "--zone", "2,1"), 2, "zone: expected 0 < stop <= resume"),
+        (("--mode", "closed-loop", "--human", "visitor"), 2, "--human: expected --truth"),
+        (("--mode", "closed-loop"), 5, "expected splats labelled human, got none"),
+    ],
+)
+def test_a_standstill_without_people_is_refused(
+    desk: Desk,
+    arm: RobotModel,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    code: int,
+    words: str,
+) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, with_person(arm, is_there=False)[1]))
+    assert desk.replay("--scene", str(scene), "-q", "--baseline", "standstill", *arguments) == code
     assert words in capsys.readouterr().err
