@@ -22,7 +22,7 @@ from splatctrl_cli.records import Bool, Float64, SphereSet
 from splatctrl_cli.robot.solids import Solid, SolidDistance, read_solids
 from splatctrl_cli.robot.urdf import UrdfFile
 
-TOLERANCE = 1e-4  # [m] between the proven and the found deficit
+TOLERANCE = 1e-5  # [m] between the proven and the found deficit
 RESOLUTION = 2e-3  # [m] longest edge of a triangle that is counted as covered or not by its middle
 PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
 

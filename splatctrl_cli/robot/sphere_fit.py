@@ -21,7 +21,7 @@ from scipy.spatial.distance import cdist
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Bool, Float64, SphereSet
-from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
+from splatctrl_cli.robot.coverage import TOLERANCE, areas, largest_deficit, refined
 from splatctrl_cli.robot.solids import Solid, SolidDistance
 
 Int64 = NDArray[np.int64]
@@ -219,7 +219,8 @@ class _Link:
             largest_deficit(part.surface.corners, centers, radii - part.slack, floor=-np.inf).proven
             for part in self._parts
         )
-        radii = np.maximum(radii - max(spare, 0.0) - self._options.max_deficit, 10**-DIGITS)
+        allowed = max(self._options.max_deficit - TOLERANCE, 0.0)  # so that what is proven keeps to it
+        radii = np.maximum(radii - max(spare, 0.0) - allowed, 10**-DIGITS)
         return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
 
     def _polished(self, centers: Float64) -> tuple[Float64, float]:
