@@ -125,10 +125,8 @@ def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
 
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
     """Streams of joint1 ... joint7 under the names of `wanted` that end so, where no stream has those."""
-    if any(set(stream.names) & set(wanted) for stream in streams):
-        return streams
     names = with_prefix(wanted)
-    if not names:
+    if not names or any(set(stream.names) & set(names.values()) for stream in streams):
         return streams
     loss.notes.append(f"joints without a prefix are taken by their number: joint1 is {names['joint1']}, and so on")
     return [
@@ -138,9 +136,11 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
 
 
 def with_prefix(wanted: Sequence[str]) -> dict[str, str]:
-    """joint1 ... joint7 -> the one name of `wanted` that ends so; empty where one of them has none, or several."""
-    ending = {short: [name for name in wanted if name.endswith(short)] for short in NAMELESS}
-    return {short: full[0] for short, full in ending.items()} if all(len(f) == 1 for f in ending.values()) else {}
+    """joint1 ... joint7 -> the names of `wanted` that end so after one prefix; empty unless one prefix fits."""
+    first = NAMELESS[0]
+    prefixes = [name.removesuffix(first) for name in wanted if name.endswith(first)]
+    fitting = [prefix for prefix in prefixes if all(prefix + short in wanted for short in NAMELESS)]
+    return {short: fitting[0] + short for short in NAMELESS} if len(fitting) == 1 else {}
 
 
 def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:

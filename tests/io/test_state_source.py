@@ -227,6 +227,22 @@ def test_a_ros_1_franka_state_without_names_is_taken_by_the_numbers_of_its_joint
     assert any("1 of 20 states have no valid end-effector pose" in note for note in source.loss.notes)
 
 
+def test_fingers_of_another_topic_join_a_franka_state_without_names(tmp_path: Path) -> None:
+    store = store_with(franka_msgs__FrankaState=FRANKA_STATE)
+    kind, q = "franka_msgs/msg/FrankaState", ramp(20, 7)
+    messages = []
+    for i, row in enumerate(q):
+        stamp, zero = START_NS + i * STEP_NS, np.zeros(16)
+        numbers = {"q": row, "q_d": row, "dq": row, "dq_d": row, "O_T_EE": zero, "O_T_EE_d": zero}
+        content = store.types[kind](header=header(store, stamp), time=0.0, **numbers)
+        messages.append(Message(log_ns=stamp, topic="/franka_states", type_name=kind, content=content))
+    fingers = ("fr3_finger_joint1", "fr3_finger_joint2")
+    gripper = states_of(np.full((20, 2), 0.04), fingers, topic="/gripper")
+    source = opened(write_mcap(tmp_path / "x.mcap", messages + gripper, store), (*ARM, *fingers))
+    assert source.joint_names == (*ARM, *fingers)
+    assert states(source)[5].position == pytest.approx([*q[5], 0.04, 0.04])
+
+
 def franka_2(num: int) -> tuple[Any, list[Message]]:
     store = store_with(franka_msgs__FrankaRobotState=FRANKA_ROBOT_STATE)
     kind, q = "franka_msgs/msg/FrankaRobotState", ramp(num, 7)
