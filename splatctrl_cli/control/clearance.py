@@ -23,8 +23,8 @@ class PlanningArm(ArmModel, Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanningField:
-    """Distance alone, from a field: what a planner asks, without the gradient it would pay for."""
+class OnlyDistance:
+    """The distance of a field (of splats, or baked), as a scene to plan in."""
 
     field: DistanceField
 
@@ -45,15 +45,15 @@ class HasDistance(Protocol):
 class Clearance:
     """Signed distances of an arm's spheres to a scene and to each other, less margins.
 
-    radii, moving: of the M spheres that a joint moves, their indices; pairs (P, 2) of all spheres; levers (R, J): no
+    taken (R,) [m] radii and margins that come off the distances between centres; moving (M,) the spheres that a joint
+    moves; pairs (P, 2) of all spheres; levers (R, J): no
     row loses more than `levers @ |dq|` [m] on the way of dq, given that the scene's distance is 1-Lipschitz (exact
     distances are; for another field `lipschitz` scales its rows). names (R,) of the rows. num_checks counts postures.
     """
 
     model: PlanningArm
     scene: HasDistance
-    margin: Float64
-    radii: Float64
+    taken: Float64
     moving: NDArray[np.intp]
     pairs: NDArray[np.integer]
     levers: Float64
@@ -77,12 +77,11 @@ class Clearance:
         if not len(moving):
             raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
         levers, pairs = model.lever_arms(), np.asarray(model.self_pairs()).reshape(-1, 2)
-        names = sphere_names(model.sphere_set)
+        names, radii = sphere_names(model.sphere_set), np.asarray(model.sphere_set.radii, dtype=np.float64)
         return cls(
             model=model,
             scene=scene,
-            margin=np.repeat([margin, self_margin], [len(moving), len(pairs)]),
-            radii=np.asarray(model.sphere_set.radii, dtype=np.float64),
+            taken=np.concatenate([radii[moving] + margin, radii[pairs].sum(axis=1) + self_margin]),
             moving=moving,
             pairs=pairs,
             levers=np.concatenate([lipschitz * levers[moving], _between(levers, pairs)]),
@@ -111,10 +110,11 @@ class Clearance:
             )
         num_moving = len(self.moving)
         rows = np.empty((len(q), len(self.names)))
-        rows[:, :num_moving] = distance.reshape(len(q), -1) - self.radii[self.moving]
+        rows[:, :num_moving] = distance.reshape(len(q), -1)
         if len(self.pairs):
-            rows[:, num_moving:] = _apart(centers, self.pairs) - self.radii[self.pairs].sum(axis=1)
-        return rows - self.margin
+            rows[:, num_moving:] = _apart(centers, self.pairs)
+        rows -= self.taken
+        return rows
 
     def at(self, q: Float64) -> Float64:
         """The least row (B,) [m] at postures q (B, J)."""

@@ -5,12 +5,13 @@ import pytest
 
 from splatctrl_cli.config import PlannerConfig
 from splatctrl_cli.control.advancement import check_edges
-from splatctrl_cli.control.clearance import Clearance
+from splatctrl_cli.control.clearance import Clearance, OnlyDistance
 from splatctrl_cli.control.path import joint_length, resampled
 from splatctrl_cli.control.planner import PlanOutcome, plan
 from splatctrl_cli.control.shortcut import shortened
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.records import Float64
+from tests.control.fakes import Balls, Plane
 from tests.control.walls import LeveredArm, clearance, closed_ring, one_wall, thin_post
 
 CONFIG = PlannerConfig(max_iterations=300, max_time=60.0)
@@ -39,9 +40,10 @@ def test_a_margin_is_kept_everywhere() -> None:
 
 
 def test_a_goal_behind_a_closed_wall_runs_out_of_iterations() -> None:
-    found = plan(clearance(closed_ring()), np.array([1.5, 0.1]), np.array([-1.5, 0.1]), CONFIG)
+    config = replace(CONFIG, max_iterations=60)
+    found = plan(clearance(closed_ring()), np.array([1.5, 0.1]), np.array([-1.5, 0.1]), config)
     assert found.outcome is PlanOutcome.OUT_OF_ITERATIONS
-    assert found.num_iterations == CONFIG.max_iterations
+    assert found.num_iterations == 60
     assert not found.is_solved
     assert len(found.waypoints) == 0
 
@@ -119,7 +121,7 @@ def random_edges(num: int) -> tuple[Float64, Float64]:
 @pytest.mark.parametrize("room", [one_wall(), closed_ring(), thin_post()], ids=["wall", "ring", "needle"])
 def test_no_edge_is_accepted_that_dense_samples_find_in_collision(room: object) -> None:
     free = clearance(room)  # type: ignore[arg-type]
-    start, end = random_edges(200)
+    start, end = random_edges(120)
     check = check_edges(free, start, end, contact=1e-4)
     dense = np.array([densest(free, np.array(edge)) for edge in zip(start, end, strict=True)])
     assert np.all(dense[check.is_free] > 0)
@@ -129,7 +131,7 @@ def test_no_edge_is_accepted_that_dense_samples_find_in_collision(room: object) 
 
 def test_a_needle_between_samples_is_not_stepped_over() -> None:
     free = clearance(thin_post(radius=1e-3))
-    slim = replace(free, radii=np.full_like(free.radii, 1e-3))
+    slim = replace(free, taken=np.full_like(free.taken, 1e-3))
     angle = np.arctan2(0.31, 0.62) + np.array([-0.37, 0.33])
     near = np.hypot(0.62, 0.31)
     bend = np.arccos((near**2 - 0.5**2 - 0.4**2) / (2 * 0.5 * 0.4))  # the tip's sphere sweeps through the needle
@@ -166,3 +168,19 @@ def test_a_field_without_a_distance_is_an_error_that_says_where() -> None:
 
     with pytest.raises(NotEvaluableError, match=r"sphere upper\[0\] at \(0.250, 0.000, 0.000\) m: the field has no"):
         Clearance.of(LeveredArm(), Nowhere()).at(np.zeros((1, 2)))
+
+
+def test_a_distance_field_is_a_scene_as_solids_are() -> None:
+    q = random_edges(50)[0]
+    field = OnlyDistance(field=Balls([[0.62, 0.31, 0.0]], [0.002]))
+    np.testing.assert_allclose(Clearance.of(LeveredArm(), field).rows(q), clearance(thin_post()).rows(q), atol=1e-12)
+
+
+def test_a_field_steeper_than_a_distance_is_checked_with_its_own_slope() -> None:
+    steep = OnlyDistance(field=Plane([0.0, 1.0, 0.0], -0.5, scale=3.0))
+    trusting, wary = (Clearance.of(LeveredArm(), steep, lipschitz=slope) for slope in (1.0, 3.0))
+    start, end = random_edges(100)
+    dense = np.array([densest(wary, np.array(edge)) for edge in zip(start, end, strict=True)])
+    assert np.all(dense[check_edges(wary, start, end, contact=1e-4).is_free] > 0)
+    ratio = wary.speeds(end - start) / np.maximum(trusting.speeds(end - start), 1e-12)
+    assert np.allclose(ratio[:, :4], 3.0)
