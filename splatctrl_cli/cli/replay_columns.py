@@ -1,6 +1,6 @@
 """The columns of a replay's steps.csv, one value per state."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,40 +14,49 @@ if TYPE_CHECKING:
 
 Columns = dict[str, list[object]]
 
+CHUNK = 4096  # states
+ALL = slice(None)
 
-def columns_of(replay: "Replay") -> Columns:
-    """Every column, by name."""
+
+def chunks_of(replay: "Replay") -> Iterator[Columns]:
+    """`columns_of` all states, CHUNK at a time, so that a long log is never a table in memory."""
+    for first in range(0, len(replay.audit.stamp_ns), CHUNK):
+        yield columns_of(replay, slice(first, first + CHUNK))
+
+
+def columns_of(replay: "Replay", rows: slice = ALL) -> Columns:
+    """Every column of the chosen states, by name."""
     audit, names = replay.audit, sphere_names(replay.model.sphere_set)
     columns: Columns = {
-        "stamp_ns": audit.stamp_ns.tolist(),
-        "time_s": seconds_of(replay).tolist(),
-        **{f"q_{joint}": audit.position[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
+        "stamp_ns": audit.stamp_ns[rows].tolist(),
+        "time_s": seconds_of(replay)[rows].tolist(),
+        **{f"q_{joint}": audit.position[rows, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
     }
     for name, clearance in audit.clearance.items():
-        columns[f"clearance_{name}"] = clearance.distance.tolist()
-        columns[f"nearest_{name}"] = [names[s] for s in clearance.sphere]
+        columns[f"clearance_{name}"] = clearance.distance[rows].tolist()
+        columns[f"nearest_{name}"] = [names[s] for s in clearance.sphere[rows]]
     if replay.true_clearance is not None:
-        columns["clearance_true"] = replay.true_clearance.tolist()
-    columns["obstacle"] = ["" if obstacle is None else str(obstacle) for obstacle in replay.obstacles]
-    columns["self_clearance"] = audit.self_clearance.tolist()
-    columns["limit_margin"] = audit.limit_margin.tolist()
-    columns["limit_joint"] = [replay.model.joint_names[j] for j in audit.limit_joint]
-    columns["unknown_share"] = audit.unknown_share.tolist()
-    columns["map_age_s"] = replay.map_age_s.tolist()
+        columns["clearance_true"] = replay.true_clearance[rows].tolist()
+    columns["obstacle"] = ["" if obstacle is None else str(obstacle) for obstacle in replay.obstacles[rows]]
+    columns["self_clearance"] = audit.self_clearance[rows].tolist()
+    columns["limit_margin"] = audit.limit_margin[rows].tolist()
+    columns["limit_joint"] = [replay.model.joint_names[j] for j in audit.limit_joint[rows]]
+    columns["unknown_share"] = audit.unknown_share[rows].tolist()
+    columns["map_age_s"] = replay.map_age_s[rows].tolist()
     if replay.steps:
-        columns |= _step_columns(replay)
+        columns |= _step_columns(replay, rows)
     if replay.open_loop is not None:
-        columns |= _open_loop_columns(replay)
+        columns |= _open_loop_columns(replay, rows)
     if replay.divergence is not None:
-        columns["divergence_joints"] = replay.divergence.joints.tolist()
-        columns["divergence_position"] = replay.divergence.position.tolist()
-        columns["divergence_rotation_deg"] = np.degrees(replay.divergence.rotation).tolist()
+        columns["divergence_joints"] = replay.divergence.joints[rows].tolist()
+        columns["divergence_position"] = replay.divergence.position[rows].tolist()
+        columns["divergence_rotation_deg"] = np.degrees(replay.divergence.rotation[rows]).tolist()
     return columns
 
 
-def _step_columns(replay: "Replay") -> Columns:
+def _step_columns(replay: "Replay", rows: slice) -> Columns:
     def each(value: Callable[[ControlStep], object]) -> list[object]:
-        return ["" if step is None else value(step) for step in replay.steps]
+        return ["" if step is None else value(step) for step in replay.steps[rows]]
 
     def velocity_of(joint: int) -> list[object]:
         return each(lambda step: float(step.velocity[joint]))
@@ -69,10 +78,10 @@ def _step_columns(replay: "Replay") -> Columns:
     }
 
 
-def _open_loop_columns(replay: "Replay") -> Columns:
+def _open_loop_columns(replay: "Replay", rows: slice) -> Columns:
     trace = replay.open_loop
     assert trace is not None
-    difference, margins = trace.difference, trace.margins
+    difference, margins = trace.difference[rows], trace.margins[rows]
     return {
         **{f"dv_{joint}": difference[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
         "velocity_difference": np.linalg.norm(difference, axis=1).tolist(),

@@ -37,11 +37,11 @@ def write_replay(
     stopwatch: "Stopwatch",
 ) -> None:
     """Write steps.csv, events.json, summary.json, pictures and run.json."""
-    from splatctrl_cli.cli.replay_columns import columns_of
+    from splatctrl_cli.cli.replay_columns import chunks_of
     from splatctrl_cli.io.output import write_json, write_run
     from splatctrl_cli.io.replay_output import write_steps
 
-    write_steps(folder / "steps.csv", columns_of(replay))
+    write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
     write_json(folder / "summary.json", summary_of(replay, metrics))
     with stopwatch.stage("picture"):

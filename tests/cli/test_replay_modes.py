@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.cli import replay_columns
 from splatctrl_cli.cli.replay_metrics import metric_names
 from splatctrl_cli.records import JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
@@ -298,3 +299,16 @@ def test_a_standstill_without_people_is_refused(
     scene = write_scene(desk.folder / "scene", (0, with_person(arm, is_there=False)[1]))
     assert desk.replay("--scene", str(scene), "-q", "--baseline", "standstill", *arguments) == code
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
+def test_steps_are_the_same_however_many_are_written_at_once(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    moving(desk)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    for chunk, out in ((4096, "whole"), (3, "chunked")):
+        monkeypatch.setattr(replay_columns, "CHUNK", chunk)
+        assert desk.replay("--scene", str(scene), "-q", "--mode", mode, out=out) == 0
+    whole, chunked = ((desk.folder / out / "steps.csv").read_bytes() for out in ("whole", "chunked"))
+    assert whole == chunked
