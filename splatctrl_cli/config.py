@@ -128,7 +128,7 @@ class FieldConfig:
 class ControlConfig:
     """III-E: QP inverse kinematics with control barrier functions."""
 
-    preset: str = "reduced"  # the program; or paper: III-E as printed, with barrier_gain = 1 and without a second look
+    preset: str = "reduced"  # or paper: III-E as printed, with barrier_gain = 1 and without a second look
     solver: str = "clarabel"  # of the QP; or daqp: an active-set method, several times as fast
     margin: float = 0.02  # [m] epsilon, IV-C
     period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
