@@ -16,7 +16,7 @@ from splatctrl_cli.cli.common import (
     configured,
 )
 from splatctrl_cli.cli.replay_baseline import add_baseline, read_zone
-from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose
+from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose, seconds
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.robot_options import locked_joints
 from splatctrl_cli.cli.source_options import add_source
@@ -65,7 +65,11 @@ def register(subparsers: Subparsers) -> None:
         "--max-unknown", type=float, default=0.05, metavar="SHARE", help="never-seen share allowed (default: 0.05)"
     )
     parser.add_argument(
-        "--max-map-age", type=float, default=1.0, metavar="S", help="a scene older than this is an event (default: 1)"
+        "--max-map-age",
+        type=seconds,
+        default=1.0,
+        metavar="S",
+        help="a scene older than this is an event (default: 1)",
     )
     add_golden(parser)
     add_baseline(parser)
@@ -144,7 +148,9 @@ def _verdict(
     if metrics["num_without_distance"]:
         raise NotEvaluableError(
             f"replay: the path leaves known space: at {metrics['num_without_distance']:g} of "
-            f"{metrics['num_states']:g} states a sphere is where the field has no distance",
+            f"{metrics['num_states']:g} states, first at "
+            f"{first_time(replay, 'num_without_distance', lambda count: count == 0):.3f} s, "
+            "a sphere is where the field has no distance",
             remedy="the figures above leave those states out; bake with field.unknown = free or obstacle",
         )
     unknown = metrics["unknown_share"]

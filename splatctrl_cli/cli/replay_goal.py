@@ -36,7 +36,7 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--start-time", type=float, metavar="S", help="start at this time of the log [s]")
     parser.add_argument(
-        "--re-anchor", type=_seconds, metavar="S", help="put the arm back into the logged posture every S seconds"
+        "--re-anchor", type=seconds, metavar="S", help="put the arm back into the logged posture every S seconds"
     )
 
 
@@ -150,7 +150,8 @@ def pose(text: str) -> tuple[float, ...]:
     return values
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
+    """Seconds above zero, for argparse."""
     values = numbers(text)
     if len(values) != 1 or values[0] <= 0:
         raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")

@@ -81,7 +81,7 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
     (desk.folder / "field").mkdir()
     write_npz(desk.folder / "field" / "field.npz", bake(splats_of(BALL), box, config, occupancy=seen, threads=1))
     assert desk.replay("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1") == 5
-    assert "the path leaves known space: at 11 of 11 states" in capsys.readouterr().err
+    assert "the path leaves known space: at 11 of 11 states, first at 0.000 s" in capsys.readouterr().err
     assert desk.metrics()["num_without_distance"] == 11
     assert {row["clearance_barrier"] for row in desk.rows()} == {""}
     driven = ("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1", "--mode", "closed-loop")

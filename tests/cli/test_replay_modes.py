@@ -133,6 +133,7 @@ def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_join
         (("--mode", "open-loop", "--golden", "x", "--golden-tolerance", "-1"), 2, "--golden-tolerance"),
         (("--mode", "closed-loop", "--waypoints", "nowhere.toml"), 4, "nowhere.toml: cannot be read"),
         (("--mode", "closed-loop", "--re-anchor", "0"), 2, "expected seconds above 0"),
+        (("--max-map-age", "nan"), 2, "expected finite numbers"),
         (("--require", "intervention_share<=0"), 2, "unknown metric"),
     ],
 )
