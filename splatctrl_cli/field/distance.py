@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.kernel import Matern12, SquaredExponential, checked_length, checked_truncation
-from splatctrl_cli.field.spheres import Spheres, checked_points
+from splatctrl_cli.field.spheres import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.weights import weights_named
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan
@@ -212,7 +212,8 @@ class SeField:
     def query_safe(self, points: Float64) -> tuple[Float64, Float64]:
         """The smaller of this and the exact distance, in one walk: as `SafeField` of both."""
         points_ = self.spheres.points
-        score, gradient = native.safe(
+        asked = shaped_points(points)
+        found = native.safe(
             points_.clusters,
             self._offsets,
             self.radii,
@@ -220,10 +221,13 @@ class SeField:
             self._common,
             self.kernel.length,
             self.tolerance,
-            points_.relative(checked_points(points)),
+            points_.anchor,
+            asked,
             threads=self._threads,
         )
-        return score.astype(np.float64), gradient.astype(np.float64)
+        if found is None:
+            raise not_finite(asked)
+        return found
 
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
         """`query_raw` at the cells of `span`, into distance (X, Y, Z) and gradient (X, Y, Z, 3)."""

@@ -30,13 +30,24 @@ class Spheres:
 
 def checked_points(points: NDArray[np.floating]) -> Float64:
     """Query points (Q, 3) as float64. Raises InputError for another shape or a value that is not finite."""
+    array = shaped_points(points)
+    if not np.isfinite(array).all():
+        raise not_finite(array)
+    return array
+
+
+def shaped_points(points: NDArray[np.floating]) -> Float64:
+    """Query points (Q, 3) as float64. Raises InputError for another shape."""
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"query points: expected shape (Q, 3), got {array.shape}")
-    if not np.isfinite(array).all():
-        i = int(np.argmax(~np.isfinite(array).all(axis=1)))
-        raise InputError(f"query point {i}: expected finite coordinates, got {array[i].tolist()}")
     return array
+
+
+def not_finite(points: Float64) -> InputError:
+    """The error that names the first of the points (Q, 3) that is not finite."""
+    i = int(np.argmax(~np.isfinite(points).all(axis=1)))
+    return InputError(f"query point {i}: expected finite coordinates, got {points[i].tolist()}")
 
 
 def _checked(centers: ArrayLike, radii: ArrayLike) -> tuple[Float64, Float64]:

@@ -167,13 +167,17 @@ def safe(
     common: float,
     length: float,
     tolerance: float,
-    points: Float32,
+    anchor: Float64,
+    points: Float64,
     *,
     threads: int = 0,
-) -> tuple[Float32, Float32]:
-    """The smaller of `gaussian` and `nearest` (Q,) and its gradient (Q, 3); `nearest` where they are equal or NaN."""
-    score, gradient = np.empty(len(points), np.float32), np.empty((len(points), 3), np.float32)
-    native.field_safe(
+) -> tuple[Float64, Float64] | None:
+    """The smaller of `gaussian` and `nearest` (Q,) and its gradient (Q, 3); `nearest` where they are equal or NaN.
+
+    points (Q, 3) float64, in the frame that anchor (3,) is in. None where one of them is not finite.
+    """
+    score, gradient = np.empty(len(points)), np.empty((len(points), 3))
+    is_finite = native.field_safe(
         spheres.centers,
         spheres.boxes,
         offsets.values,
@@ -184,12 +188,13 @@ def safe(
         common,
         length,
         tolerance,
+        anchor,
         points,
         num_threads(threads),
         score,
         gradient,
     )
-    return score, gradient
+    return (score, gradient) if is_finite else None
 
 
 def row_sums(spheres: Clusters, has_sphere: UInt8, length: float, *, is_matern: bool, threads: int = 0) -> Float64:

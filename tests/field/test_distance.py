@@ -253,6 +253,8 @@ def test_bad_queries_and_settings_are_named() -> None:
     centers, radii = cloud(10)
     with pytest.raises(InputError, match="query point 1: expected finite coordinates"):
         SphereField(centers, radii).query(np.array([[0.0, 0, 0], [0, np.inf, 0]]))
+    with pytest.raises(InputError, match="query point 1: expected finite coordinates"):
+        make_field(centers, radii, FieldConfig()).query(np.array([[0.0, 0, 0], [0, 0, np.nan]]))
     with pytest.raises(InputError, match=r"expected shape \(Q, 3\)"):
         GpdfField(centers, radii).query(np.zeros(3))
     with pytest.raises(UsageError, match="length_scale: expected a length above 0"):

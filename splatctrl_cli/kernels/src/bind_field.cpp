@@ -1,6 +1,8 @@
 #include <nanobind/stl/optional.h>
 
+#include <cmath>
 #include <optional>
+#include <vector>
 
 #include "bind.h"
 #include "field_bake.h"
@@ -98,15 +100,30 @@ void gaussian(const Rows3& centers, const Rows6& boxes, const Floats& values, co
   query_gaussian(spheres, offsets, radii.data(), data_or_null(sign), common, length, tolerance, query);
 }
 
-void safe(const Rows3& centers, const Rows6& boxes, const Floats& values, const Floats& maxima, const Floats& radii,
+// True where every point is finite; else nothing is asked.
+bool safe(const Rows3& centers, const Rows6& boxes, const Floats& values, const Floats& maxima, const Floats& radii,
           const Floats& radius_maxima, const Maybe<Floats>& sign, double common, float length, float tolerance,
-          const Points& points, int threads, const Values& score, const Vectors& gradient) {
+          const Triple& anchor, const Points64& points, int threads, const Values64& score, const Vectors64& gradient) {
   const Clusters spheres = view_clusters(centers, boxes);
   const Offsets offsets = view_offsets(spheres, values, maxima), radius_offsets = view_offsets(spheres, radii, radius_maxima);
   if (sign) expect_per_sphere(spheres, *sign, "sign: expected (16 C)");
-  const Query query = view_query(points, threads, score, gradient);
+  const size_t q = points.shape(0);
+  expect(score.shape(0) == q && gradient.shape(0) == q, "score, gradient: expected one entry per point");
   const nb::gil_scoped_release release;
+  std::vector<float> local(7 * q);  // points, then scores, then gradients
+  bool is_finite = true;
+  for (size_t k = 0; k < 3 * q; ++k) {
+    const double moved = points.data()[k] - anchor.data()[k % 3];
+    is_finite = is_finite && std::isfinite(moved);
+    local[k] = static_cast<float>(moved);
+  }
+  if (!is_finite) return false;
+  float *scores = local.data() + 3 * q, *gradients = local.data() + 4 * q;
+  const Query query{local.data(), static_cast<int>(q), threads, scores, gradients};
   query_safe(spheres, offsets, radius_offsets, data_or_null(sign), common, length, tolerance, query);
+  for (size_t k = 0; k < q; ++k) score.data()[k] = scores[k];
+  for (size_t k = 0; k < 3 * q; ++k) gradient.data()[k] = gradients[k];
+  return true;
 }
 
 void density(const Rows3& centers, const Rows6& boxes, const Bytes& has_sphere, bool is_matern, float length, int threads,
@@ -241,7 +258,8 @@ void bind_field(nb::module_& m) {
   m.def("field_safe", &safe, nb::arg("centers").noconvert(), nb::arg("boxes").noconvert(), nb::arg("offsets").noconvert(),
         nb::arg("maxima").noconvert(), nb::arg("radii").noconvert(), nb::arg("radius_maxima").noconvert(),
         nb::arg("sign").noconvert().none(), nb::arg("common"), nb::arg("length"), nb::arg("tolerance"),
-        nb::arg("points").noconvert(), nb::arg("threads"), nb::arg("score").noconvert(), nb::arg("gradient").noconvert());
+        nb::arg("anchor").noconvert(), nb::arg("points").noconvert(), nb::arg("threads"), nb::arg("score").noconvert(),
+        nb::arg("gradient").noconvert());
   m.def("field_density", &density, nb::arg("centers").noconvert(), nb::arg("boxes").noconvert(),
         nb::arg("has_sphere").noconvert(), nb::arg("is_matern"), nb::arg("length"), nb::arg("threads"),
         nb::arg("sum").noconvert());
