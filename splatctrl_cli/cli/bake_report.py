@@ -1,7 +1,7 @@
 """What ``sdf-bake`` says of a field: the summary, ``field.json``, the figures that a gate can name, the pictures."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ FAR = 1.0  # [m] a grid whose every cell is farther from the splats than this is
 @dataclass(frozen=True, kw_only=True)
 class FieldReport:
     """A baked grid with its statistics and the warnings; accuracy: plain values, by what it was compared with;
-    reliability: of its probability, by the truth.
+    reliability: of each form of the probability, by the truth.
     """
 
     grid: "DistanceGrid"
@@ -32,7 +32,7 @@ class FieldReport:
     warnings: tuple[str, ...]
     changes: "Changes | None" = None
     accuracy: Mapping[str, Any] | None = None
-    reliability: "Reliability | None" = None
+    reliability: "Mapping[str, Reliability]" = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as written to ``field.json``: the grid's header and place first."""
@@ -148,11 +148,10 @@ def write_pictures(folder: Path, report: FieldReport, point: Sequence[float]) ->
         gradient_picture(pictures / "gradient.png", grid, lengths.histogram, lengths.bin_width, point)
     if "probability" in grid.channels:
         probability_picture(pictures / "probability.png", grid, point)
-    if report.reliability is not None:
+    if report.reliability:
         from splatctrl_cli.evaluate.reliability import reliability_picture
 
-        name = str(grid.header.get("probability"))
-        reliability_picture(pictures / "reliability.png", {name: report.reliability}, "Probability against the truth")
+        reliability_picture(pictures / "reliability.png", report.reliability, "Probability against the truth")
 
 
 def _update(changes: "Changes") -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """A baked field beside the truth of a simulated log: where cameras looked, how far off is it?"""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_ac
 from splatctrl_cli.evaluate.reliability import Reliability, reliability
 from splatctrl_cli.evaluate.visibility import seen_by
 from splatctrl_cli.field.grid import exact_channel
+from splatctrl_cli.field.probability import CollisionProbability
 from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Bool, DistanceGrid, Float64, RgbdFrame
 from splatctrl_cli.simulate.truth import Truth, load_truth
@@ -22,6 +23,7 @@ from splatctrl_cli.simulate.truth import Truth, load_truth
 FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
 MAX_CELLS = 200_000  # a larger grid is compared at this many cells, drawn with the seed
 _CURVES = ("edges", "predicted", "observed")
+NEAR = 0.05  # [m] where a probability is neither 0 nor 1
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
@@ -32,7 +34,8 @@ class Comparison:
     num_drawn of the grid's cells, num_blank of them without a distance (field.unknown = nan), num_near of the others
     outside the objects and within 20 cm, num_seen of those with a nearest true surface point that a training camera
     saw inside the workspace; num_outside_workspace more were seen, but their surface lies where the scene keeps no
-    splats. reliability: of the channel probability at seen cells within 20 cm of a surface, inside or out.
+    splats. reliability: of each form of the probability, at seen cells within 20 cm of a surface, inside or out.
+    error_mean, error_sigma [m]: of sdf at seen cells within `NEAR` of a surface, None without any.
     """
 
     accuracy: FieldAccuracy
@@ -41,20 +44,30 @@ class Comparison:
     num_near: int
     num_seen: int
     num_outside_workspace: int
-    reliability: Reliability | None
+    reliability: Mapping[str, Reliability]
+    error_mean: float | None
+    error_sigma: float | None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as written to ``field.json``."""
         counts = {name: value for name, value in vars(self).items() if name.startswith("num_")}
-        curve = {} if self.reliability is None else {"reliability": _curve(self.reliability)}
-        return {**counts, **self.accuracy.as_dict(), **curve}
+        error = {"error_mean": self.error_mean, "error_sigma": self.error_sigma}
+        curves = {name: _curve(curve) for name, curve in self.reliability.items()}
+        return {**counts, **self.accuracy.as_dict(), **error, "reliability": curves}
 
 
 def compare_with_truth(
-    grid: DistanceGrid, source: BakeSource, truth_path: Path, log: Path, *, seed: int
+    grid: DistanceGrid,
+    source: BakeSource,
+    truth_path: Path,
+    log: Path,
+    *,
+    seed: int,
+    probabilities: Mapping[str, CollisionProbability],
 ) -> Comparison:
-    """The accuracy of `hard` and `sdf` at drawn cells; the robot is in neither the field nor the truth.
+    """The accuracy of `hard` and `sdf` at drawn cells, and the reliability of the probabilities of the same splats.
 
+    The robot is in neither the field nor the truth.
     Raises NotEvaluableError where no cell is near an object.
     """
     truth = load_truth(truth_path)
@@ -76,6 +89,8 @@ def compare_with_truth(
         in_workspace[is_around] = source.workspace.contains(surface[is_around])
     health: Any = grid.header["health"]
     is_counted = seen & in_workspace
+    error = (cells["sdf"] - distance)[is_counted & (np.abs(distance) < NEAR)]
+    asked = probabilities if is_counted.any() else {}
     return Comparison(
         accuracy=field_accuracy(
             {name: cells[name][is_near] for name in FIELDS},
@@ -88,15 +103,18 @@ def compare_with_truth(
         num_near=int(np.count_nonzero(is_near)),
         num_seen=int(np.count_nonzero(is_counted & is_near)),
         num_outside_workspace=int(np.count_nonzero(seen & ~in_workspace & is_near)),
-        reliability=reliability(cells["probability"][is_counted], distance[is_counted] <= 0)
-        if "probability" in cells and is_counted.any()
-        else None,
+        reliability={
+            name: reliability(form.at(points[is_counted], cells["sdf"][is_counted]), distance[is_counted] <= 0)
+            for name, form in asked.items()
+        },
+        error_mean=float(error.mean()) if len(error) else None,
+        error_sigma=float(error.std()) if len(error) else None,
     )
 
 
 def _cells(grid: DistanceGrid, drawn: NDArray[np.int64]) -> dict[str, Float64]:
-    """What the grid holds at drawn cells, whole channels of which may not fit the memory: hard, sdf, probability."""
-    names = [name for name in ("sdf", "hard", "bound", "probability") if name in grid.channels]
+    """What the grid holds at drawn cells, whole channels of which may not fit the memory: hard, sdf."""
+    names = [name for name in ("sdf", "hard", "bound") if name in grid.channels]
     channels: dict[str, NDArray[np.generic]] = {
         name: grid.channels[name].reshape(-1)[drawn].astype(np.float32) for name in names
     }
@@ -156,10 +174,16 @@ def accuracy_lines(compared: Comparison) -> list[str]:
         )
     if compared.num_outside_workspace:
         verdict += f"; {compared.num_outside_workspace} cells before seen surfaces outside the workspace do not count"
-    curve = compared.reliability
-    expected = (
-        [] if curve is None else [f"probability: calibration error {curve.calibration_error:.3f} at seen cells"]
-    )
+    expected = [
+        f"probability, {name}: calibration error {curve.calibration_error:.3f} at seen cells"
+        for name, curve in compared.reliability.items()
+    ]
+    if compared.error_mean is not None and compared.error_sigma:
+        mean, sigma = compared.error_mean, compared.error_sigma
+        expected.append(
+            f"within {NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- {sigma * 1e3:.1f} mm: "
+            f"calibrate the probability with --set field.error_mean={mean:.4f} --set field.error={sigma:.4f}"
+        )
     return [
         "error = field - truth, positive where clearance is over-estimated",
         *table(header, rows),

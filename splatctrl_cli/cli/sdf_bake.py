@@ -276,14 +276,16 @@ def _compared(report: "FieldReport", job: _Job, args: argparse.Namespace) -> tup
     """The report with the accuracy against all that options name, and the tables of it."""
     from splatctrl_cli.cli.bake_report import reference_lines
 
-    grid, curve = report.grid, None
+    grid, curves = report.grid, {}
     found: dict[str, Any] = {}
     lines: list[str] = []
     if args.truth is not None:
         from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
+        from splatctrl_cli.field.probability import probabilities
 
-        compared = compare_with_truth(grid, job.source, args.truth, args.seen_by, seed=args.seed)
-        found["truth"], curve = compared.as_dict(), compared.reliability
+        forms = probabilities(job.baker.spheres, job.config.field, threads=args.threads)
+        compared = compare_with_truth(grid, job.source, args.truth, args.seen_by, seed=args.seed, probabilities=forms)
+        found["truth"], curves = compared.as_dict(), dict(compared.reliability)
         lines += ["", *accuracy_lines(compared)]
     if args.reference_mesh is not None:
         from splatctrl_cli.evaluate.reference_mesh import compare_with_mesh
@@ -297,7 +299,7 @@ def _compared(report: "FieldReport", job: _Job, args: argparse.Namespace) -> tup
         held_out = compare_with_held_out(grid, job.source, args)
         found["held_out_depth"] = held_out.as_dict()
         lines += ["", *held_out_lines(held_out)]
-    return replace(report, accuracy=found or None, reliability=curve), lines
+    return replace(report, accuracy=found or None, reliability=curves), lines
 
 
 def _middle(job: _Job) -> list[float]:

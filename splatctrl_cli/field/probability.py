@@ -27,6 +27,10 @@ class CollisionProbability(Protocol):
         """Probability (X, Y, Z) at the cells of `span`, whose chosen distance [m] is `sdf`."""
         ...
 
+    def at(self, points: Float64, sdf: Float64) -> Float64:
+        """Probability (Q,) at points (Q, 3) [m], whose chosen distance is sdf (Q,) [m]."""
+        ...
+
     def described(self) -> dict[str, object]:
         """What it means, and its numbers, for a header."""
         ...
@@ -46,6 +50,10 @@ class CalibratedProbability:
         from scipy.special import ndtr
 
         return np.asarray(ndtr((self.mean - clearance) / self.sigma))
+
+    def at(self, points: Float64, sdf: Float64) -> Float64:
+        """As `CollisionProbability.at`."""
+        return self.of(sdf)
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
         """As `CollisionProbability.baked`."""
@@ -90,6 +98,10 @@ class PaperProbability:
             threads=self._threads,
         )
         return self._combined(self._gpdf.query_raw(points)[0], half.astype(np.float64))
+
+    def at(self, points: Float64, sdf: Float64) -> Float64:
+        """As `CollisionProbability.at`; the paper's form does not depend on the chosen distance."""
+        return self.of(points)
 
     def baked(self, span: GridSpan, sdf: Float32, *, threads: int) -> Float32:
         """As `CollisionProbability.baked`; the paper's form does not depend on the chosen distance."""
@@ -145,6 +157,12 @@ def make_probability(spheres: Spheres, config: FieldConfig, *, threads: int = 1)
     if config.probability not in PROBABILITIES:
         raise UsageError(f"field.probability: expected one of {', '.join(PROBABILITIES)}, got {config.probability}")
     return PROBABILITIES[config.probability](spheres, config, threads)
+
+
+def probabilities(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> dict[str, CollisionProbability]:
+    """Every form that these weights have, by name: the paper's variance is not that of the full process (cg)."""
+    names = [name for name in PROBABILITIES if name != "paper" or config.weights != "cg"]
+    return {name: PROBABILITIES[name](spheres, config, threads) for name in names}
 
 
 def checked_error(error: float) -> float:

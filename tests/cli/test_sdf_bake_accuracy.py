@@ -81,10 +81,15 @@ def test_probability_is_held_to_the_truth(
     folder = sample_data / "tabletop"
     truth = ["--truth", folder / "truth.json", "--seen-by", folder / "log.mcap"]
     assert bake(true_splats, tmp_path / "field", *truth, "--probability", "calibrated") == 0
-    assert "probability: calibration error" in capsys.readouterr().out
-    found = accuracy(tmp_path / "field")["truth"]["reliability"]
-    assert sum(found["count"]) > 50
-    assert found["calibration_error"] < 0.2
+    out = capsys.readouterr().out
+    assert "probability, calibrated: calibration error" in out
+    assert "probability, paper: calibration error" in out
+    truth_said = accuracy(tmp_path / "field")["truth"]
+    assert f"--set field.error_mean={truth_said['error_mean']:.4f}" in out
+    assert 0 < truth_said["error_sigma"] < 0.02
+    found = truth_said["reliability"]
+    assert sum(found["calibrated"]["count"]) == sum(found["paper"]["count"]) > 50
+    assert found["calibrated"]["calibration_error"] < 0.2
     pictures = sorted(path.name for path in (tmp_path / "field" / "report").iterdir())
     assert pictures == ["gradient.png", "probability.png", "reliability.png", "slices.png"]
 
