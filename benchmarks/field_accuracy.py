@@ -29,7 +29,7 @@ from benchmarks.surfaces import (
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.evaluate.field_accuracy import BANDS, BandAccuracy, band_accuracy
-from splatctrl_cli.field.distance import GpdfField, KernelField, SafeField, SeField, SphereField
+from splatctrl_cli.field.distance import GpdfField, LogSumExpField, SafeField, SeField, SphereField
 from splatctrl_cli.field.health import median_spacing
 from splatctrl_cli.field.weights import METHODS
 from splatctrl_cli.records import Float64
@@ -162,7 +162,7 @@ def distances(
     found = {("hard", ""): exact.query(points)[0]}
     for weights in methods:
         noise = CG_NOISE if weights == "cg" else FieldConfig.noise
-        kernels: dict[str, KernelField] = {
+        kernels: dict[str, LogSumExpField] = {
             "se": SeField(centers, radii, noise=noise, weights=weights, threads=0),
             "gpdf": GpdfField(centers, radii, noise=noise, weights=weights, threads=0),
         }

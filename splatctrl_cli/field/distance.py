@@ -1,7 +1,8 @@
 """Distance fields over splats: exact, two kernel fields, and the smaller of exact and kernel. Positive outside."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,27 +54,10 @@ class SphereField:
         return self.spheres.points.source[entry]
 
 
-class KernelField(Protocol):
-    """A field whose log-sum-exp may have no distance somewhere."""
+class LogSumExpField(ABC):
+    """A field that is a log-sum-exp over splats: what `GpdfField` and `SeField` share."""
 
     spheres: Spheres
-
-    def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3), the exact ones where it has none."""
-        ...
-
-    def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
-        """The same, but NaN where it has no distance."""
-        ...
-
-
-class GpdfField:
-    """The paper's field (eq. 7 to 10, 12, 15): a GP with a Matern-1/2 kernel, in the log domain.
-
-    ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, radius and weight in the exponent, shifted by the largest
-    exponent: finite for every l and every mix of radii, where eq. 12 as printed (shifted by the nearest centre)
-    overflows for r / l > 88 in float32. With weights of either sign (cg) a sum that is not positive has no distance.
-    """
 
     def __init__(
         self,
@@ -91,11 +75,31 @@ class GpdfField:
         self._hold(Spheres.of(centers, radii), config, threads)
 
     @classmethod
-    def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> "GpdfField":
+    def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> Self:
         """The field of spheres that are already clustered."""
         field = cls.__new__(cls)
         field._hold(spheres, config, threads)
         return field
+
+    @abstractmethod
+    def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None: ...
+
+    @abstractmethod
+    def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
+        """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3); NaN where it has no distance."""
+
+    def query(self, points: Float64) -> tuple[Float64, Float64]:
+        """As `query_raw`, the exact distance and its gradient where it has no distance."""
+        return or_exact(self.query_raw(points), self.spheres, points)
+
+
+class GpdfField(LogSumExpField):
+    """The paper's field (eq. 7 to 10, 12, 15): a GP with a Matern-1/2 kernel, in the log domain.
+
+    ``f(x) = -l log sum_i w_i exp((r_i - |x - p_i|) / l)``, radius and weight in the exponent, shifted by the largest
+    exponent: finite for every l and every mix of radii, where eq. 12 as printed (shifted by the nearest centre)
+    overflows for r / l > 88 in float32. With weights of either sign (cg) a sum that is not positive has no distance.
+    """
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
         self.spheres = spheres
@@ -145,40 +149,14 @@ class GpdfField:
             threads=threads,
         )
 
-    def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """As `query_raw`, the exact distance and its gradient where the sum is not positive."""
-        return or_exact(self.query_raw(points), self.spheres, points)
 
-
-class SeField:
+class SeField(LogSumExpField):
     """The paper's Gaussian kernel in the log domain, with radii: no bias over an evenly sampled plane.
 
     ``f(x) = sqrt(-2 l^2 L) - sum_i pi_i r_i`` with ``L = log sum_i w_i exp(-|x - p_i|^2 / (2 l^2))`` and pi the
     shares of its terms. (As printed, ``k_d(-r) = k_d(r)`` loses the radius's sign.) It has no distance where L >= 0,
     which happens near and inside the surface.
     """
-
-    def __init__(
-        self,
-        centers: ArrayLike,
-        radii: ArrayLike,
-        length_scale: float = FieldConfig.length_scale,
-        *,
-        noise: float = FieldConfig.noise,
-        truncation: float = FieldConfig.truncation,
-        weights: str = FieldConfig.weights,
-        threads: int = 1,
-    ) -> None:
-        """centers (N, 3) [m], world; radii (N,) [m]; length_scale l and truncation [m]. Raises as `Spheres.of`."""
-        config = FieldConfig(length_scale=length_scale, noise=noise, truncation=truncation, weights=weights)
-        self._hold(Spheres.of(centers, radii), config, threads)
-
-    @classmethod
-    def over(cls, spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> "SeField":
-        """The field of spheres that are already clustered."""
-        field = cls.__new__(cls)
-        field._hold(spheres, config, threads)
-        return field
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
         self.spheres = spheres
@@ -246,10 +224,6 @@ class SeField:
             threads=threads,
         )
 
-    def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """As `query_raw`, the exact distance and its gradient where L >= 0."""
-        return or_exact(self.query_raw(points), self.spheres, points)
-
 
 class SafeField:
     """The smaller of the exact distance and a kernel field, with the gradient of whichever it is.
@@ -258,7 +232,7 @@ class SafeField:
     it, the result never exceeds the distance to the spheres. Where the kernel has no distance it is the exact one.
     """
 
-    def __init__(self, exact: DistanceField, kernel: KernelField) -> None:
+    def __init__(self, exact: DistanceField, kernel: LogSumExpField) -> None:
         self._exact, self._kernel = exact, kernel
         are_of_one = isinstance(exact, SphereField) and exact.spheres is kernel.spheres
         self._both = kernel if isinstance(kernel, SeField) and are_of_one else None
