@@ -1,13 +1,15 @@
-"""Boxes, cylinders and spheres: exact signed distance, nearest surface point, ray hits and normals.
+"""Boxes, cylinders, capsules and spheres: exact signed distance, nearest surface point, ray hits and normals.
 
-A primitive's own frame has its origin in its middle; a cylinder stands along z. R rays, Q points.
+A primitive's own frame has its origin in its middle; a cylinder or capsule stands along z. R rays, Q points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import interpolate_transform, invert_transform, transform_points
 from splatctrl_cli.records import Float64
 from splatctrl_cli.simulate.textures import Texture
 
@@ -15,10 +17,40 @@ ALWAYS = (-(2**62), 2**62)  # [ns] a span of time that holds every stamp
 
 
 @dataclass(frozen=True, kw_only=True)
-class Primitive:
-    """One solid: kind `box` (size = full x, y, z), `cylinder` (radius, height) or `sphere` (radius) [m].
+class Track:
+    """Poses (K, 4, 4) of a solid that moves, at increasing stamps (K,) int64 [ns]; at rest before and after.
 
-    T_world_shape (4, 4) places it; it is there while from_ns <= stamp < to_ns.
+    Between two stamps the origin moves on a straight line and the solid turns about one axis, both evenly.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    T_world_shape: Float64
+
+    def __post_init__(self) -> None:
+        if len(self.stamp_ns) == 0 or len(self.stamp_ns) != len(self.T_world_shape):
+            raise InputError(
+                f"track: expected a pose for every stamp, got {len(self.T_world_shape)} for {len(self.stamp_ns)}"
+            )
+        if np.any(np.diff(self.stamp_ns) <= 0):
+            raise InputError("track: expected stamps that increase")
+
+    def at(self, stamp_ns: int) -> Float64:
+        """T_world_shape (4, 4) at a stamp."""
+        after = int(np.searchsorted(self.stamp_ns, stamp_ns, side="right"))
+        if after in (0, len(self.stamp_ns)):
+            return np.asarray(self.T_world_shape[max(after - 1, 0)])
+        first, last = int(self.stamp_ns[after - 1]), int(self.stamp_ns[after])
+        share = (stamp_ns - first) / (last - first)
+        return interpolate_transform(self.T_world_shape[after - 1], self.T_world_shape[after], share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Primitive:
+    """One solid: kind `box` (size = full x, y, z), `cylinder` (radius, height), `sphere` (radius) or `capsule`
+    (radius, length of its axis) [m].
+
+    T_world_shape (4, 4) places it, or where it moves its first pose: `at` gives it as it stands at a stamp. It is
+    there while from_ns <= stamp < to_ns.
     """
 
     name: str
@@ -28,6 +60,13 @@ class Primitive:
     texture: Texture
     from_ns: int = ALWAYS[0]
     to_ns: int = ALWAYS[1]
+    track: Track | None = None
+
+    def at(self, stamp_ns: int) -> "Primitive":
+        """The solid as it stands at a stamp, without its track."""
+        if self.track is None:
+            return self
+        return replace(self, T_world_shape=self.track.at(stamp_ns), track=None)
 
     def is_present(self, stamp_ns: int) -> bool:
         """True while the solid is in the scene."""
@@ -38,6 +77,8 @@ class Primitive:
         """Radius [m] of the ball about its middle that holds it."""
         if self.kind == "box":
             return float(np.linalg.norm(self.size)) / 2
+        if self.kind == "capsule":
+            return self.size[0] + self.size[1] / 2
         return float(np.hypot(self.size[0], self.size[1] / 2)) if self.kind == "cylinder" else self.size[0]
 
 
@@ -50,6 +91,8 @@ def closest_point(primitive: Primitive, points_world: Float64) -> tuple[Float64,
         distance = np.linalg.norm(p, axis=1) - primitive.size[0]
     elif primitive.kind == "box":
         distance, surface = _box_closest(p, np.array(primitive.size) / 2)
+    elif primitive.kind == "capsule":
+        distance, surface = _capsule_closest(p, primitive.size[0], primitive.size[1] / 2)
     else:
         distance, surface = _cylinder_closest(p, primitive.size[0], primitive.size[1] / 2)
     return distance, transform_points(primitive.T_world_shape, surface)
@@ -80,6 +123,15 @@ def _cylinder_closest(p: Float64, radius: float, half: float) -> tuple[Float64, 
     return distance, np.column_stack([direction * surface[:, :1], surface[:, 2]])
 
 
+def _capsule_closest(p: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
+    on_axis = np.zeros_like(p)
+    on_axis[:, 2] = np.clip(p[:, 2], -half, half)
+    away = p - on_axis
+    length = np.linalg.norm(away, axis=1)
+    away[length == 0] = [1.0, 0.0, 0.0]
+    return length - radius, on_axis + away * (radius / np.where(length > 0, length, 1.0))[:, None]
+
+
 def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) -> Float64:
     """The ray parameter t (R,) of the first hit of origin + t * directions (R, 3), inf where there is none."""
     T_shape_world = invert_transform(primitive.T_world_shape)
@@ -90,10 +142,10 @@ def hit(primitive: Primitive, origin_world: Float64, directions_world: Float64) 
             near, far = _round_span(origin, directions, primitive.size[0])
         elif primitive.kind == "box":
             near, far = _slab_span(origin, directions, np.array(primitive.size) / 2)
+        elif primitive.kind == "capsule":
+            near, far = _capsule_span(origin, directions, primitive.size[0], primitive.size[1] / 2)
         else:
-            side = _round_span(origin[:2], directions[:, :2], primitive.size[0])
-            caps = _slab_span(origin[2:], directions[:, 2:], np.array([primitive.size[1] / 2]))
-            near, far = np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
+            near, far = _cylinder_span(origin, directions, primitive.size[0], primitive.size[1] / 2)
         return np.where((near <= far) & (near > 1e-6), near, np.inf)
 
 
@@ -101,6 +153,9 @@ def normals(primitive: Primitive, points_shape: Float64) -> Float64:
     """Outward unit normals (R, 3) at surface points (R, 3), both in the primitive's own frame."""
     if primitive.kind == "sphere":
         return points_shape / primitive.size[0]
+    if primitive.kind == "capsule":
+        half = np.array([0.0, 0.0, primitive.size[1] / 2])
+        return np.asarray((points_shape - np.clip(points_shape, -half, half)) / primitive.size[0])
     out = np.zeros_like(points_shape)
     rows = np.arange(len(points_shape))
     if primitive.kind == "box":
@@ -112,6 +167,25 @@ def normals(primitive: Primitive, points_shape: Float64) -> Float64:
     out[:, :2] = np.where(is_cap[:, None], 0, points_shape[:, :2] / radius)
     out[:, 2] = np.where(is_cap, np.sign(points_shape[:, 2]), 0)
     return out
+
+
+def _cylinder_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
+    """Where rays are inside a cylinder along z: t from, t to."""
+    side = _round_span(origin[:2], directions[:, :2], radius)
+    caps = _slab_span(origin[2:], directions[:, 2:], np.array([half]))
+    return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
+
+
+def _capsule_span(origin: Float64, directions: Float64, radius: float, half: float) -> tuple[Float64, Float64]:
+    """The same of a capsule: from the first to the last of its cylinder and its two balls, as it is convex."""
+    end = np.array([0.0, 0.0, half])
+    spans = [
+        _cylinder_span(origin, directions, radius, half),
+        *(_round_span(origin - side * end, directions, radius) for side in (-1.0, 1.0)),
+    ]
+    near = [np.where(a <= b, a, np.inf) for a, b in spans]
+    far = [np.where(a <= b, b, -np.inf) for a, b in spans]
+    return np.min(near, axis=0), np.max(far, axis=0)
 
 
 def _round_span(origin: Float64, directions: Float64, radius: float) -> tuple[Float64, Float64]:

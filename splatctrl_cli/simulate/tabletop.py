@@ -11,7 +11,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Float64, Intrinsics
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.simulate.motion import Motion
-from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.primitives import ALWAYS, Primitive
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.simulate.textures import Texture
 
@@ -148,10 +148,23 @@ def _box(
 
 
 def _cylinder(
-    name: str, radius: float, height: float, position: Sequence[float], texture: Texture, **span: int
+    name: str,
+    radius: float,
+    height: float,
+    position: Sequence[float],
+    texture: Texture,
+    from_ns: int = ALWAYS[0],
+    to_ns: int = ALWAYS[1],
 ) -> Primitive:
-    size = (radius, height)
-    return Primitive(name=name, kind="cylinder", size=size, T_world_shape=_placed(position), texture=texture, **span)
+    return Primitive(
+        name=name,
+        kind="cylinder",
+        size=(radius, height),
+        T_world_shape=_placed(position),
+        texture=texture,
+        from_ns=from_ns,
+        to_ns=to_ns,
+    )
 
 
 def _sphere(name: str, radius: float, position: Sequence[float], texture: Texture) -> Primitive:

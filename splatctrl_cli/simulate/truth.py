@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64, Intrinsics
-from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, closest_point
+from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Track, closest_point
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.simulate.textures import Texture
 
-FORMAT, VERSION = "splatctrl-truth", 1
-NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}
+FORMAT = "splatctrl-truth"
+VERSIONS = (1, 2)  # 2 has capsules and solids that move; a file is of the first that can hold it
+NUM_SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,7 @@ def closest_of(primitives: Sequence[Primitive], points_world: Float64, stamp_ns:
     surface = np.full((len(points), 3), np.nan)
     for primitive in primitives:
         if primitive.is_present(stamp_ns):
-            near, where = closest_point(primitive, points)
+            near, where = closest_point(primitive.at(stamp_ns), points)
             is_nearer = near < distance
             distance[is_nearer] = near[is_nearer]
             surface[is_nearer] = where[is_nearer]
@@ -70,7 +71,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
     """The truth as plain JSON values; `load_truth` reads them back unchanged."""
     return {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSIONS[_is_new(truth.primitives)],
         "frame": "world",
         "units": {"length": "m", "time": "ns", "angle": "rad"},
         "primitives": [_primitive_document(primitive) for primitive in truth.primitives],
@@ -108,9 +109,10 @@ def load_truth(path: Path) -> Truth:
     except ValueError as error:
         raise InputError(f"{path}: not valid JSON: {error}") from None
     is_ours = isinstance(document, dict) and document.get("format") == FORMAT
-    if not is_ours or document.get("version") != VERSION:
+    if not is_ours or document.get("version") not in VERSIONS:
         raise InputError(
-            f"{path}: expected {FORMAT} version {VERSION}", remedy="give the truth.json that simulate wrote"
+            f"{path}: expected {FORMAT} version {' or '.join(map(str, VERSIONS))}",
+            remedy="give the truth.json that simulate wrote",
         )
     try:
         return _parsed(path, document)
@@ -154,7 +156,23 @@ def _primitive_document(primitive: Primitive) -> dict[str, Any]:
         "from_ns": None if primitive.from_ns == ALWAYS[0] else primitive.from_ns,
         "to_ns": None if primitive.to_ns == ALWAYS[1] else primitive.to_ns,
         "texture": asdict(primitive.texture),
+        **({} if primitive.track is None else {"track": _track_document(primitive.track)}),
     }
+
+
+def _is_new(primitives: Sequence[Primitive]) -> bool:
+    return any(primitive.kind == "capsule" or primitive.track is not None for primitive in primitives)
+
+
+def _track_document(track: Track) -> dict[str, Any]:
+    return {"stamp_ns": track.stamp_ns.tolist(), "T_world_shape": track.T_world_shape.tolist()}
+
+
+def _track(entry: dict[str, Any] | None) -> Track | None:
+    if entry is None:
+        return None
+    poses = np.array([_pose(rows) for rows in entry["T_world_shape"]])
+    return Track(stamp_ns=np.array(entry["stamp_ns"], dtype=np.int64), T_world_shape=poses)
 
 
 def _primitive(entry: dict[str, Any]) -> Primitive:
@@ -169,6 +187,7 @@ def _primitive(entry: dict[str, Any]) -> Primitive:
         texture=Texture(**{**texture, "dark": tuple(texture["dark"]), "bright": tuple(texture["bright"])}),
         from_ns=ALWAYS[0] if entry["from_ns"] is None else entry["from_ns"],
         to_ns=ALWAYS[1] if entry["to_ns"] is None else entry["to_ns"],
+        track=_track(entry.get("track")),
     )
 
 

@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.records import Float64
-from splatctrl_cli.simulate.primitives import Primitive, closest_point, hit, normals, signed_distance
+from splatctrl_cli.simulate.primitives import Primitive, Track, closest_point, hit, normals, signed_distance
 from splatctrl_cli.simulate.textures import Texture
 
 PLAIN = Texture(pattern="noise", feature=0.1, dark=(0, 0, 0), bright=(1, 1, 1))
 TILTED = look_at([0.3, -0.2, 0.5], [1.0, 0.4, 0.1])
-SIZES = {"box": (0.2, 0.4, 0.6), "cylinder": (0.2, 0.6), "sphere": (0.3,)}
+SIZES = {"box": (0.2, 0.4, 0.6), "cylinder": (0.2, 0.6), "sphere": (0.3,), "capsule": (0.2, 0.3)}
 KINDS = sorted(SIZES)
 
 
@@ -30,6 +32,12 @@ def surface_samples(kind: str, rng: np.random.Generator, count: int = 200_000) -
         axis = rng.integers(0, 3, count)
         p[np.arange(count), axis] = np.sign(p[np.arange(count), axis])
         return p * np.array([0.1, 0.2, 0.3])
+    if kind == "capsule":
+        is_side = rng.uniform(size=count) < 0.5
+        axis = np.where(is_side, rng.uniform(-0.15, 0.15, count), np.copysign(0.15, direction[:, 2]))
+        direction[is_side, 2] = 0.0
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return 0.2 * direction + axis[:, None] * np.array([0, 0, 1])
     angle = rng.uniform(0, 2 * np.pi, count)
     is_side = rng.uniform(size=count) < 0.7
     rho = np.where(is_side, 0.2, 0.2 * np.sqrt(rng.uniform(size=count)))
@@ -50,6 +58,11 @@ def surface_samples(kind: str, rng: np.random.Generator, count: int = 200_000) -
         ("cylinder", (0, 0, 0), -0.2),
         ("cylinder", (0, 0.05, -0.28), -0.02),
         ("sphere", (0, 0.5, 0), 0.2),
+        ("capsule", (0.5, 0, 0.1), 0.3),
+        ("capsule", (0, 0, 0.5), 0.15),
+        ("capsule", (0.3, 0, 0.55), 0.3),
+        ("capsule", (0, 0, 0.1), -0.2),
+        ("capsule", (0, 0, 0.25), -0.1),
         ("sphere", (0, 0, 0), -0.3),
     ],
 )
@@ -125,3 +138,53 @@ def test_a_solid_is_present_from_its_first_stamp_to_before_its_last() -> None:
         name="a", kind="sphere", size=(1.0,), T_world_shape=np.eye(4), texture=PLAIN, from_ns=10, to_ns=20
     )
     assert [shape.is_present(t) for t in (9, 10, 19, 20)] == [False, True, True, False]
+
+
+def test_a_capsule_is_as_far_as_the_nearest_place_of_its_axis() -> None:
+    """Against the minimum over the axis in float64, found by ternary search."""
+    points = np.random.default_rng(6).uniform(-0.7, 0.7, (300, 3))
+    low, high = np.full(300, -0.15), np.full(300, 0.15)
+    for _ in range(120):
+        a, b = low + (high - low) / 3, high - (high - low) / 3
+        is_lower = np.hypot(np.hypot(*points[:, :2].T), points[:, 2] - a) < np.hypot(
+            np.hypot(*points[:, :2].T), points[:, 2] - b
+        )
+        low, high = np.where(is_lower, low, a), np.where(is_lower, b, high)
+    expected = np.hypot(np.hypot(*points[:, :2].T), points[:, 2] - low) - 0.2
+    np.testing.assert_allclose(signed_distance(solid("capsule"), points), expected, atol=1e-12)
+
+
+def track() -> Track:
+    poses = np.stack([np.eye(4), TILTED, look_at([0.1, 0.5, 0.4], [0.0, 0.0, 0.0])])
+    return Track(stamp_ns=np.array([100, 200, 400], dtype=np.int64), T_world_shape=poses)
+
+
+def test_a_track_moves_straight_and_turns_evenly_between_its_poses() -> None:
+    moves = track()
+    turn = Slerp(moves.stamp_ns, Rotation.from_matrix(moves.T_world_shape[:, :3, :3]))
+    for stamp in (100, 130, 200, 275, 400):
+        T = moves.at(stamp)
+        np.testing.assert_allclose(T[:3, :3], turn(stamp).as_matrix(), atol=1e-12)
+        expected = [np.interp(stamp, moves.stamp_ns, moves.T_world_shape[:, axis, 3]) for axis in range(3)]
+        np.testing.assert_allclose(T[:3, 3], expected, atol=1e-12)
+    np.testing.assert_array_equal(moves.at(0), moves.T_world_shape[0])
+    np.testing.assert_array_equal(moves.at(10**9), moves.T_world_shape[2])
+
+
+def test_a_solid_that_moves_is_where_its_track_is() -> None:
+    moving = Primitive(
+        name="a", kind="capsule", size=SIZES["capsule"], T_world_shape=np.eye(4), texture=PLAIN, track=track()
+    )
+    points = np.random.default_rng(7).uniform(-0.7, 0.7, (100, 3))
+    placed = moving.at(275)
+    assert placed.track is None
+    np.testing.assert_array_equal(
+        signed_distance(placed, points), signed_distance(solid("capsule", track().at(275)), points)
+    )
+
+
+def test_a_track_without_order_is_refused() -> None:
+    with pytest.raises(InputError, match="stamps that increase"):
+        Track(stamp_ns=np.array([5, 5], dtype=np.int64), T_world_shape=np.stack([np.eye(4)] * 2))
+    with pytest.raises(InputError, match="a pose for every stamp, got 1 for 2"):
+        Track(stamp_ns=np.array([5, 6], dtype=np.int64), T_world_shape=np.eye(4)[None])

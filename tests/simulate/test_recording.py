@@ -235,8 +235,8 @@ def test_where_nothing_is_the_distance_is_infinite(exact: Recording) -> None:
     ("text", "message"),
     [
         ("{", "not valid JSON"),
-        ("[]", "expected splatctrl-truth version 1"),
-        ('{"format": "splatctrl-truth", "version": 2}', "expected splatctrl-truth version 1"),
+        ("[]", "expected splatctrl-truth version 1 or 2"),
+        ('{"format": "splatctrl-truth", "version": 3}', "expected splatctrl-truth version 1 or 2"),
         ('{"format": "splatctrl-truth", "version": 1}', "damaged: KeyError"),
     ],
 )
