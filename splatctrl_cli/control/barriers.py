@@ -55,7 +55,7 @@ def pair_gradient(direction: Float64, jacobians: Float64, pairs: Index) -> Float
     return np.asarray(np.matmul(direction[:, None, :], relative)[:, 0, :])
 
 
-def barrier_bound(distance: Float64, *, margin: float, gain: float, rate: float | Float64 = 0.0) -> Float64:
+def barrier_bound(distance: Float64, *, margin: float | Float64, gain: float, rate: float | Float64 = 0.0) -> Float64:
     """h (M,) of the rows: ``alpha (d - epsilon) + dd/dt`` [m/s]; rate is dd/dt of a field that changes with time."""
     return np.asarray(gain * (distance - margin) + rate)
 

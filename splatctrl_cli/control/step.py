@@ -4,19 +4,17 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control import barriers, tasks
-from splatctrl_cli.control.arm import ArmModel, sphere_names
-from splatctrl_cli.control.barriers import Barrier
+from splatctrl_cli.control import tasks
+from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.checks import check_config, check_model, checked_posture
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import velocity_box
 from splatctrl_cli.control.presets import PAPER, PrintedTask, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named
+from splatctrl_cli.control.rows import RowBuilder, Rows
 from splatctrl_cli.control.target import Guide, pose_error, reference_velocity
-from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none
@@ -92,39 +90,6 @@ class ControlStep:
         return tuple(intervention.name for intervention in self.interventions)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Rows:
-    """Every barrier row at one configuration (M, external then self), and which of them the QP needs.
-
-    is_fixed: no joint velocity changes it; in_qp: not fixed, and some velocity of the box violates it.
-    """
-
-    external: Barrier
-    own: Barrier
-    margin: Float64
-    is_fixed: Bool
-    in_qp: Bool
-
-    @property
-    def distance(self) -> Float64:
-        return np.concatenate([self.external.distance, self.own.distance])
-
-    @property
-    def h(self) -> Float64:
-        return np.concatenate([self.external.h, self.own.h])
-
-    @property
-    def for_qp(self) -> tuple[Barrier, Barrier]:
-        num_external = len(self.external)
-        return self.external.select(self.in_qp[:num_external]), self.own.select(self.in_qp[num_external:])
-
-    def spread(self, values: Float64) -> Float64:
-        """Values of the QP's rows as values of all rows, zero elsewhere."""
-        everywhere = np.zeros(len(self.in_qp))
-        everywhere[self.in_qp] = values
-        return everywhere
-
-
 class QpIkController:
     """Drives a frame of an arm to a goal pose under the barrier rows of a distance field (paper, III-E)."""
 
@@ -144,21 +109,19 @@ class QpIkController:
         """
         check_config(config)
         check_model(model)
-        self._model, self._config, self._field, self._frame = model, config, field, frame
+        self._model, self._config, self._frame = model, config, frame
         self._solver: QpSolver = solver_named(config.solver) if solver is None else solver
         self._home = np.asarray(model.middle if home is None else home, dtype=np.float64)
-        self._moving = np.flatnonzero(model.moving_spheres)
-        self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
-        self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
+        self._builder = RowBuilder(model, config, field)
         self._limit_names = tuple(f"{joint} {side}" for side in ("highest", "lowest") for joint in model.joint_names)
-        self._row_names = _row_names(sphere_names(model.sphere_set), self._moving, self._pairs)
+        self._row_names = self._builder.names
         weight = np.repeat([config.weight_linear, config.weight_angular], 3)
         self._weight = tasks.eliminated_weight(weight, config.weight_kinematics * weight)
 
     def with_field(self, field: DistanceField) -> "QpIkController":
         """The same controller on another field (a newer scene)."""
         other = object.__new__(QpIkController)
-        other.__dict__.update(self.__dict__, _field=field)
+        other.__dict__.update(self.__dict__, _builder=self._builder.with_field(field))
         return other
 
     def step(
@@ -179,7 +142,7 @@ class QpIkController:
         model, config = self._model, self._config
         error = pose_error(model.frame_pose(q, self._frame), T_world_goal)
         box = velocity_box(q, model.lower, model.upper, model.velocity_limit, config.barrier_gain)
-        rows = self._rows(q, box, distance_rate)
+        rows = self._builder.at(q, box, distance_rate)
         aim = self._aim(q, error, guide)
         if config.preset == PAPER:
             printed = self._printed(q, aim, box, rows)
@@ -192,18 +155,9 @@ class QpIkController:
 
         Raises as `step`.
         """
-        q, config, model = checked_posture(self._model, q), self._config, self._model
-        centers, jacobians = model.spheres_at(q)
-        distance, gradient = self._queried(centers)
-        between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
-        motion = jacobians @ velocity
-        apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
-        gain = config.barrier_gain
-        scene = barriers.barrier_bound(distance, margin=config.margin, gain=gain, rate=distance_rate)
-        own = barriers.barrier_bound(between, margin=config.self_margin, gain=gain)
-        room = np.concatenate(
-            [scene + np.sum(gradient * motion[self._moving], axis=1), own + np.sum(direction * apart, axis=1)]
-        )
+        q, model = checked_posture(self._model, q), self._model
+        room = self._builder.room(q, velocity, distance_rate)
+        gain = self._config.barrier_gain
         lowest, highest = velocity_box(q, model.lower, model.upper, model.velocity_limit, gain)
         limits = np.concatenate([highest - velocity, velocity - lowest])
         row, limit = int(np.argmin(room)), int(np.argmin(limits))
@@ -230,7 +184,7 @@ class QpIkController:
             tasks.posture_task(lean, self._config.posture_weight),
         ]
 
-    def _printed(self, q: Float64, aim: tuple[Float64, Float64], box: tuple[Float64, Float64], rows: _Rows) -> Choice:
+    def _printed(self, q: Float64, aim: tuple[Float64, Float64], box: tuple[Float64, Float64], rows: Rows) -> Choice:
         """The answer of the program as the paper prints it."""
         config = self._config
         weight = np.repeat([config.weight_linear, config.weight_angular], 3)
@@ -243,62 +197,7 @@ class QpIkController:
         posture = tasks.posture_task(aim[1], config.posture_weight)
         return solve_printed(self._solver, task, posture, box, rows.for_qp, config)
 
-    def _rows(self, q: Float64, box: tuple[Float64, Float64], distance_rate: float | Float64) -> _Rows:
-        """Every barrier row at q: gradient and distance come from one query of one function."""
-        config = self._config
-        centers, jacobians = self._model.spheres_at(q)
-        distance, gradient = self._queried(centers)
-        between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
-        external = Barrier(
-            index=self._moving,
-            G=-barriers.external_gradient(gradient, jacobians[self._moving]),
-            h=barriers.barrier_bound(distance, margin=config.margin, gain=config.barrier_gain, rate=distance_rate),
-            distance=distance,
-            slack_cost=config.slack_cost,
-            slack_weight=config.weight_slack,
-        )
-        own_h = barriers.barrier_bound(between, margin=config.self_margin, gain=config.barrier_gain)
-        own = Barrier(
-            index=np.arange(len(self._pairs)),
-            G=-self._pair_gradient(direction, jacobians, own_h, box),
-            h=own_h,
-            distance=between,
-            slack_cost=config.self_slack_cost,
-            slack_weight=config.weight_slack,
-        )
-        both = (external, own)
-        is_fixed = np.concatenate([barriers.is_immovable(b.G, self._model.velocity_limit) for b in both])
-        can_bind = np.concatenate([barriers.can_bind(b.G, b.h, *box) for b in both])
-        margin = np.repeat([config.margin, config.self_margin], [len(external), len(own)])
-        return _Rows(external=external, own=own, margin=margin, is_fixed=is_fixed, in_qp=can_bind & ~is_fixed)
-
-    def _pair_gradient(
-        self, direction: Float64, jacobians: Float64, h: Float64, box: tuple[Float64, Float64]
-    ) -> Float64:
-        """``dd/dq`` (P, J) of the pairs whose spheres are fast enough to use up h; zero for the others, which no
-        velocity of the box brings to bind.
-        """
-        speed = barriers.fastest_spheres(jacobians, *box)
-        near = np.flatnonzero(h <= speed[self._pairs[:, 0]] + speed[self._pairs[:, 1]])
-        gradient = np.zeros((len(h), jacobians.shape[2]))
-        gradient[near] = barriers.pair_gradient(direction[near], jacobians, self._pairs[near])
-        return gradient
-
-    def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
-        """Distance (M,) of the moving spheres' surfaces and the field's gradient (M, 3) at their centres."""
-        points = np.ascontiguousarray(centers[self._moving])
-        distance, gradient = self._field.query(points)
-        bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
-        if np.any(bad):
-            first = int(np.argmax(bad))
-            where = ", ".join(f"{v:.3f}" for v in points[first])
-            raise NotEvaluableError(
-                f"sphere {self._row_names[first]} at ({where}) m: the field has no distance there",
-                remedy="bake a field that covers the robot's reach",
-            )
-        return distance - self._radii[self._moving], gradient
-
-    def _kept_scale(self, q: Float64, choice: Choice, rows: _Rows) -> float:
+    def _kept_scale(self, q: Float64, choice: Choice, rows: Rows) -> float:
         """The largest of SCALES whose next distances are no worse than the rows promised, else 0.
 
         A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
@@ -309,17 +208,11 @@ class QpIkController:
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
         floor = np.minimum(promised, rows.distance) - config.promise_tolerance
         for scale in SCALES:
-            if np.all(self._distances(q + scale * config.period * choice.velocity) >= floor):
+            if np.all(self._builder.distances(q + scale * config.period * choice.velocity) >= floor):
                 return scale
         return 0.0
 
-    def _distances(self, q: Float64) -> Float64:
-        """Every row's distance at q; NaN where the field has none, which keeps no promise."""
-        centers = self._model.sphere_centers(q)
-        distance = self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii[self._moving]
-        return np.concatenate([distance, barriers.pair_distance(centers, self._radii, self._pairs)[0]])
-
-    def _reported(self, error: Float64, rows: _Rows, choice: Choice, scale: float) -> ControlStep:
+    def _reported(self, error: Float64, rows: Rows, choice: Choice, scale: float) -> ControlStep:
         """The step, with its rows by name."""
         slack = rows.spread(choice.slack)
         return ControlStep(
@@ -342,11 +235,11 @@ class QpIkController:
             num_refused=choice.num_refused,
         )
 
-    def _interventions(self, choice: Choice, rows: _Rows) -> tuple[Intervention, ...]:
+    def _interventions(self, choice: Choice, rows: Rows) -> tuple[Intervention, ...]:
         """The limits and barrier rows whose multiplier is not zero."""
         multipliers = np.concatenate([choice.box_multipliers, rows.spread(choice.row_multipliers)])
         names, num_limits = (*self._limit_names, *self._row_names), len(self._limit_names)
-        num_scene = num_limits + len(self._moving)
+        num_scene = num_limits + self._builder.num_external
         return tuple(
             Intervention(
                 name=names[i],
@@ -358,8 +251,3 @@ class QpIkController:
 
     def _named(self, rows: Bool) -> tuple[str, ...]:
         return tuple(self._row_names[i] for i in np.flatnonzero(rows))
-
-
-def _row_names(spheres: tuple[str, ...], moving: NDArray[np.integer], pairs: NDArray[np.integer]) -> tuple[str, ...]:
-    """Names of the barrier rows: moving spheres, then pairs."""
-    return tuple(spheres[s] for s in moving) + tuple(f"{spheres[a]}~{spheres[b]}" for a, b in pairs)

@@ -1,0 +1,155 @@
+"""Every barrier row of III-E at a configuration: one for each moving sphere, then one for each pair of spheres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control import barriers
+from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.barriers import Barrier
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.records import Bool, DistanceField, Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """The rows at one configuration (M, external then self), and which of them the QP needs.
+
+    margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not fixed, and some velocity of the box violates
+    it.
+    """
+
+    external: Barrier
+    own: Barrier
+    margin: Float64
+    is_fixed: Bool
+    in_qp: Bool
+
+    @property
+    def distance(self) -> Float64:
+        return np.concatenate([self.external.distance, self.own.distance])
+
+    @property
+    def h(self) -> Float64:
+        return np.concatenate([self.external.h, self.own.h])
+
+    @property
+    def for_qp(self) -> tuple[Barrier, Barrier]:
+        num_external = len(self.external)
+        return self.external.select(self.in_qp[:num_external]), self.own.select(self.in_qp[num_external:])
+
+    def spread(self, values: Float64) -> Float64:
+        """Values of the QP's rows as values of all rows, zero elsewhere."""
+        everywhere = np.zeros(len(self.in_qp))
+        everywhere[self.in_qp] = values
+        return everywhere
+
+
+class RowBuilder:
+    """Builds the rows of an arm in a distance field; names (M,) say which sphere or pair a row guards."""
+
+    def __init__(self, model: ArmModel, config: ControlConfig, field: DistanceField) -> None:
+        self._model, self._config, self._field = model, config, field
+        self._moving = np.flatnonzero(model.moving_spheres)
+        self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
+        self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
+        self._margin = np.repeat([config.margin, config.self_margin], [len(self._moving), len(self._pairs)])
+        self.names = _row_names(sphere_names(model.sphere_set), self._moving, self._pairs)
+
+    @property
+    def num_external(self) -> int:
+        """Rows against the scene; they come first."""
+        return len(self._moving)
+
+    def with_field(self, field: DistanceField) -> "RowBuilder":
+        """The same rows in another field."""
+        other = object.__new__(RowBuilder)
+        other.__dict__.update(self.__dict__, _field=field)
+        return other
+
+    def at(self, q: Float64, box: tuple[Float64, Float64], distance_rate: float | Float64) -> Rows:
+        """Every barrier row at q: gradient and distance come from one query of one function."""
+        config = self._config
+        centers, jacobians = self._model.spheres_at(q)
+        distance, gradient = self._queried(centers)
+        between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
+        external = Barrier(
+            index=self._moving,
+            G=-barriers.external_gradient(gradient, jacobians[self._moving]),
+            h=self._external_bound(distance, distance_rate),
+            distance=distance,
+            slack_cost=config.slack_cost,
+            slack_weight=config.weight_slack,
+        )
+        own_h = self._own_bound(between)
+        own = Barrier(
+            index=np.arange(len(self._pairs)),
+            G=-self._pair_gradient(direction, jacobians, own_h, box),
+            h=own_h,
+            distance=between,
+            slack_cost=config.self_slack_cost,
+            slack_weight=config.weight_slack,
+        )
+        both = (external, own)
+        is_fixed = np.concatenate([barriers.is_immovable(b.G, self._model.velocity_limit) for b in both])
+        can_bind = np.concatenate([barriers.can_bind(b.G, b.h, *box) for b in both])
+        return Rows(external=external, own=own, margin=self._margin, is_fixed=is_fixed, in_qp=can_bind & ~is_fixed)
+
+    def room(self, q: Float64, velocity: Float64, distance_rate: float | Float64) -> Float64:
+        """``h - G v`` (M,) [m/s] of every row at q for a velocity (J,)."""
+        centers, jacobians = self._model.spheres_at(q)
+        distance, gradient = self._queried(centers)
+        between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
+        motion = jacobians @ velocity
+        apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
+        scene = self._external_bound(distance, distance_rate)
+        own = self._own_bound(between)
+        return np.concatenate(
+            [scene + np.sum(gradient * motion[self._moving], axis=1), own + np.sum(direction * apart, axis=1)]
+        )
+
+    def distances(self, q: Float64) -> Float64:
+        """Every row's distance (M,) [m] at q; NaN where the field has none, which keeps no promise."""
+        centers = self._model.sphere_centers(q)
+        distance = self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii[self._moving]
+        return np.concatenate([distance, barriers.pair_distance(centers, self._radii, self._pairs)[0]])
+
+    def _external_bound(self, distance: Float64, distance_rate: float | Float64) -> Float64:
+        margin = self._margin[: self.num_external]
+        return barriers.barrier_bound(distance, margin=margin, gain=self._config.barrier_gain, rate=distance_rate)
+
+    def _own_bound(self, distance: Float64) -> Float64:
+        return barriers.barrier_bound(distance, margin=self._config.self_margin, gain=self._config.barrier_gain)
+
+    def _pair_gradient(
+        self, direction: Float64, jacobians: Float64, h: Float64, box: tuple[Float64, Float64]
+    ) -> Float64:
+        """``dd/dq`` (P, J) of the pairs whose spheres are fast enough to use up h; zero for the others, which no
+        velocity of the box brings to bind.
+        """
+        speed = barriers.fastest_spheres(jacobians, *box)
+        near = np.flatnonzero(h <= speed[self._pairs[:, 0]] + speed[self._pairs[:, 1]])
+        gradient = np.zeros((len(h), jacobians.shape[2]))
+        gradient[near] = barriers.pair_gradient(direction[near], jacobians, self._pairs[near])
+        return gradient
+
+    def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
+        """Distance (M,) of the moving spheres' surfaces and the field's gradient (M, 3) at their centres."""
+        points = np.ascontiguousarray(centers[self._moving])
+        distance, gradient = self._field.query(points)
+        bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
+        if np.any(bad):
+            first = int(np.argmax(bad))
+            where = ", ".join(f"{v:.3f}" for v in points[first])
+            raise NotEvaluableError(
+                f"sphere {self.names[first]} at ({where}) m: the field has no distance there",
+                remedy="bake a field that covers the robot's reach",
+            )
+        return distance - self._radii[self._moving], gradient
+
+
+def _row_names(spheres: tuple[str, ...], moving: NDArray[np.integer], pairs: NDArray[np.integer]) -> tuple[str, ...]:
+    """Names of the barrier rows: moving spheres, then pairs."""
+    return tuple(spheres[s] for s in moving) + tuple(f"{spheres[a]}~{spheres[b]}" for a, b in pairs)
