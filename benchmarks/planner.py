@@ -84,7 +84,7 @@ def _followed(solved: Solved, room: Clearance) -> tuple[TrackingRun, TrackingRun
     path = timed(solved.plan.waypoints, room.model.velocity_limit, planner.max_acceleration)
     slow = timed(solved.plan.waypoints, room.model.velocity_limit / 4, planner.max_acceleration)
     joints = follow_joints(path, room, FRAME, planner, control)
-    return joints, follow_with_controller(slow, room, solved.problem.scene, FRAME, planner, control)
+    return joints, follow_with_controller(slow, room, lambda stamp_ns: solved.problem.scene, FRAME, planner, control)
 
 
 def _edge_checks(clearance: Clearance, problems: Sequence[Problem]) -> dict[str, float]:

@@ -131,6 +131,7 @@ class ControlConfig:
     preset: str = "reduced"  # or paper: III-E as printed, with barrier_gain = 1 and without a second look
     solver: str = "clarabel"  # of the QP; or daqp: an active-set method, several times as fast
     margin: float = 0.02  # [m] epsilon, IV-C
+    coverage: str = "report"  # of the spheres: say what they leave uncovered; or margin: keep that much more, too
     period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
     barrier_gain: float = 10.0  # [1/s] alpha of every limit and barrier row; 1 (as printed) takes 1.4 times as long
     self_margin: float = 0.02  # [m] epsilon of the self-collision rows, III-E
@@ -162,16 +163,17 @@ class ControlConfig:
 class PlannerConfig:
     """IV: the sampling-based planner (BiRRT) that the controller is compared with."""
 
+    seed: int = 0  # of samples and shortcuts; the same seed, the same path
+    goal_postures: int = 8  # of a goal pose, sought from twice as many guesses; a path may end in any
     contact: float = 1e-4  # [m] clearance above the margin that a posture needs; bounds the checks of a grazing edge
     batch: int = 8  # samples per iteration, whose edges are checked together
     reach: float = 1.5  # [rad] longest edge grown towards a sample, in joint space
     shortest: float = 0.1  # [rad] shortest edge that is worth a node
-    max_iterations: int = 4000
-    max_time: float = 10.0  # [s]
+    max_iterations: int = 4000  # then a search ends as out-of-iterations
+    max_time: float = 10.0  # [s], then as out-of-time: the only thing here that depends on the machine
     shortcut_rounds: int = 4  # of random shortcuts, after the greedy ones
     shortcut_batch: int = 8  # shortcuts tried per round
     max_acceleration: float = 7.5  # [rad/s^2] of every joint: the least of the Panda's
-    period: float = 0.01  # [s] of the loop that follows a path
     follow_gain: float = 10.0  # [1/s] joint error to joint velocity, where a path is followed in joint space
     wait_distance: float = 0.05  # [m] the reference waits while the end effector is this far behind it
     limit_tolerance: float = 1e-3  # [rad] a start or goal this far outside a joint limit is encoder noise
@@ -186,6 +188,7 @@ class Config:
     occupancy: OccupancyConfig = dataclasses.field(default_factory=OccupancyConfig)
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     control: ControlConfig = dataclasses.field(default_factory=ControlConfig)
+    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values, as written to ``run.json``."""
@@ -222,6 +225,8 @@ _POSITIVE = (
     *("occupancy.log_odds_hit", "occupancy.log_odds_limit", "field.voxel", "field.length_scale", "field.error"),
     *("gaussians.max_gaussians", "gaussians.lr_center", "gaussians.lr_center_final", "gaussians.densify_every"),
     *("gaussians.split_shrink", "gaussians.max_screen_radius", "gaussians.max_size_share"),
+    *("planner.goal_postures", "planner.contact", "planner.batch", "planner.reach", "planner.shortest"),
+    *("planner.shortcut_batch", "planner.max_acceleration", "planner.wait_distance"),
 )
 _AT_LEAST_ZERO = (
     *("gaussians.iterations", "gaussians.max_degree", "gaussians.degree_every", "gaussians.lr_log_scale"),
@@ -242,6 +247,8 @@ _AT_LEAST_ZERO = (
         "field.padding",
         "scene.noise",
     ),
+    *("planner.seed", "planner.max_iterations", "planner.max_time", "planner.shortcut_rounds"),
+    *("planner.follow_gain", "planner.limit_tolerance"),
 )
 _SHARES = (
     *("scene.initial_opacity", "scene.min_opacity"),
@@ -255,6 +262,7 @@ _CHOICES = {
     "field.unknown": ("free", "obstacle", "nan"),
     "field.probability": ("calibrated", "paper"),
     "control.preset": ("reduced", "paper"),
+    "control.coverage": ("report", "margin"),
     "control.solver": ("clarabel", "daqp"),
     "control.distance_rate": ("none", "snapshots"),
 }

@@ -65,11 +65,12 @@ class Clearance:
         model: PlanningArm,
         scene: HasDistance,
         *,
-        margin: float = 0.0,
+        margin: float | Float64 = 0.0,
         self_margin: float = 0.0,
         lipschitz: float = 1.0,
     ) -> "Clearance":
-        """The clearance of an arm in a scene; margins [m] are taken off the distances, to the scene and to itself.
+        """The clearance of an arm in a scene; margins [m] are taken off the distances, to the scene (one number, or
+        (S,) of every sphere) and to itself.
 
         Raises InputError where no sphere moves.
         """
@@ -81,7 +82,7 @@ class Clearance:
         return cls(
             model=model,
             scene=scene,
-            taken=np.concatenate([radii[moving] + margin, radii[pairs].sum(axis=1) + self_margin]),
+            taken=np.concatenate([(radii + margin)[moving], radii[pairs].sum(axis=1) + self_margin]),
             moving=moving,
             pairs=pairs,
             levers=np.concatenate([lipschitz * levers[moving], _between(levers, pairs)]),

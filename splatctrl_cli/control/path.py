@@ -17,6 +17,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
 
 MAX_PIECES = 200_000  # of a path, when its clearance is proved
+SPACING = 0.05  # [rad] of the samples that the speed of a frame is looked at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +109,27 @@ class TimedPath:
         return self.waypoints[edge] + share[:, None] * motion, rate[:, None] * motion
 
 
-def timed(waypoints: Float64, velocity_limit: Float64, max_acceleration: float) -> TimedPath:
-    """The fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2].
+def effector_rates(
+    model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
+) -> Float64:
+    """(W - 1,) shares of each edge per second at which a frame keeps to speeds [m/s] and [rad/s], at samples
+    `SPACING` apart; infinite where an edge does not move it.
+    """
+    rates = np.full(len(waypoints) - 1, np.inf)
+    for edge, ends in enumerate(pairwise(waypoints)):
+        for q in resampled(np.array(ends), SPACING):
+            twist = model.frame_jacobian(q, frame) @ (ends[1] - ends[0])
+            for part, limit in ((twist[:3], max_linear), (twist[3:], max_angular)):
+                speed = float(np.linalg.norm(part))
+                rates[edge] = min(rates[edge], limit / speed if speed > 0 else np.inf)
+    return rates
+
+
+def timed(
+    waypoints: Float64, velocity_limit: Float64, max_acceleration: float, *, max_rate: Float64 | None = None
+) -> TimedPath:
+    """The fastest trapezoids within velocity_limit (J,) [rad/s] and max_acceleration [rad/s^2], and where it is given
+    within max_rate (W - 1,), the share of each edge per second.
 
     Raises InputError for fewer than two waypoints or limits that are not above zero.
     """
@@ -118,9 +138,11 @@ def timed(waypoints: Float64, velocity_limit: Float64, max_acceleration: float) 
     if not (np.min(velocity_limit) > 0 and max_acceleration > 0):
         raise InputError("path: expected velocity and acceleration limits above 0")
     motion = np.abs(np.diff(waypoints, axis=0))
-    motion = motion[np.max(motion, axis=1) > 0]
-    is_new = np.r_[True, np.max(np.abs(np.diff(waypoints, axis=0)), axis=1) > 0]
+    is_long = np.max(motion, axis=1) > 0
+    motion, is_new = motion[is_long], np.r_[True, is_long]
     speed = np.min(velocity_limit / np.maximum(motion, 1e-12), axis=1)
+    if max_rate is not None:
+        speed = np.minimum(speed, max_rate[is_long])
     acceleration = max_acceleration / np.max(motion, axis=1)
     speed = np.minimum(speed, np.sqrt(acceleration))  # a short edge is a triangle
     seconds = 1.0 / speed + speed / acceleration

@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.path import effector_length, joint_length, least_clearance, resampled, timed
+from splatctrl_cli.control.path import (
+    effector_length,
+    effector_rates,
+    joint_length,
+    least_clearance,
+    resampled,
+    timed,
+)
 from splatctrl_cli.control.planner import plan
 from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.errors import InputError
@@ -60,6 +67,23 @@ def test_a_path_of_one_place_or_without_limits_is_refused() -> None:
         timed(PATH, np.zeros(2), 3.0)
 
 
+def test_a_path_keeps_the_speed_of_a_frame_too() -> None:
+    rates = effector_rates(ARM, PATH, "tip", max_linear=0.2, max_angular=0.5)
+    path = timed(PATH, ARM.velocity_limit, 7.5, max_rate=rates)
+    assert path.duration > timed(PATH, ARM.velocity_limit, 7.5).duration
+    twists = np.array(
+        [ARM.frame_jacobian(q, "tip") @ v for q, v in zip(*path.at(np.arange(0, path.duration, 0.01)), strict=True)]
+    )
+    linear, angular = np.linalg.norm(twists[:, :3], axis=1), np.linalg.norm(twists[:, 3:], axis=1)
+    assert linear.max() < 0.2 * 1.001 and angular.max() < 0.5 * 1.001
+    assert linear.max() > 0.199 or angular.max() > 0.499
+
+
+def test_an_edge_that_leaves_a_frame_where_it_is_has_no_rate() -> None:
+    still = effector_rates(ARM, np.array([[0.1, 0.2], [0.1, 0.2]]), "tip", max_linear=0.2, max_angular=0.5)
+    assert still == np.inf
+
+
 def test_a_path_is_followed_to_its_end_by_the_joints() -> None:
     room = clearance(one_wall(), margin=0.02)
     planned = plan(room, PATH[0], np.array([-0.7, -0.2]), PlannerConfig())
@@ -76,6 +100,6 @@ def test_a_path_is_followed_to_its_end_by_the_controller() -> None:
     field = Balls([[0.62, 0.31, 0.0]], [0.002])
     planned = plan(room, np.array([1.2, 0.3]), np.array([-0.4, 0.5]), PlannerConfig())
     path = timed(planned.waypoints, ARM.velocity_limit / 3, 3.0)
-    run = follow_with_controller(path, room, field, "tip", PlannerConfig(), ControlConfig())
+    run = follow_with_controller(path, room, lambda stamp_ns: field, "tip", PlannerConfig(), ControlConfig())
     assert run.has_arrived
     assert run.least_clearance > -0.01 - 1e-3  # of 0.03: the controller keeps 0.02

@@ -1,0 +1,97 @@
+"""A path planned for a replay's task: from its start to a pose, in the scene known at that time. J joints."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig, PlannerConfig
+from splatctrl_cli.control.advancement import check_edges
+from splatctrl_cli.control.clearance import Clearance, HasDistance, PlanningArm
+from splatctrl_cli.control.goal_postures import goal_postures
+from splatctrl_cli.control.path import TimedPath, effector_rates, timed
+from splatctrl_cli.control.planner import PlanOutcome, plan
+from splatctrl_cli.control.replay import ReplayTask
+from splatctrl_cli.records import Float64
+
+NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision", "goal-in-collision"
+ROOM = 1e-3  # [m] left to move in where the start or goal stands within a margin
+GUESSES = 2  # per goal posture that is looked for
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedPath:
+    """A path with a clock, None where outcome says why there is none.
+
+    margin, self_margin [m]: those it was planned with, less than asked for where the start or the goal stands nearer.
+    num_proved of its num_edges edges are proved free. seconds [s]: of planning, goal postures included.
+    """
+
+    outcome: str
+    path: TimedPath | None
+    clearance: Clearance
+    margin: float
+    self_margin: float
+    num_edges: int
+    num_proved: int
+    seconds: float
+
+
+def planned_path(
+    model: PlanningArm, scene: HasDistance, task: ReplayTask, planner: PlannerConfig, control: ControlConfig
+) -> PlannedPath:
+    """A path from the task's start to its goal pose, at most as fast as the controller may drive its frame.
+
+    scene gives a lower bound of a 1-Lipschitz distance: then every edge is proved. The postures at the goal are
+    sought from the task's home, the start, and random ones.
+    """
+    began = time.perf_counter()
+    room, start, frame = Clearance.of(model, scene), task.start, task.frame
+    random = np.random.default_rng(planner.seed)
+    drawn = random.uniform(model.lower, model.upper, (GUESSES * planner.goal_postures, len(start)))
+    guesses = np.vstack([model.middle if task.home is None else task.home, start, drawn])
+    goals = goal_postures(model, frame, task.T_world_goal, guesses, control, at_most=planner.goal_postures)
+    margin, own, outcome = np.nan, np.nan, NO_POSTURE
+    if len(goals):
+        margin, own, goals = _margins(room, start, goals, control)
+        outcome = START_BLOCKED if len(goals) else GOAL_BLOCKED
+    path, num_proved, num_edges = None, 0, 0
+    if min(margin, own) > 0:
+        room = Clearance.of(model, scene, margin=margin, self_margin=own)
+        found = plan(room, np.clip(start, model.lower, model.upper), goals, planner, seed=planner.seed)
+        outcome = found.outcome
+        if found.outcome is PlanOutcome.SOLVED:
+            way = found.waypoints
+            rates = effector_rates(
+                model, way, frame, max_linear=control.max_linear_speed, max_angular=control.max_angular_speed
+            )
+            path = timed(way, model.velocity_limit, planner.max_acceleration, max_rate=rates)
+            check = check_edges(room, way[:-1], way[1:], contact=0.0)
+            num_edges, num_proved = len(check.free_share), int(np.sum(check.is_free))
+    return PlannedPath(
+        outcome=outcome,
+        path=path,
+        clearance=room,
+        margin=margin,
+        self_margin=own,
+        num_edges=num_edges,
+        num_proved=num_proved,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlConfig) -> tuple[float, float, Float64]:
+    """The margins to the scene and of the pairs that the start and a goal (G, J) keep, and the goals that keep them;
+    where a margin is not above 0, the goals are none if none of them is free.
+    """
+    rows = room.rows(np.vstack([start, goals])) - ROOM
+    num = len(room.moving)
+    scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)
+    margin, self_margin = min(control.margin, float(scene[0])), min(control.self_margin, float(own[0]))
+    short = np.maximum(margin - scene[1:], self_margin - own[1:])
+    if np.min(short) > 0:  # no goal keeps what the start keeps: as much as the best one does
+        best = int(np.argmin(short))
+        margin, self_margin = min(margin, float(scene[1 + best])), min(self_margin, float(own[1 + best]))
+    keeps = (scene[1:] >= margin) & (own[1:] >= self_margin)
+    is_free = (scene[1:] > 0) & (own[1:] > 0)
+    return margin, self_margin, goals[keeps & is_free]

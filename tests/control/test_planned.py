@@ -1,0 +1,86 @@
+"""A replay's task planned: postures at a goal pose, margins that the start and goal allow, and proved edges."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig, PlannerConfig
+from splatctrl_cli.control.goal_postures import goal_postures
+from splatctrl_cli.control.path import least_clearance
+from splatctrl_cli.control.planned import GOAL_BLOCKED, NO_POSTURE, START_BLOCKED, planned_path
+from splatctrl_cli.control.replay import ReplayTask, is_at_goal
+from splatctrl_cli.control.solids import Ball, Solids
+from splatctrl_cli.control.target import pose_error
+from splatctrl_cli.records import Float64
+from tests.control.walls import LeveredArm, one_wall
+
+ARM = LeveredArm()
+CONFIG, PLANNER = ControlConfig(), PlannerConfig(max_iterations=300, max_time=60.0)
+START, GOAL = np.array([0.7, 0.2]), np.array([-0.7, -0.2])
+
+
+def task(start: Float64 = START, goal: Float64 = GOAL) -> ReplayTask:
+    return ReplayTask(start=start, T_world_goal=ARM.frame_pose(goal, "tip"), frame="tip")
+
+
+def ball(x: float, y: float, radius: float = 0.05) -> Solids:
+    return Solids(solids=[Ball(center=np.array([x, y, 0.0]), radius=radius)])
+
+
+def test_goal_postures_bring_the_frame_to_the_pose_and_keep_the_limits() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        wanted = random.uniform(ARM.lower, ARM.upper)
+        T = ARM.frame_pose(wanted, "tip")
+        guesses = np.vstack([wanted + random.normal(size=2) / 4, random.uniform(ARM.lower, ARM.upper, (12, 2))])
+        found = goal_postures(ARM, "tip", T, guesses, CONFIG, at_most=5)
+        assert 1 <= len(found) <= 5
+        for q in found:
+            assert is_at_goal(10 * pose_error(ARM.frame_pose(q, "tip"), T), CONFIG)
+            assert np.all((q >= ARM.lower) & (q <= ARM.upper))
+
+
+def test_a_pose_out_of_reach_has_no_posture() -> None:
+    T = np.eye(4)
+    T[0, 3] = 1.5
+    assert goal_postures(ARM, "tip", T, np.array([[0.1, 0.2], [1.0, 1.0]]), CONFIG, at_most=5).shape == (0, 2)
+    far = replace(task(), T_world_goal=T)
+    found = planned_path(ARM, one_wall(), far, PLANNER, CONFIG)
+    assert (found.outcome, found.path) == (NO_POSTURE, None)
+
+
+def test_a_planned_path_keeps_the_controllers_margin_and_speed() -> None:
+    found = planned_path(ARM, one_wall(), task(), PLANNER, CONFIG)
+    assert found.outcome == "solved" and found.path is not None
+    assert found.num_proved == found.num_edges == len(found.path.waypoints) - 1
+    assert (found.margin, found.self_margin) == (CONFIG.margin, CONFIG.self_margin)
+    assert least_clearance(found.clearance, found.path.waypoints).lower > -1e-3
+    assert found.clearance.at(START[None])[0] < 0.5  # less its margin, of a wall that is there
+    assert is_at_goal(pose_error(ARM.frame_pose(found.path.waypoints[-1], "tip"), task().T_world_goal), CONFIG)
+    positions, velocities = found.path.at(np.arange(0.0, found.path.duration, 0.01))
+    speeds = [
+        np.linalg.norm((ARM.frame_jacobian(q, "tip") @ v)[:3]) for q, v in zip(positions, velocities, strict=True)
+    ]
+    assert max(speeds) < CONFIG.max_linear_speed * 1.01
+
+
+def test_a_start_within_the_margin_is_planned_from_with_as_much_as_it_keeps() -> None:
+    tip = ARM.frame_pose(START, "tip")[:3, 3]
+    out = tip / np.linalg.norm(tip)
+    near = ball(*(tip + (0.04 + 0.05 + 0.012) * out)[:2])
+    found = planned_path(ARM, near, task(), PLANNER, CONFIG)
+    assert found.outcome == "solved"
+    assert found.margin == pytest.approx(0.012 - 0.001, abs=1e-6)
+
+
+def test_a_start_and_a_goal_in_collision_are_named() -> None:
+    for posture, outcome in ((START, START_BLOCKED), (GOAL, GOAL_BLOCKED)):
+        found = planned_path(ARM, ball(*ARM.frame_pose(posture, "tip")[:2, 3]), task(), PLANNER, CONFIG)
+        assert (found.outcome, found.path, found.num_edges) == (outcome, None, 0)
+
+
+def test_the_same_seed_plans_the_same_path() -> None:
+    one, again = (planned_path(ARM, one_wall(), task(), PLANNER, CONFIG) for _ in range(2))
+    assert one.path is not None and again.path is not None
+    np.testing.assert_array_equal(one.path.waypoints, again.path.waypoints)
