@@ -2,13 +2,13 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,12 +19,15 @@ if TYPE_CHECKING:
     from splatctrl_cli.control.explain import Obstacle
     from splatctrl_cli.control.rates import SceneStep
     from splatctrl_cli.field.grid import GridField
-    from splatctrl_cli.records import DistanceField, DistanceGrid, Float64, SplatSet
+    from splatctrl_cli.records import DistanceField, DistanceGrid, Float64, OccupancyGrid, SplatSet
 
     Index = NDArray[np.int64]
 
+Key = TypeVar("Key", bound=Hashable)
+HELD = 2  # scenes whose fields are kept: a rate of change needs two
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class KnownFields:
     """The fields of one scene: `barrier` is what a controller uses, `distances` what an audit puts side by side.
 
@@ -38,12 +41,18 @@ class KnownFields:
     human: "DistanceField | None" = None
 
 
+def _nothing(_: int) -> None:
+    """For a scene that is all there from the beginning."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class KnownScene:
-    """`at(stamp_ns)` gives the same object for the same scene; nothing is known before `first_ns` (None: always).
+    """`at(stamp_ns)` gives the same object for the same scene as long as it is in use; nothing is known before
+    `first_ns` (None: always).
 
     cameras: the cameras that made it, None where that is not recorded. stamps_ns: of the scenes that are there one
-    after the other, empty for one scene for all times.
+    after the other (so far, where they are made on the way: `advance` to a stamp makes those known then), empty for
+    one scene for all times; each is known `latency_ns` after its stamp. finish: to be called when the replay is done.
     """
 
     at: Callable[[int], KnownFields]
@@ -51,24 +60,49 @@ class KnownScene:
     first_ns: int | None
     cameras: tuple[str, ...] | None
     digests: dict[str, str]
-    stamps_ns: tuple[int, ...] = ()
+    stamps_ns: Sequence[int] = ()
+    latency_ns: int = 0
+    advance: Callable[[int], None] = _nothing
+    finish: Callable[[], None] = lambda: None
 
     def age_s(self, stamp_ns: int) -> float:
         """How old [s] the scene in use at a stamp is; NaN where scenes have no times."""
-        index = bisect_right(self.stamps_ns, stamp_ns) - 1
+        index = self._index_at(stamp_ns)
         return math.nan if index < 0 else (stamp_ns - self.stamps_ns[index]) * 1e-9
 
     def step_at(self, stamp_ns: int) -> "SceneStep | None":
         """The two newest scenes at a stamp, None where there is only one."""
         from splatctrl_cli.control.rates import SceneStep
 
-        index = bisect_right(self.stamps_ns, stamp_ns) - 1
+        index = self._index_at(stamp_ns)
         if index < 1:
             return None
         older_ns, newer_ns = self.stamps_ns[index - 1 : index + 1]
-        return SceneStep(
-            newer=self.at(newer_ns).barrier, older=self.at(older_ns).barrier, seconds=(newer_ns - older_ns) * 1e-9
-        )
+        older, newer = (self.at(stamp + self.latency_ns).barrier for stamp in (older_ns, newer_ns))
+        return SceneStep(newer=newer, older=older, seconds=(newer_ns - older_ns) * 1e-9)
+
+    def _index_at(self, stamp_ns: int) -> int:
+        self.advance(stamp_ns)
+        return bisect_right(self.stamps_ns, stamp_ns - self.latency_ns) - 1
+
+
+def fields_at(
+    stamps_ns: Sequence[int], latency_ns: int, key_of: Callable[[int], Key], fields_of: Callable[[Key], KnownFields]
+) -> Callable[[int], KnownFields]:
+    """The fields of the newest scene (by its index among `stamps_ns`) that is known at a stamp; those of the HELD
+    scenes used last are kept. It raises NotEvaluableError where none is known yet.
+    """
+    kept = lru_cache(maxsize=HELD)(fields_of)
+
+    def at(stamp_ns: int) -> KnownFields:
+        index = bisect_right(stamps_ns, stamp_ns - latency_ns) - 1
+        if index < 0:
+            raise NotEvaluableError(
+                f"no scene is known at stamp {stamp_ns} ns", remedy="it was not seen yet; ask for a later time"
+            )
+        return kept(key_of(index))
+
+    return at
 
 
 def from_grid(path: Path) -> KnownScene:
@@ -100,43 +134,47 @@ def from_grid(path: Path) -> KnownScene:
     )
 
 
-def from_splats(path: Path, config: "Config", threads: int) -> KnownScene:
-    """The scene of a reconstruction: at each stamp the fields of its newest snapshot not later.
+def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int = 0) -> KnownScene:
+    """The scene of a reconstruction: at each stamp the fields of its newest snapshot that is as old as the latency.
 
     Known space is what a camera saw, and what the robot itself was in at some time of the log.
     """
-    from splatctrl_cli.control.audit import observed_lookup
     from splatctrl_cli.io.output import sha256
     from splatctrl_cli.io.scene_folder import open_scene
-    from splatctrl_cli.records import SWEPT
 
     scene = open_scene(path)
-    occupancy = scene.occupancy()
-    known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
     has_times = scene.has_clock and len(stamps) > 1
+    if latency_ns and not has_times:
+        raise UsageError(
+            f"--latency: {path} is one scene for all times: expected snapshots", remedy="leave --latency out"
+        )
 
-    @cache
-    def fields(index: int) -> KnownFields:
-        splats = scene.splats_at(stamps[index]) if has_times and index < len(stamps) - 1 else scene.splats()
-        return splat_fields(splats, config, threads)
+    def fields(stamp_ns: int | None) -> KnownFields:
+        return splat_fields(scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns), config, threads)
 
-    def at(stamp_ns: int) -> KnownFields:
-        if not has_times:
-            return fields(len(stamps) - 1)
-        index = bisect_right(stamps, stamp_ns) - 1
-        if index < 0:
-            scene.splats_at(stamp_ns)  # raises: nothing is known yet
-        return fields(index)
+    def key_of(index: int) -> int | None:
+        return stamps[index] if index < len(stamps) - 1 else None  # the last is the final map
 
+    always = stamps if has_times else [-(2**63)]
     return KnownScene(
-        at=at,
-        observed=observed_lookup(known.astype("uint8"), occupancy.origin, occupancy.voxel),
-        first_ns=stamps[0] if has_times else None,
+        at=fields_at(always, latency_ns, key_of if has_times else lambda _: None, fields),
+        observed=known_space(scene.occupancy()),
+        first_ns=stamps[0] + latency_ns if has_times else None,
         cameras=tuple(scene.cameras),
         digests={"splats.ply": sha256(path / "splats.ply")},
         stamps_ns=tuple(stamps) if has_times else (),
+        latency_ns=latency_ns,
     )
+
+
+def known_space(occupancy: "OccupancyGrid") -> "Observed":
+    """What a camera saw or the robot was in, of an occupancy grid."""
+    from splatctrl_cli.control.audit import observed_lookup
+    from splatctrl_cli.records import SWEPT
+
+    known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
+    return observed_lookup(known.astype("uint8"), occupancy.origin, occupancy.voxel)
 
 
 def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFields:

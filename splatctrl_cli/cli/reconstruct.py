@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.robot.model import RobotModel
 
 DAMAGED = 3
+DEFAULT_POSE_JUMP = 1.0  # [m]
 GATED = (
     *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet"),
     *("loss", "psnr"),
@@ -60,22 +61,27 @@ def register(subparsers: Subparsers) -> None:
         metavar="FILE.ply",
         help="coloured points to start from; depth is then not looked at (colour cameras alone: no occupancy)",
     )
-    parser.add_argument(
-        "--max-pose-jump",
-        type=float,
-        default=1.0,
-        metavar="M",
-        help="how far a camera may move between frames less than a second apart, in metres (default: 1)",
-    )
-    parser.add_argument(
-        "--allow-disagreement", action="store_true", help="go on where cameras disagree on where the surfaces are"
-    )
+    add_disagreement(parser)
     parser.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted, to the same bytes"
     )
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     add_config(parser)
     add_gates(parser)
+
+
+def add_disagreement(parser: argparse._ActionsContainer) -> None:
+    """``--max-pose-jump`` and ``--allow-disagreement``: what a log is let off with."""
+    parser.add_argument(
+        "--max-pose-jump",
+        type=float,
+        default=DEFAULT_POSE_JUMP,
+        metavar="M",
+        help="how far a camera may move between frames less than a second apart, in metres (default: 1)",
+    )
+    parser.add_argument(
+        "--allow-disagreement", action="store_true", help="go on where cameras disagree on where the surfaces are"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -216,14 +222,14 @@ def _open(args: argparse.Namespace) -> "RecordSource":
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
     if args.dtu is None:
         source = open_source(args.source, source_options(args))
-        _check_pose_jumps(source, args.max_pose_jump)
+        check_pose_jumps(source, args.max_pose_jump)
         return source
     from splatctrl_cli.io.dtu_source import DtuSource, view_numbers
 
     return DtuSource(args.dtu, args.scan, view_numbers([word for word in (args.holdout or "").split(",") if word]))
 
 
-def _check_pose_jumps(source: "ShotSource", limit: float) -> None:
+def check_pose_jumps(source: "ShotSource", limit: float) -> None:
     """Raise InputError for a camera that is suddenly elsewhere; where nobody knows when, views may lie anywhere."""
     from splatctrl_cli.scene.consistency import largest_jump
 

@@ -74,6 +74,7 @@ class Reconstruction:
         self.stamps: list[int] = []
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
+        self._early: TimeStep | None = None  # the first that said nothing of the workspace
         self.disagreement: dict[str, float] = {}  # [m] of each pair of cameras that see enough of the same
         self._saved_at, self._save_time = -float("inf"), 0.0
         if checkpoint is not None:
@@ -81,9 +82,16 @@ class Reconstruction:
 
     def run(self, console: Console) -> None:
         """Step through what is left of the log."""
-        early = self._step_through(console)
-        if self.fitter is None and early is not None:
-            self._workspace(early)  # says that there is no depth
+        self._step_through(console)
+        self.check_found()
+        if not self.source.has_clock and not self.is_refined:
+            assert self.fitter is not None
+            self._refine(self.fitter, console)
+
+    def check_found(self) -> None:
+        """Raise InputError where the time steps so far gave no splat."""
+        if self.fitter is None and self._early is not None:
+            self._workspace(self._early)  # says that there is no depth
         if self.fitter is None:
             raise InputError(
                 f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
@@ -94,37 +102,17 @@ class Reconstruction:
                 f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
                 remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
             )
-        if not self.source.has_clock and not self.is_refined:
-            self._refine(self.fitter, console)
 
-    def _step_through(self, console: Console) -> "TimeStep | None":
-        """Take in the time steps; returns the first one that said nothing yet of where the workspace is."""
+    def _step_through(self, console: Console) -> None:
         from tqdm import tqdm
 
-        steps = tqdm(self._steps(), disable=True if console.is_quiet else None, unit=" steps")
-        early: TimeStep | None = None
+        steps = tqdm(self.time_steps(), disable=True if console.is_quiet else None, unit=" steps")
         for index, step in enumerate(steps):
             if index < self.num_read:
                 continue
-            self.num_read = index + 1
-            if self.fitter is None and not step.has_depth and self._needs_depth():
-                console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
-                early = early or step
+            row = self.take(step, console)
+            if row is None:
                 continue
-            if self.fitter is None:
-                self.fitter = self._new_fitter(self._workspace(step))
-                if self.cloud is not None:
-                    self.fitter.plant(self.cloud)
-            elif not self.source.has_clock and self.fitter.num_steps == 1:
-                console.log(
-                    "warning: more views than fit in one time step; the last ones are refined on, the rest seed"
-                )
-            self._check_cameras(step, console)
-            row = self.fitter.step(step.frames, self._posture(step))
-            self.stamps.extend(frame.stamp_ns for frame in step.frames)
-            self._record(row)
-            if self.fitter.num_steps == 1:
-                self._warn_of_small_budget(row, console)
             if index % 10 == 0 and not steps.disable:
                 steps.set_postfix(splats=row.alive, dB=row.psnr)
             if steps.disable and index % 10 == 0:
@@ -132,10 +120,32 @@ class Reconstruction:
                     "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB on its own views"
                 )
                 console.log(f"time step {index}: {row.alive} splats, {quality}")
-            if self.source.has_clock and self._is_snapshot_due(index, step.stamp_ns):
-                self._snapshot(step.stamp_ns)
             self._save_if_due()
-        return early
+
+    def take(self, step: "TimeStep", console: Console) -> "AuditRow | None":
+        """Take in the next time step, with its snapshot where one is due; None for one that does not say yet where
+        the workspace is.
+        """
+        index, self.num_read = self.num_read, self.num_read + 1
+        if self.fitter is None and not step.has_depth and self._needs_depth():
+            console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
+            self._early = self._early or step
+            return None
+        if self.fitter is None:
+            self.fitter = self._new_fitter(self._workspace(step))
+            if self.cloud is not None:
+                self.fitter.plant(self.cloud)
+        elif not self.source.has_clock and self.fitter.num_steps == 1:
+            console.log("warning: more views than fit in one time step; the last ones are refined on, the rest seed")
+        self._check_cameras(step, console)
+        row = self.fitter.step(step.frames, self._posture(step))
+        self.stamps.extend(frame.stamp_ns for frame in step.frames)
+        self._record(row)
+        if self.fitter.num_steps == 1:
+            self._warn_of_small_budget(row, console)
+        if self.source.has_clock and self._is_snapshot_due(index, step.stamp_ns):
+            self.snapshot(step.stamp_ns)
+        return row
 
     def _check_cameras(self, step: "TimeStep", console: Console) -> None:
         """Measure once a pair how far cameras disagree on what both see. Raises InputError where that is too far."""
@@ -182,7 +192,7 @@ class Reconstruction:
             self._save_if_due()
 
         self._record(fitter.refine(total, progress))
-        self._snapshot(self.rows[-1].stamp_ns)
+        self.snapshot(self.rows[-1].stamp_ns)
         self.is_refined = True
 
     def finish(self) -> None:
@@ -231,7 +241,8 @@ class Reconstruction:
         first, last = taken[0].stamp_ns - SAME_MOMENT_NS, taken[-1].stamp_ns
         return (stamp_ns - first) // period_ns > (last - first) // period_ns
 
-    def _snapshot(self, stamp_ns: int) -> None:
+    def snapshot(self, stamp_ns: int) -> None:
+        """Write the map as it is."""
         assert self.fitter is not None
         grid, thresholds = self.fitter.occupancy_grid(), self.config.occupancy
         states = grid.states(thresholds.free_below, thresholds.occupied_above)
@@ -271,7 +282,8 @@ class Reconstruction:
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 
-    def _steps(self) -> "Iterator[TimeStep]":
+    def time_steps(self) -> "Iterator[TimeStep]":
+        """Those of the source, from its beginning."""
         from splatctrl_cli.scene.time_steps import time_steps
 
         steps = time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)

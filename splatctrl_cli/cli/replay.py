@@ -15,10 +15,11 @@ from splatctrl_cli.cli.common import (
     check_gates,
     configured,
 )
+from splatctrl_cli.cli.lockstep import add_lockstep, check_lockstep
 from splatctrl_cli.cli.replay_baseline import add_baseline, read_zone
 from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose, seconds
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
-from splatctrl_cli.cli.robot_options import locked_joints
+from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, read_robot
 from splatctrl_cli.cli.source_options import add_source
 from splatctrl_cli.errors import NotEvaluableError
 
@@ -46,6 +47,7 @@ def register(subparsers: Subparsers) -> None:
     scene.add_argument(
         "--scene", type=Path, metavar="SCENE", help="a reconstruction: its splats, as known at each time"
     )
+    add_lockstep(parser, scene)
     parser.add_argument("--urdf", type=Path, required=True, metavar="FILE", help="the robot's URDF")
     parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its spheres (default: the URDF's own)")
     parser.add_argument(
@@ -58,6 +60,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="JOINT=VALUE",
         help="hold a joint that no log moves (repeatable)",
     )
+    add_robot_geometry(parser)
     parser.add_argument("--mode", choices=MODES, default="audit", help="what to replay (default: audit)")
     add_goal(parser)
     parser.add_argument("--truth", type=Path, metavar="FILE", help="truth.json of a simulated log")
@@ -96,40 +99,42 @@ def run(args: argparse.Namespace) -> int:
     )
     golden = read_golden(args)
     read_zone(args)
+    check_lockstep(args)
     out = args.out or Path("replay")
     with output_path(out, force=args.force, is_folder=True) as folder:
         with stopwatch.stage("read"):
-            inputs, logged = _read(args, config)
+            inputs, logged = _read(args, config, folder, console)
         for doubt in inputs.model.doubts:
             console.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
             replay = replayed(args, inputs, config, console)
         with stopwatch.stage("truth"):
             replay = with_truth(inputs, replay)
+        inputs.scene.finish()
         metrics = metrics_of(replay)
         write_json(folder / "states.json", logged.as_dict())
         write_replay(folder, replay, metrics, config=config, inputs=inputs.digests, stopwatch=stopwatch)
-    lines = [*lines_of(replay, metrics, with_steps=args.steps or args.verbose > 0), *logged.lines()]
+    lines = lines_of(replay, metrics, with_steps=args.steps or args.verbose > 0)
+    lines += [coverage_words(inputs.model, config.control), *logged.lines()]
     console.result({"out": str(out), **metrics}, lines)
     return _verdict(args, replay, metrics, golden, inputs.source)
 
 
-def _read(args: argparse.Namespace, config: "Config") -> "tuple[ReplayInputs, LoggedStates]":
-    from splatctrl_cli.cli.known_scene import from_grid, from_splats
+def _read(
+    args: argparse.Namespace, config: "Config", folder: Path, console: Console
+) -> "tuple[ReplayInputs, LoggedStates]":
+    from splatctrl_cli.cli.lockstep import opened_scene
     from splatctrl_cli.cli.replay_modes import ReplayInputs
     from splatctrl_cli.cli.replay_states import read_states
-    from splatctrl_cli.geometry import transform_from
     from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.robot.model import RobotModel
     from splatctrl_cli.simulate.truth import load_truth
 
-    T_world_base = None if args.base is None else transform_from(args.base[:3], args.base[3:])
-    model = RobotModel.from_urdf(args.urdf, args.spheres, T_world_base=T_world_base, locked=locked_joints(args.lock))
+    model = read_robot(args, config.control)
     truth = None if args.truth is None else load_truth(args.truth)
-    scene = from_grid(args.field) if args.field is not None else from_splats(args.scene, config, args.threads)
     logged = read_states(args, model)
+    scene = opened_scene(args, config, model, folder, console)
     source = logged.source
-    files = [path for path in (args.urdf, args.spheres, args.truth) if path is not None]
+    files = [path for path in (args.urdf, args.spheres, args.srdf, args.truth) if path is not None]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
     inputs = ReplayInputs(source=source, states=logged.states, model=model, scene=scene, truth=truth, digests=digests)
     return inputs, logged

@@ -1,10 +1,11 @@
-"""``--baseline standstill``: the monitored standstill beside the closed loop, in one table."""
+"""``--baseline``: what else stands beside the closed loop, and the distances to people of a monitored standstill."""
 
 import argparse
 import fnmatch
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from splatctrl_cli.cli.replay_compare import BIRRT, BIRRT_IK, check_comparable
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
@@ -18,15 +19,21 @@ FIGURES = (
     *("completed", "duration_s", "mean_human_distance", "min_human_distance", "num_stops"),
     *("longest_stop_s", "stopped_s"),
 )
-BESIDE = ("closed_loop", "standstill")
+STANDSTILL = "standstill"
+BESIDE = ("closed_loop", STANDSTILL)
+BASELINES = (STANDSTILL, BIRRT, BIRRT_IK)
 
 
 def add_baseline(parser: argparse.ArgumentParser) -> None:
     """``--baseline``, ``--zone``, ``--human``."""
     parser.add_argument(
         "--baseline",
-        choices=("standstill",),
-        help="beside the closed loop: the logged path, held while a person is in the zone",
+        type=_baselines,
+        action="extend",
+        default=[],
+        metavar="NAME,...",
+        help="beside the closed loop (repeatable): standstill, the logged path held while a person is in the zone; "
+        "birrt, a path planned in the scene known at the start, followed by the joints; birrt-ik, by the controller",
     )
     parser.add_argument(
         "--zone", default="0.5,0.6", metavar="STOP,RESUME", help="distances [m] of that zone (default: 0.5,0.6)"
@@ -40,14 +47,30 @@ def add_baseline(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _baselines(text: str) -> list[str]:
+    """Names joined by commas, for argparse."""
+    names = text.split(",")
+    for name in names:
+        if name not in BASELINES:
+            raise argparse.ArgumentTypeError(f"expected {', '.join(BASELINES)}, got {name!r}")
+    return names
+
+
+def read_baselines(args: argparse.Namespace) -> tuple[str, ...]:
+    """The baselines, each once. Raises UsageError for another mode, or where one does not go with the goal."""
+    names = tuple(dict.fromkeys(args.baseline))
+    if names and args.mode != "closed-loop":
+        raise UsageError("--baseline: expected --mode closed-loop to stand beside", remedy="give it")
+    check_comparable(args, names)
+    return names
+
+
 def read_zone(args: argparse.Namespace) -> "Zone | None":
-    """The zone of --zone, None without a baseline. Raises UsageError for another mode or a zone that is none."""
+    """The zone of --zone, None without a standstill. Raises UsageError as `read_baselines`, or for a bad zone."""
     from splatctrl_cli.control.standstill import Zone
 
-    if args.baseline is None:
+    if STANDSTILL not in read_baselines(args):
         return None
-    if args.mode != "closed-loop":
-        raise UsageError("--baseline: expected --mode closed-loop to stand beside", remedy="give it")
     try:
         stop, resume = (float(part) for part in args.zone.split(","))
     except ValueError:
@@ -58,7 +81,7 @@ def read_zone(args: argparse.Namespace) -> "Zone | None":
 def separations(
     args: argparse.Namespace, zone: "Zone | None", inputs: "ReplayInputs", replay: "Replay", config: "Config"
 ) -> "Mapping[str, Separation]":
-    """The closed loop and the standstill beside people, from the same moment; empty without a baseline."""
+    """The closed loop and the standstill beside people, from the same moment; empty without a standstill."""
     from splatctrl_cli.cli.replay_modes import logged_motion
     from splatctrl_cli.control.replay import Outcome
     from splatctrl_cli.control.standstill import monitored_standstill, separation_of
@@ -132,7 +155,7 @@ def _people(args: argparse.Namespace, inputs: "ReplayInputs") -> "DistanceToPeop
             "--human: expected --truth to take it from", remedy="without it people are splats labelled so"
         )
     stamps = scene.stamps_ns or (int(inputs.states[0].stamp_ns),)
-    if all(scene.at(stamp).human is None for stamp in stamps):
+    if all(scene.at(stamp + scene.latency_ns).human is None for stamp in stamps):
         raise NotEvaluableError(
             "--baseline: expected splats labelled human, got none at any time",
             remedy="reconstruct from a log with masks of people, or give --truth and --human",

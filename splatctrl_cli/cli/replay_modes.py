@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.explain import Event, EventKind, audit_signals, events_of, stale_signal, step_signals
 from splatctrl_cli.control.open_loop import OpenLoopTask, OpenLoopTrace, open_loop
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence
+from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.clearance import clearance_agreement, mark_seen
@@ -136,7 +138,7 @@ def _audited(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", c
     scene, model = inputs.scene, inputs.model
     trace = audit(model, states, lambda stamp: scene.at(stamp).distances, observed=scene.observed)
     last = scene.at(int(trace.stamp_ns[-1]))
-    statics = static_violations(model, last.barrier, trace.position[-1], config.control.margin)
+    statics = static_violations(model, last.barrier, trace.position[-1], scene_margin(model, config.control))
     return _replay(inputs, config, trace, statics, num_before=len(inputs.states) - len(states), radius_of=-1)
 
 
@@ -263,13 +265,12 @@ def _obstacles(inputs: ReplayInputs, trace: AuditTrace) -> "tuple[Obstacle | Non
     """What is nearest to the nearest sphere at every state, by the controller's field; None without a distance."""
     nearest = trace.clearance["barrier"]
     found: list[Obstacle | None] = [None] * len(trace.stamp_ns)
-    groups: dict[int, list[int]] = {}
-    for index in np.flatnonzero(np.isfinite(nearest.distance)):
-        groups.setdefault(id(inputs.scene.at(int(trace.stamp_ns[index]))), []).append(int(index))
-    for states in groups.values():
+    for fields, group in groupby(
+        np.flatnonzero(np.isfinite(nearest.distance)), key=lambda index: inputs.scene.at(int(trace.stamp_ns[index]))
+    ):
+        states = list(group)
         centers = inputs.model.sphere_centers_batch(trace.position[states])
         points = np.ascontiguousarray(centers[np.arange(len(states)), nearest.sphere[states]])
-        fields = inputs.scene.at(int(trace.stamp_ns[states[0]]))
         for state, obstacle in zip(states, fields.obstacles(points), strict=True):
             found[state] = obstacle
     return tuple(found)

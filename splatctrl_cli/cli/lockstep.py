@@ -1,0 +1,229 @@
+"""A log's reconstruction in lockstep with its replay: frame sets are taken in as the replay's clock passes them."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.cli.common import Console
+from splatctrl_cli.cli.known_scene import (
+    KnownFields,
+    KnownScene,
+    fields_at,
+    from_grid,
+    from_splats,
+    known_space,
+    splat_fields,
+)
+from splatctrl_cli.cli.reconstruct import DEFAULT_POSE_JUMP, add_disagreement, check_pose_jumps
+from splatctrl_cli.cli.replay_goal import numbers
+from splatctrl_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.cli.reconstruction import Reconstruction
+    from splatctrl_cli.config import Config
+    from splatctrl_cli.control.audit import Observed
+    from splatctrl_cli.io.shot import ShotSource
+    from splatctrl_cli.records import Float64, UInt8
+    from splatctrl_cli.robot.model import RobotModel
+
+FOLDER = "scene"  # within the replay's
+
+
+def add_lockstep(parser: argparse.ArgumentParser, scene: argparse._ActionsContainer) -> None:
+    """``--lockstep`` among the choices of a scene, ``--latency``, and what reconstructing a log is let off with."""
+    scene.add_argument(
+        "--lockstep",
+        action="store_true",
+        help="reconstruct the scene from LOG's own cameras, in step with the replay; --set scene.max_splats=N",
+    )
+    parser.add_argument(
+        "--latency",
+        type=_latency,
+        default=0.0,
+        metavar="S",
+        help="a map is known this long after its frames' stamp (--scene, --lockstep; default: 0)",
+    )
+    add_disagreement(parser.add_argument_group("with --lockstep"))
+
+
+def _latency(text: str) -> float:
+    """Seconds, not below zero, for argparse."""
+    (value, *more) = numbers(text)
+    if more or value < 0:
+        raise argparse.ArgumentTypeError(f"expected seconds not below 0, got {text!r}")
+    return value
+
+
+def check_lockstep(args: argparse.Namespace) -> None:
+    """Raise UsageError for options that mean nothing without it."""
+    if args.latency and args.field is not None:
+        raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
+    if not args.lockstep and (args.allow_disagreement or args.max_pose_jump != DEFAULT_POSE_JUMP):
+        raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
+
+
+def opened_scene(
+    args: argparse.Namespace, config: "Config", model: "RobotModel", folder: Path, console: Console
+) -> KnownScene:
+    """The scene that the options of a replay name; what --lockstep reconstructs goes into `folder`."""
+    if args.field is not None:
+        return from_grid(args.field)
+    if args.scene is not None:
+        return from_splats(args.scene, config, args.threads, latency_ns=_latency_ns(args))
+    return from_log(args, config, model, folder, console)
+
+
+def _latency_ns(args: argparse.Namespace) -> int:
+    return int(args.latency * 1e9 + 0.5)
+
+
+def from_log(
+    args: argparse.Namespace, config: "Config", model: "RobotModel", folder: Path, console: Console
+) -> KnownScene:
+    """The scene that a log's own cameras give as it goes; what is reconstructed is left in `folder`/scene.
+
+    Raises InputError for a log without frames or a clock.
+    """
+    from splatctrl_cli.cli.reconstruction import Reconstruction
+
+    source = _open(args, model)
+    check_pose_jumps(source, args.max_pose_jump)
+    place = folder / FOLDER
+    place.mkdir()
+    fitted = Reconstruction(
+        source,
+        model,
+        config,
+        place,
+        box=None,
+        seed=args.seed,
+        threads=args.threads,
+        identity={"command": "replay --lockstep"},
+        allow_disagreement=args.allow_disagreement,
+    )
+    lockstep = Lockstep(fitted, config, _latency_ns(args), console, ends_with_log=args.mode != "closed-loop")
+    return lockstep.scene()
+
+
+class Lockstep:
+    """Frame sets that wait, and the stamps and files of the maps after those that were taken in.
+
+    ends_with_log: known space is that of the whole log, else that of the frame sets that the replay passed.
+    """
+
+    def __init__(
+        self,
+        fitted: "Reconstruction",
+        config: "Config",
+        latency_ns: int,
+        console: Console,
+        *,
+        ends_with_log: bool,
+    ) -> None:
+        import numpy as np
+
+        from splatctrl_cli.io.output import Stopwatch
+
+        self._fitted, self._config, self._console = fitted, config, console
+        self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
+        self._stopwatch = Stopwatch()
+        self._steps = fitted.time_steps()
+        self._next = next(self._steps, None)
+        self._stamps_ns: list[int] = []
+        self._files: list[Path] = []
+        self._known: tuple[int, Observed] = (0, lambda points: np.zeros(len(points), np.uint8))  # after so many
+
+    def scene(self) -> KnownScene:
+        """As a replay sees it; the first frame sets, up to the first map, are taken in at once."""
+        while self._next is not None and not self._stamps_ns:
+            self._take()
+        self._fitted.check_found()
+        known_at = fields_at(self._stamps_ns, self._latency_ns, self._files.__getitem__, self._fields)
+
+        def at(stamp_ns: int) -> KnownFields:
+            self._advance(stamp_ns)
+            return known_at(stamp_ns)
+
+        return KnownScene(
+            at=at,
+            observed=self._observed,
+            first_ns=self._stamps_ns[0] + self._latency_ns,
+            cameras=tuple(self._fitted.cameras),
+            digests={},
+            stamps_ns=self._stamps_ns,
+            latency_ns=self._latency_ns,
+            advance=self._advance,
+            finish=self._finish,
+        )
+
+    def _advance(self, stamp_ns: int) -> None:
+        """Take in every frame set that is known at a stamp."""
+        while self._next is not None and self._next.stamp_ns + self._latency_ns <= stamp_ns:
+            self._take()
+
+    def _take(self) -> None:
+        step, fitted = self._next, self._fitted
+        assert step is not None
+        with self._stopwatch.stage("fit"):
+            fitted.take(step, self._console)
+        with self._stopwatch.stage("read"):
+            self._next = next(self._steps, None)
+        taken = fitted.writer.snapshots
+        if self._next is None and fitted.rows and taken[-1].stamp_ns < step.stamp_ns:
+            fitted.snapshot(step.stamp_ns)  # the log's last map, due or not
+        for snapshot in taken[len(self._files) :]:
+            self._stamps_ns.append(snapshot.stamp_ns)
+            self._files.append(snapshot.path)
+
+    def _fields(self, file: Path) -> KnownFields:
+        from splatctrl_cli.io.splats import read_ply
+
+        return splat_fields(read_ply(file)[0], self._config, self._fitted.threads)
+
+    def _observed(self, points: "Float64") -> "UInt8":
+        """The known space of the log, or of as much of it as the replay has passed."""
+        while self._ends_with_log and self._next is not None:
+            self._take()
+        num_taken, known = self._known
+        if num_taken != len(self._fitted.rows):
+            assert self._fitted.fitter is not None
+            known = known_space(self._fitted.fitter.occupancy_grid())
+            self._known = len(self._fitted.rows), known
+        return known(points)
+
+    def _finish(self) -> None:
+        """Leave a scene folder as `reconstruct` writes it, of the frame sets that were taken in."""
+        from splatctrl_cli.io.output import write_run
+
+        fitted = self._fitted
+        with self._stopwatch.stage("write"):
+            fitted.finish()
+        write_run(
+            fitted.writer.folder,
+            command="replay",
+            config=self._config.as_dict(),
+            inputs=fitted.source.digests(),
+            metrics=fitted.metrics(),
+            stopwatch=self._stopwatch,
+            seed=fitted.seed,
+        )
+        num, seconds = len(fitted.rows), self._stopwatch.seconds["fit"]
+        self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")
+
+
+def _open(args: argparse.Namespace, model: "RobotModel") -> "ShotSource":
+    """The log once more: its frames are read in step with the replay."""
+    from splatctrl_cli.cli.source_options import source_options
+    from splatctrl_cli.io.capture import CaptureSource
+    from splatctrl_cli.io.ros_log import RosLogSource
+    from splatctrl_cli.io.state_source import open_states
+
+    source = open_states(args.log, source_options(args), model.joint_names)
+    if not source.cameras:
+        raise InputError(
+            f"{args.log}: --lockstep: expected cameras, got joint states alone",
+            remedy="give --scene or --field of the same place",
+        )
+    if not isinstance(source, RosLogSource | CaptureSource):
+        raise UsageError(f"{args.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
+    return source

@@ -1,0 +1,159 @@
+"""``splatctrl replay --lockstep`` and ``--latency``: what is known of the scene at each time, and since when."""
+
+import argparse
+import csv
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.cli import known_scene
+from splatctrl_cli.cli.common import Console
+from splatctrl_cli.cli.known_scene import KnownFields, from_splats
+from splatctrl_cli.cli.lockstep import from_log
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.cli.replay import register
+from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.robot.model import RobotModel
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
+
+SETTINGS = ["scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3"]
+FAST = ["--threads", "1", "-q", *(word for setting in SETTINGS for word in ("--set", setting))]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording") / "small"
+    size = ["--duration", "1.4", "--width", "160", "--height", "120"]
+    assert main(["simulate", "-o", str(folder), *size, "-q"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def replayed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dict[str, str]]]:
+    """The steps of a replay of the recording, in lockstep or (with `scene`) after `reconstruct`."""
+    folder = tmp_path_factory.mktemp("replays")
+    robot = ["--urdf", str(recording / "robot.urdf"), "--spheres", str(recording / "robot_spheres.yaml")]
+    log = [str(recording / "log.mcap"), *robot, "--cameras", "cam0,cam1", *FAST]
+
+    def replay(*options: str, every: int = 1, has_folder: bool = False) -> list[dict[str, str]]:
+        number = len(list(folder.iterdir()))
+        out, scene, every_set = (
+            folder / f"{number}",
+            folder / f"{number}_scene",
+            ["--set", f"scene.snapshot_every={every}"],
+        )
+        known = ["--lockstep", *every_set]
+        if has_folder:
+            assert main(["reconstruct", *log, *every_set, "-o", str(scene)]) == 0
+            known = ["--scene", str(scene)]
+        assert main(["replay", *log, *known, "-o", str(out), "--max-unknown", "1", *options]) in (0, 3)
+        with (out / "steps.csv").open() as stream:
+            return list(csv.DictReader(stream))
+
+    return replay
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_lockstep_says_what_a_reconstruction_with_snapshots_would(
+    replayed: Callable[..., list[dict[str, str]]], every: int
+) -> None:
+    rows = replayed(every=every)
+    assert rows == replayed(every=every, has_folder=True)
+    ages = np.array([float(row["map_age_s"]) for row in rows])
+    assert (ages >= 0).all() and ages.max() == pytest.approx(0.2 * every - 0.02, abs=0.021)
+
+
+def test_a_closed_loop_in_lockstep_drives_as_in_the_reconstruction(
+    replayed: Callable[..., list[dict[str, str]]],
+) -> None:
+    drive = ["--mode", "closed-loop", "--latency", "0.3", "--set", "control.max_time=0.8"]
+    rows = replayed(*drive)
+    assert rows == replayed(*drive, has_folder=True)
+    assert {float(row["map_age_s"]) >= 0.3 - 1e-9 for row in rows} == {True}
+    assert rows != replayed("--mode", "closed-loop", "--set", "control.max_time=0.8")
+
+
+def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
+    recording: Path, tmp_path: Path, arm: RobotModel
+) -> None:
+    scene = opened(recording, tmp_path, arm, latency=0.25)
+    assert len(scene.stamps_ns) == 1
+    first = scene.stamps_ns[0]
+    assert scene.first_ns == first + SECOND // 4
+    with pytest.raises(NotEvaluableError, match="no scene is known"):
+        scene.at(first)
+    for num, seconds in ((1, 0.44), (2, 0.46), (3, 0.66), (3, 0.5)):
+        scene.at(first + round(seconds * SECOND))
+        assert len(scene.stamps_ns) == num
+    assert scene.age_s(first + SECOND // 2) == pytest.approx(0.3, abs=1e-6)
+    step = scene.step_at(first + round(0.66 * SECOND))
+    assert step is not None and step.seconds == pytest.approx(0.2, abs=1e-3)
+    scene.finish()
+    assert {"splats.ply", "run.json", "snapshots.csv", "occupancy.npz"} <= {
+        path.name for path in (tmp_path / "scene").iterdir()
+    }
+
+
+def opened(recording: Path, folder: Path, arm: RobotModel, *, latency: float) -> known_scene.KnownScene:
+    commands = argparse.ArgumentParser().add_subparsers()
+    register(commands)
+    robot = ["--urdf", str(recording / "robot.urdf")]
+    words = [str(recording / "log.mcap"), *robot, "--lockstep", "--latency", str(latency), "--mode", "closed-loop"]
+    args = commands.choices["replay"].parse_args([*words, "--cameras", "cam0,cam1", *FAST])
+    return from_log(args, load_config(None, SETTINGS), arm, folder, Console(args))
+
+
+def test_a_map_is_known_only_after_the_latency(desk: Desk, arm: RobotModel) -> None:
+    small = (BALL[0], 0.02)
+    snapshots = ((0, splats_of(small)), (SECOND // 2, splats_of(BALL)))
+    scene = str(write_scene(desk.folder / "scene", *snapshots))
+    assert desk.replay("--scene", scene, "-q", "--latency", "0.2") == 0
+    rows = desk.rows()
+    assert desk.metrics()["num_before_scene"] == 2
+    expected = [clearance(arm, START, small)] * 5 + [clearance(arm, START, BALL)] * 4
+    np.testing.assert_allclose([float(row["clearance_exact"]) for row in rows], expected, atol=1e-6)
+    ages = [0.2, 0.3, 0.4, 0.5, 0.6, 0.2, 0.3, 0.4, 0.5]
+    np.testing.assert_allclose([float(row["map_age_s"]) for row in rows], ages, atol=1e-6)
+
+
+def test_the_fields_of_two_scenes_are_kept_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[weakref.ref[KnownFields]] = []
+    make = known_scene.splat_fields
+
+    def counted(*given: Any) -> KnownFields:
+        fields = make(*given)
+        made.append(weakref.ref(fields))
+        return fields
+
+    monkeypatch.setattr(known_scene, "splat_fields", counted)
+    scene = from_splats(
+        write_scene(tmp_path / "scene", *((k * SECOND, splats_of(BALL)) for k in range(6))), Config(), 1
+    )
+    for stamp in range(0, 6 * SECOND, SECOND // 4):
+        assert scene.at(stamp) is scene.at(stamp)
+        scene.step_at(stamp)
+        assert sum(ref() is not None for ref in made) <= 2
+    assert len(made) == 6
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (["--lockstep"], 4, "expected cameras, got joint states alone"),
+        (["--field", "x", "--latency", "0.1"], 2, "one scene for all times"),
+        (["--scene", "x", "--allow-disagreement"], 2, "expected --lockstep"),
+        (["--lockstep", "--latency=-1"], 2, "not below 0"),
+        (["--lockstep", "--scene", "x"], 2, "not allowed with"),
+    ],
+)
+def test_what_cannot_be_in_lockstep_is_said(
+    desk: Desk, options: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    desk.source.cameras = ()
+    assert desk.replay("-q", *options) == code
+    assert said in capsys.readouterr().err
