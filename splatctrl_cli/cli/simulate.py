@@ -17,8 +17,10 @@ def register(subparsers: Subparsers) -> None:
         subparsers, "simulate", run, summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth"
     )
     add_output(parser, default="simulated", what="folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the depth noise (default: 0)")
-    parser.add_argument("--duration", type=float, default=7.0, metavar="S", help="length in seconds (default: 7)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the noise and of --human-arm (default: 0)")
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="length in seconds (default: 7, with --human-arm 24)"
+    )
     parser.add_argument("--fps", type=float, default=5.0, metavar="HZ", help="frames a second (default: 5)")
     parser.add_argument("--width", type=int, default=320, metavar="PX", help="image width (default: 320)")
     parser.add_argument("--height", type=int, default=240, metavar="PX", help="image height (default: 240)")
@@ -29,6 +31,11 @@ def register(subparsers: Subparsers) -> None:
         "--person", action="store_true", help="a person with masks walks by, instead of the visitor that stands still"
     )
     parser.add_argument(
+        "--human-arm",
+        choices=("near-pickup", "near-goal"),
+        help="a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal",
+    )
+    parser.add_argument(
         "--dtu", action="store_true", help="write PATH/dtu too: a DTU scan of a scene that stands still"
     )
 
@@ -37,17 +44,20 @@ def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.io.output import Stopwatch, output_path, write_json, write_run
     from splatctrl_cli.simulate.recording import RecordingOptions
+    from splatctrl_cli.simulate.shared_workspace import DURATION_S
     from splatctrl_cli.simulate.truth import truth_document
 
+    default_s = 7.0 if args.human_arm is None else DURATION_S
     console = Console(args)
     options = RecordingOptions(
-        duration_s=args.duration,
+        duration_s=default_s if args.duration is None else args.duration,
         fps=args.fps,
         width=args.width,
         height=args.height,
         noise=args.noise,
         seed=args.seed,
         with_person=args.person,
+        human_arm=args.human_arm,
     )
     stopwatch = Stopwatch()
     out = args.out or Path("simulated")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -9,7 +10,8 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate import tabletop
+from splatctrl_cli.simulate import shared_workspace, tabletop
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.noise import DepthNoise
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.render import Renderer
@@ -27,7 +29,8 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 class RecordingOptions:
     """What to record: duration [s], frames per second of each camera, image size [px], depth noise, its seed.
 
-    with_person: a person with masks walks by, instead of the visitor that stands still.
+    with_person: a person with masks walks by, instead of the visitor that stands still. human_arm: one of
+    `shared_workspace.PLACES`, instead of both: the table shared with a person's arm, whose visit the seed draws.
     """
 
     duration_s: float = 7.0
@@ -37,6 +40,7 @@ class RecordingOptions:
     noise: str = "realsense"
     seed: int = 0
     with_person: bool = False
+    human_arm: str | None = None
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.duration_s <= 600:
@@ -48,6 +52,9 @@ class RecordingOptions:
                 raise UsageError(f"{option}: expected 16 to 4096 px, got {value}")
         if self.noise not in NOISES:
             raise UsageError(f"--noise: expected one of {', '.join(NOISES)}, got {self.noise}")
+        if self.human_arm is not None and (self.with_person or self.human_arm not in shared_workspace.PLACES):
+            places = ", ".join(shared_workspace.PLACES)
+            raise UsageError(f"--human-arm: expected one of {places}, without --person, got {self.human_arm}")
         if self.seed < 0:
             raise UsageError(f"--seed: expected 0 or more, got {self.seed}")
 
@@ -61,11 +68,21 @@ class Recording:
         span = round(options.duration_s * 1e9)
         self.start_ns, self.end_ns = START_NS, START_NS + span
         self.cameras = tabletop.cameras(options.width, options.height)
+        things, self._temporary, self._motion = self._scene()
+        self.primitives: tuple[Primitive, ...] = (*tabletop.furniture(), *things, *self._temporary)
+
+    def _scene(self) -> tuple[list[Primitive], list[Primitive], Motion]:
+        """What stands on the table, what is there for a while only, and the arm's motion."""
+        options, span = self.options, self.end_ns - self.start_ns
+        if options.human_arm is not None:
+            visit = shared_workspace.visit_of(options.human_arm, options.seed)
+            things = shared_workspace.things(options.human_arm, options.seed)
+            arm = shared_workspace.human_arm(visit, START_NS)
+            return things, arm, shared_workspace.task_motion(visit)
         third = (START_NS + span // 3, START_NS + 2 * span // 3)
         num_steps = max(round(options.duration_s * options.fps / 3), 1)
-        self._temporary = tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third)]
-        self.primitives: tuple[Primitive, ...] = (*tabletop.furniture(), *tabletop.things(), *self._temporary)
-        self._motion = tabletop.arm_motion(options.duration_s)
+        temporary = tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third)]
+        return tabletop.things(), temporary, tabletop.arm_motion(options.duration_s)
 
     def joint_states(self) -> Iterator[JointState]:
         """The arm's states from start to end, 50 a second."""
@@ -76,25 +93,29 @@ class Recording:
 
     def frames(self) -> Iterator[RgbdFrame]:
         """The images of every camera in time order, cameras in turn at each stamp."""
-        renderers = [Renderer(camera, self.primitives[: -len(self._temporary)]) for camera in self.cameras]
-        noise = NOISES[self.options.noise]
         for index in range(int(np.ceil(self.options.duration_s * self.options.fps - 1e-9))):
-            offset_ns = round(index * 1e9 / self.options.fps)
-            arm, passing = self._moving(offset_ns)
-            for number, renderer in enumerate(renderers):
-                color, depth = renderer.image([*arm, *passing])
-                human = _shown(depth, renderer.image(arm)[1]) if self.options.with_person else None
-                if noise is not None:
-                    depth = noise.applied(depth, np.random.default_rng([self.options.seed, number, index]))
-                yield RgbdFrame(
-                    stamp_ns=self.start_ns + offset_ns,
-                    camera=renderer.camera.name,
-                    color=color,
-                    depth=depth,
-                    intrinsics=renderer.camera.intrinsics,
-                    T_world_camera=renderer.camera.T_world_camera,
-                    human=human,
-                )
+            yield from self.frames_at(index, self._motion.at(self._offset_ns(index) / 1e9)[0])
+
+    def frames_at(self, index: int, q: Float64) -> Iterator[RgbdFrame]:
+        """The images of every camera at the time of the frame `index`, with the arm at q (J,)."""
+        stamp_ns = self.start_ns + self._offset_ns(index)
+        arm = tabletop.arm_solids(self.robot.urdf.shapes, self.link_poses(q))
+        passing = [p.at(stamp_ns) for p in self._temporary if p.is_present(stamp_ns)]
+        noise, has_masks = NOISES[self.options.noise], self.options.with_person or self.options.human_arm is not None
+        for number, renderer in enumerate(self._renderers):
+            color, depth = renderer.image([*arm, *passing])
+            human = _shown(depth, renderer.image(arm)[1]) if has_masks else None
+            if noise is not None:
+                depth = noise.applied(depth, np.random.default_rng([self.options.seed, number, index]))
+            yield RgbdFrame(
+                stamp_ns=stamp_ns,
+                camera=renderer.camera.name,
+                color=color,
+                depth=depth,
+                intrinsics=renderer.camera.intrinsics,
+                T_world_camera=renderer.camera.T_world_camera,
+                human=human,
+            )
 
     def records(self) -> Iterator[Record]:
         """Joint states and images by stamp; joint states come before images of the same stamp."""
@@ -150,11 +171,14 @@ class Recording:
         ]
         return np.array([state.stamp_ns for state in states], dtype=np.int64), np.array(clearance)
 
-    def _moving(self, offset_ns: int) -> tuple[list[Primitive], list[Primitive]]:
-        """The arm's solids, and what is there for a while only."""
-        q, _ = self._motion.at(offset_ns / 1e9)
-        arm = tabletop.arm_solids(self.robot.urdf.shapes, self.link_poses(q))
-        return arm, [p for p in self._temporary if p.is_present(self.start_ns + offset_ns)]
+    def _offset_ns(self, index: int) -> int:
+        """When the frame `index` is taken, from the start [ns]."""
+        return round(index * 1e9 / self.options.fps)
+
+    @cached_property
+    def _renderers(self) -> list[Renderer]:
+        """One by camera, with what is always there cast."""
+        return [Renderer(camera, self.primitives[: -len(self._temporary)]) for camera in self.cameras]
 
 
 def _shown(depth: Float32, without: Float32) -> UInt8:
