@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 Metrics = dict[str, float | None]
 
-_HEAD = ("num_spheres", "num_bare_links", "num_states", "num_before_scene", "duration_s", "min_clearance")
+_HEAD = (
+    *("num_spheres", "num_bare_links", "coverage_deficit", "num_self_pairs", "num_states", "num_before_scene"),
+    *("duration_s", "min_clearance"),
+)
 _TAIL = (
     *("min_clearance_true", "num_below_margin", "num_in_collision", "min_self_clearance", "min_limit_margin"),
     *("unknown_share", "num_without_distance", "num_static_violations", "max_map_age_s"),
@@ -58,6 +61,8 @@ def metrics_of(replay: "Replay") -> Metrics:
     metrics: Metrics = {
         "num_spheres": len(replay.model.sphere_set.radii),
         "num_bare_links": len(replay.model.bare_links),
+        "coverage_deficit": None if replay.model.coverage is None else replay.model.coverage.max_deficit,
+        "num_self_pairs": len(replay.model.self_pairs()),
         "num_states": len(audit.stamp_ns),
         "num_before_scene": replay.num_before_scene,
         "duration_s": float(audit.stamp_ns[-1] - audit.stamp_ns[0]) * 1e-9,

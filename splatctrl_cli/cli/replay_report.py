@@ -38,12 +38,13 @@ def write_replay(
 ) -> None:
     """Write steps.csv, events.json, summary.json, pictures and run.json."""
     from splatctrl_cli.cli.replay_columns import chunks_of
+    from splatctrl_cli.cli.replay_robot import coverage_words
     from splatctrl_cli.io.output import write_json, write_run
     from splatctrl_cli.io.replay_output import write_steps
 
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
-    write_json(folder / "summary.json", summary_of(replay, metrics))
+    write_json(folder / "summary.json", summary_of(replay, metrics, coverage_words(replay.model, config.control)))
     with stopwatch.stage("picture"):
         _draw(folder, replay)
     write_run(folder, command="replay", config=config.as_dict(), inputs=inputs, metrics=metrics, stopwatch=stopwatch)
@@ -75,12 +76,13 @@ def _draw(folder: Path, replay: "Replay") -> None:
         divergence_picture(folder / "divergence.png", seconds, of.joints, of.position, of.rotation)
 
 
-def summary_of(replay: "Replay", metrics: "Metrics") -> dict[str, Any]:
+def summary_of(replay: "Replay", metrics: "Metrics", coverage: str) -> dict[str, Any]:
     """When and why, the metrics, and the words that go with them."""
     words = {
         "mode": replay.mode,
         "outcome": str(replay.closed_loop.outcome) if replay.closed_loop else f"{replay.mode}: every state",
         "margin": replay.margin,
+        "coverage": coverage,
         "units": "m, rad, s",
         "min_clearance": "the smallest exact distance from a moving sphere's surface to the splats",
     }

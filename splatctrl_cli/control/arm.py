@@ -12,7 +12,8 @@ from splatctrl_cli.records import Bool, Float64, SphereSet
 class ArmModel(Protocol):
     """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` is one.
 
-    J joints, S spheres; positions [m] and poses in world.
+    J joints, S spheres; positions [m] and poses in world. sphere_deficit (S,) [m]: how far outside the spheres the
+    surface of a sphere's body may be, NaN where nobody measured it.
     """
 
     @property
@@ -32,6 +33,9 @@ class ArmModel(Protocol):
 
     @property
     def moving_spheres(self) -> Bool: ...
+
+    @property
+    def sphere_deficit(self) -> Float64: ...
 
     @property
     def middle(self) -> Float64: ...

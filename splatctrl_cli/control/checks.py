@@ -47,6 +47,17 @@ def check_model(model: ArmModel) -> None:
         raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
 
 
+def check_coverage(model: ArmModel, config: ControlConfig) -> None:
+    """Raise InputError where the rows should make up for uncovered surface and nobody measured how much there is."""
+    unknown = np.isnan(model.sphere_deficit) & np.asarray(model.moving_spheres)
+    if config.coverage == "margin" and np.any(unknown):
+        name = sphere_names(model.sphere_set)[int(np.argmax(unknown))]
+        raise InputError(
+            f"control.coverage = margin: sphere {name}: expected a measured coverage of its body, got none",
+            remedy="give a URDF whose collision geometry can be read, or set control.coverage = report",
+        )
+
+
 def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions") -> Float64:
     """q as (J,) float64. Raises InputError where it has another size or is not finite."""
     posture = np.asarray(q, dtype=np.float64)
@@ -96,17 +107,19 @@ def check_goal(model: ArmModel, T_world_goal: Float64) -> None:
 
 
 def static_violations(
-    model: ArmModel, field: DistanceField, q: Float64, margin: float
+    model: ArmModel, field: DistanceField, q: Float64, margin: float | Float64
 ) -> tuple[StaticViolation, ...]:
-    """The spheres that no joint moves and that stand within the margin [m]: a matter of mounting, not of control."""
+    """The spheres that no joint moves and that stand within the margin [m], one or (S,): a matter of mounting, not of
+    control.
+    """
     if np.all(model.moving_spheres):
         return ()
     still, distance = sphere_clearance(model, field, q, ~np.asarray(model.moving_spheres))
-    names = sphere_names(model.sphere_set)
+    names, least = sphere_names(model.sphere_set), np.broadcast_to(margin, len(model.moving_spheres))
     return tuple(
         StaticViolation(sphere=names[s], clearance=float(d))
         for s, d in zip(still, distance, strict=True)
-        if d < margin
+        if d < least[s]
     )
 
 

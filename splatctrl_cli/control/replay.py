@@ -23,6 +23,7 @@ from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.rates import SceneStepAt, rate_of
+from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.control.target import Guide, pose_error
 from splatctrl_cli.records import DistanceField, Float64
@@ -124,7 +125,7 @@ def closed_loop(
     field = field_at(task.stamp_ns)
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
     check_free(model, field, q)
-    statics = static_violations(model, field, q, config.margin)
+    statics = static_violations(model, field, q, scene_margin(model, config))
     course = _Course(model, config, task)
     stamps, positions, steps, changes, anchored = [], [], [], [], []
     outcome = Outcome.LOG_ENDED if task.follow is not None else Outcome.TIMEOUT

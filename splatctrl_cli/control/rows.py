@@ -12,6 +12,8 @@ from splatctrl_cli.control.barriers import Barrier
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
+MARGIN = "margin"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
@@ -55,7 +57,8 @@ class RowBuilder:
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
-        self._margin = np.repeat([config.margin, config.self_margin], [len(self._moving), len(self._pairs)])
+        own_margin = np.full(len(self._pairs), config.self_margin)
+        self._margin = np.concatenate([scene_margin(model, config)[self._moving], own_margin])
         self.names = _row_names(sphere_names(model.sphere_set), self._moving, self._pairs)
 
     @property
@@ -148,6 +151,17 @@ class RowBuilder:
                 remedy="bake a field that covers the robot's reach",
             )
         return distance - self._radii[self._moving], gradient
+
+
+def scene_margin(model: ArmModel, config: ControlConfig) -> Float64:
+    """The distance (S,) [m] that every sphere keeps to the scene: epsilon, and where `config.coverage` is "margin"
+    also what the spheres leave uncovered of their body.
+
+    A point of the surface is no farther than that deficit from a sphere, so by the triangle inequality the surface
+    keeps epsilon where the spheres keep this, of any distance that changes by no more than a metre per metre.
+    """
+    deficit = np.asarray(model.sphere_deficit) if config.coverage == MARGIN else np.zeros(len(model.moving_spheres))
+    return config.margin + deficit
 
 
 def _row_names(spheres: tuple[str, ...], moving: NDArray[np.integer], pairs: NDArray[np.integer]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import tasks
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.checks import check_config, check_model, checked_posture
+from splatctrl_cli.control.checks import check_config, check_coverage, check_model, checked_posture
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import velocity_box
 from splatctrl_cli.control.presets import PAPER, PrintedTask, solve_printed
@@ -109,6 +109,7 @@ class QpIkController:
         """
         check_config(config)
         check_model(model)
+        check_coverage(model, config)
         self._model, self._config, self._frame = model, config, frame
         self._solver: QpSolver = solver_named(config.solver) if solver is None else solver
         self._home = np.asarray(model.middle if home is None else home, dtype=np.float64)

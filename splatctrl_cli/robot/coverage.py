@@ -149,6 +149,20 @@ def coverage_of_solids(
     )
 
 
+def deficit_by_sphere(urdf: UrdfFile, spheres: SphereSet, report: CoverageReport) -> Float64:
+    """How far outside all spheres (S,) [m] a surface point of each sphere's rigid body may be (proven).
+
+    The spheres of links that fixed joints join cover each other's surface, so the worst link of the body counts for
+    all of its spheres. 0 for a body without collision geometry.
+    """
+    leaders = {link: leader for link, (leader, _) in urdf.rigid_bodies().items()}
+    worst: dict[str, float] = {}
+    for link in report.links:
+        if link.deficit is not None:
+            worst[leaders[link.link]] = max(worst.get(leaders[link.link], 0.0), link.deficit.proven)
+    return np.array([worst.get(leaders[link], 0.0) for link in spheres.links], dtype=np.float64)
+
+
 def largest_deficit(
     triangles: Float64, centers: Float64, radii: Float64, *, tolerance: float = TOLERANCE, floor: float = 0.0
 ) -> Deficit:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
+from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.levers import lever_arms
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.spheres import matched_links, spheres_of
@@ -26,7 +27,9 @@ class RobotModel:
 
     joint_names, lower, upper [rad or m], velocity_limit [1/s] (J,); sphere_set in link frames; frame_names: what
     `frame_pose` knows; urdf: the file it came from; left_out: links of the sphere file that the URDF does not have;
-    bare_links: links with a body in the URDF and no sphere.
+    bare_links: links with a body in the URDF and no sphere; coverage: how the spheres cover the collision surface,
+    None where it was not measured, and then coverage_unknown says why; sphere_deficit (S,) [m]: how far outside the
+    spheres a surface point of the sphere's rigid body may be, NaN where that is not known.
     """
 
     def __init__(
@@ -49,6 +52,10 @@ class RobotModel:
         self.are_links_renamed = are_links_renamed
         covered = set(spheres.links)
         self.bare_links = tuple(link for link in urdf.solid_links if link not in covered)
+        self.coverage: CoverageReport | None = None
+        self.coverage_unknown = "the collision geometry was not read"
+        self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
+        self._chosen_pairs: Index | None = None
         self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
         rows = [joint.idx_q for joint in model.joints][1:]
         self.lower: Float64 = np.where(self._is_wrapped, -np.inf, model.lowerPositionLimit[rows])
@@ -92,6 +99,22 @@ class RobotModel:
         sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
         is_renamed = not set(asked.links) & set(file.links)
         return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed)
+
+    def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
+        """The same robot with its spheres' coverage measured; `unknown` says why there is no report."""
+        deficit = np.full(len(self.sphere_set.radii), np.nan)
+        if coverage is not None:
+            deficit = deficit_by_sphere(self.urdf, self.sphere_set, coverage)
+        return self._changed(coverage=coverage, coverage_unknown=unknown, sphere_deficit=deficit)
+
+    def with_self_pairs(self, pairs: Index) -> "RobotModel":
+        """The same robot, whose `self_pairs` are these (P, 2)."""
+        return self._changed(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2))
+
+    def _changed(self, **attributes: object) -> "RobotModel":
+        other = object.__new__(RobotModel)
+        other.__dict__.update(self.__dict__, **attributes)
+        return other
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -170,8 +193,11 @@ class RobotModel:
         """Pairs (P, 2) of spheres that could collide with each other.
 
         Left out: pairs on the same or on adjacent bodies (links joined by fixed joints are one), and pairs whose
-        gap at `posture` (J,) (default: the middle of the limits) is at most `touching` [m].
+        gap at `posture` (J,) (default: the middle of the limits) is at most `touching` [m]. Pairs that were chosen
+        (`with_self_pairs`) stand for the default.
         """
+        if self._chosen_pairs is not None and posture is None:
+            return self._chosen_pairs
         centers = self.sphere_centers(self.middle if posture is None else posture)
         parents = np.array(self._model.parents, dtype=np.int64)
         a, b = np.triu_indices(len(centers), k=1)

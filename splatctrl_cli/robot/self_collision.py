@@ -92,6 +92,14 @@ def self_collision_pairs(
     )
 
 
+def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Int64:
+    """The model's `self_pairs` (P, 2) less those of links that `disabled` (an SRDF) names."""
+    off = {frozenset(pair.links) for pair in disabled}
+    links, pairs = model.sphere_set.links, model.self_pairs()
+    keep = [frozenset((links[a], links[b])) not in off for a, b in pairs]
+    return np.asarray(pairs[np.array(keep, dtype=np.bool_)])
+
+
 def _joined(model: RobotModel) -> dict[frozenset[str], str]:
     """Pairs of links that no posture tells anything about: of one rigid body, or of two bodies with one joint."""
     bodies = model.urdf.rigid_bodies(model.joint_names)

@@ -22,6 +22,7 @@ class PlanarArm:
             radii=np.array([0.06] + [radius] * 4),
         )
         self.moving_spheres: Bool = np.array([False, True, True, True, True])
+        self.sphere_deficit: Float64 = np.full(5, np.nan)
         self.base_position: Float64 = np.zeros(3)
         self.middle: Float64 = np.zeros(2)
         self.pairs = np.array([[0, 3], [0, 4]])

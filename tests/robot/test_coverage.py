@@ -10,6 +10,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot.coverage import TOLERANCE, areas, coverage_deficit, largest_deficit, refined, uncovered_area
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf
 from tests.robot.shapes import BALL, BOX, arm_of, written
 
@@ -182,3 +183,15 @@ def test_public_panda_sets_leave_much_of_the_collision_hulls_uncovered(
     assert report.uncovered_share == pytest.approx(share, abs=0.005)
     assert report.max_deficit == pytest.approx(deficit, abs=2e-4)
     assert report.open_links == ("panda_link6",)
+
+
+def test_the_worst_link_of_a_rigid_body_counts_for_all_of_its_spheres(tmp_path: Path) -> None:
+    pad = '<link name="pad"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>'
+    glue = '<joint name="glue" type="fixed"><parent link="tip"/><child link="pad"/><origin xyz="0 0 0.02"/></joint>'
+    path = written(tmp_path, arm_of(BALL, BALL).replace("</robot>", f"{pad}{glue}</robot>"))
+    spheres = SphereSet(links=("base", "tip", "pad"), centers=np.zeros((3, 3)), radii=np.array([0.08, 0.07, 0.05]))
+    model = RobotModel.from_urdf(path, spheres)
+    assert np.isnan(model.sphere_deficit).all() and "not read" in model.coverage_unknown
+    measured = model.with_coverage(coverage_deficit(model.urdf, spheres))
+    np.testing.assert_allclose(measured.sphere_deficit, [0.0, 0.01, 0.01], atol=1e-9)
+    assert np.isnan(model.sphere_deficit).all()

@@ -1,0 +1,107 @@
+"""The robot of a replay: its model, what its spheres leave uncovered, and which of its links may touch."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.cli.robot_options import locked_joints
+from splatctrl_cli.errors import InputError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.config import ControlConfig
+    from splatctrl_cli.robot.coverage import LinkCoverage
+    from splatctrl_cli.robot.model import RobotModel
+
+COARSE = 0.02  # [m] of areas, which a replay does not report; the deficit is as exact as ever
+
+
+def add_robot_geometry(parser: argparse.ArgumentParser) -> None:
+    """``--packages`` and ``--srdf``."""
+    parser.add_argument(
+        "--packages",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder in which package:// paths of the URDF's meshes are found (repeatable; default: those above it)",
+    )
+    parser.add_argument(
+        "--srdf", type=Path, metavar="FILE", help="self-collision rows leave out what its disable_collisions name"
+    )
+
+
+def read_robot(args: argparse.Namespace, config: "ControlConfig") -> "RobotModel":
+    """The model of the arguments, its spheres measured against the URDF's collision geometry where that can be read.
+
+    Raises InputError where `config.coverage` is "margin" and no distance bounds what is uncovered.
+    """
+    from splatctrl_cli.geometry import transform_from
+    from splatctrl_cli.robot.model import RobotModel
+    from splatctrl_cli.robot.self_collision import without_disabled
+    from splatctrl_cli.robot.srdf import read_srdf
+
+    T_world_base = None if args.base is None else transform_from(args.base[:3], args.base[3:])
+    model = RobotModel.from_urdf(args.urdf, args.spheres, T_world_base=T_world_base, locked=locked_joints(args.lock))
+    if args.srdf is not None:
+        disabled, _ = read_srdf(args.srdf, model.urdf)
+        model = model.with_self_pairs(without_disabled(model, disabled))
+    model = _measured(model, args.packages)
+    if config.coverage == "margin":
+        _check_bounded(model)
+    return model
+
+
+def coverage_words(model: "RobotModel", config: "ControlConfig") -> str:
+    """What the spheres leave uncovered, or why that is not known, and the margin that then holds for the surface."""
+    report = model.coverage
+    if report is None:
+        return f"how much of the surface the spheres cover is not known: {model.coverage_unknown}"
+    if not report.bare_links and report.max_deficit == 0:
+        return "the spheres cover all of the collision surface (proven): the margin is that of the surface"
+    far = max((link for link in report.links if link.deficit is not None), key=_proven, default=None)
+    words = "no link has spheres" if far is None else f"the spheres leave up to {1e3 * _proven(far):.2f} mm uncovered"
+    words += "" if far is None else f" ({far.link})"
+    if config.coverage == "margin":
+        words += (
+            f"; their rows keep that much more, link by link, so that the surface keeps {1e3 * config.margin:g} mm"
+        )
+    else:
+        left = 1e3 * (config.margin - (0.0 if far is None else _proven(far)))
+        words += f"; where they keep {1e3 * config.margin:g} mm the surface keeps " + (
+            f"{left:.2f} mm" if left > 0 else "nothing for certain"
+        )
+    bare = f", and nothing of {', '.join(report.bare_links)}, which have no sphere" if report.bare_links else ""
+    return words + bare
+
+
+def _measured(model: "RobotModel", packages: list[Path]) -> "RobotModel":
+    from splatctrl_cli.robot.coverage import coverage_deficit
+
+    try:
+        return model.with_coverage(
+            coverage_deficit(model.urdf, model.sphere_set, folders=packages, resolution=COARSE)
+        )
+    except InputError as error:
+        return model.with_coverage(None, str(error))
+
+
+def _check_bounded(model: "RobotModel") -> None:
+    """Raise InputError where a link that moves has no sphere, or nothing was measured."""
+    wanted, name = "control.coverage = margin", model.urdf.path.name
+    if model.coverage is None:
+        raise InputError(
+            f"{wanted}: expected the collision geometry of {name}: {model.coverage_unknown}",
+            remedy="give --packages, or a URDF with collision geometry, or set control.coverage = report",
+        )
+    bodies = model.urdf.rigid_bodies()
+    children = {child for _, child in model.urdf.parents}
+    bare = [link for link in model.coverage.bare_links if bodies[link][0] in children]
+    if bare:
+        raise InputError(
+            f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {name}",
+        )
+
+
+def _proven(link: "LinkCoverage") -> float:
+    return 0.0 if link.deficit is None else max(0.0, link.deficit.proven)

@@ -1,0 +1,129 @@
+"""What a replay says of the robot it was given: uncovered surface, and pairs that an SRDF takes out."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.replay import ReplayTask, closed_loop
+from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.records import Float64, SphereSet
+from splatctrl_cli.robot.coverage import coverage_deficit, refined
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.solids import read_solids
+from splatctrl_cli.robot.sphere_files import spheres_yaml
+from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_scene
+from tests.control.fakes import Balls
+
+SHORT = 0.012  # [m] taken off every radius
+
+
+def shrunk(spheres: SphereSet, links: tuple[str, ...] | None = None) -> SphereSet:
+    """The set with smaller spheres, only those on `links`."""
+    kept = [index for index, link in enumerate(spheres.links) if links is None or link in links]
+    return SphereSet(
+        links=tuple(spheres.links[index] for index in kept),
+        centers=spheres.centers[kept],
+        radii=spheres.radii[kept] - SHORT,
+    )
+
+
+def with_spheres(desk: Desk, spheres: SphereSet) -> Desk:
+    path = desk.folder / "spheres.yaml"
+    path.write_text(spheres_yaml(spheres))
+    desk.robot[-1] = str(path)
+    return desk
+
+
+def about(desk: Desk) -> str:
+    return str(json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["coverage"])
+
+
+def surface_clearance(model: RobotModel, positions: Float64, field: Balls) -> float:
+    """The least distance from points on the collision surface of the links that move, at most 2 cm apart."""
+    least = np.inf
+    for link, solids in read_solids(model.urdf).items():
+        if link != "link0":
+            points = np.concatenate([refined(s.surface.corners, 0.02)[0].reshape(-1, 3)[::3] for s in solids])
+            poses = [model.frame_pose(q, link) for q in positions]
+            least = min(least, *(field.query(transform_points(pose, points))[0].min() for pose in poses))
+    return float(least)
+
+
+def test_a_replay_says_what_the_spheres_leave_uncovered(desk: Desk, arm: RobotModel) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    with_spheres(desk, shrunk(arm.sphere_set))
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    report = coverage_deficit(arm.urdf, shrunk(arm.sphere_set))
+    assert desk.metrics()["coverage_deficit"] == pytest.approx(report.max_deficit, abs=1e-9)
+    assert report.worst is not None and report.worst.link in about(desk)
+    assert f"up to {1e3 * report.worst.deficit.proven:.2f} mm" in about(desk)  # type: ignore[union-attr]
+    assert "where they keep 20 mm the surface keeps" in about(desk)
+
+
+def test_a_link_without_a_sphere_is_named_and_refused_as_a_margin(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    links = tuple(link for link in dict.fromkeys(arm.sphere_set.links) if link not in ("link0", "link3"))
+    with_spheres(desk, shrunk(arm.sphere_set, links))
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.metrics()["coverage_deficit"] is None
+    assert "nothing of link0, link3, which have no sphere" in about(desk)
+    capsys.readouterr()
+    assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
+    message = capsys.readouterr().err
+    assert "expected spheres on every link that moves, got none on link3\n" in message.replace(";", "\n")
+    assert "splatctrl robot spheres" in message
+
+
+def test_collision_geometry_that_cannot_be_read_is_said_and_refused_as_a_margin(
+    desk: Desk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    urdf = Path(desk.robot[1])
+    lost = desk.folder / "lost.urdf"
+    mesh = '<collision><geometry><mesh filename="package://arm/m.stl"/></geometry></collision>'
+    lost.write_text(urdf.read_text().replace('<link name="link1">', f'<link name="link1">{mesh}', 1))
+    desk.robot[1] = str(lost)
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    assert desk.metrics()["coverage_deficit"] is None
+    assert "is not known" in about(desk) and "package://arm/m.stl" in about(desk)
+    capsys.readouterr()
+    assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
+    assert "give --packages" in capsys.readouterr().err
+
+
+def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotModel, sample_data: Path) -> None:
+    spheres = shrunk(arm.sphere_set)
+    model = RobotModel.from_urdf(sample_data / "tabletop" / "robot.urdf", spheres)
+    model = model.with_coverage(coverage_deficit(model.urdf, spheres))
+    ball, frame = Balls([BALL[0]], [BALL[1]]), model.frame_names[-1]
+    goal = model.frame_pose(START, frame)
+    goal[:3, 3] = np.array(BALL[0]) - [0.02, 0.02, 0.0]
+    task = ReplayTask(start=START, T_world_goal=goal, frame=frame)
+    kept = {}
+    for coverage in ("report", "margin"):
+        config = ControlConfig(coverage=coverage, solver="daqp", max_time=6.0)
+        trace = closed_loop(model, config, task, lambda stamp: ball)
+        kept[coverage] = surface_clearance(model, trace.position[:: len(trace.position) // 4], ball)
+    assert kept["margin"] >= 0.02 - 1e-3
+    assert kept["report"] < 0.02 - 3e-3
+
+
+def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    links = [arm.sphere_set.links[s] for s in arm.self_pairs()[0]]
+    srdf = desk.folder / "arm.srdf"
+    srdf.write_text(
+        f'<robot name="arm"><disable_collisions link1="{links[1]}" link2="{links[0]}" reason="Never"/></robot>'
+    )
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    every = desk.metrics()["num_self_pairs"]
+    assert every == len(arm.self_pairs())
+    gone = sum({arm.sphere_set.links[a], arm.sphere_set.links[b]} == set(links) for a, b in arm.self_pairs())
+    assert desk.replay("--scene", str(scene), "-q", "--force", "--srdf", str(srdf)) == 0
+    assert gone > 0 and desk.metrics()["num_self_pairs"] == every - gone
+    assert srdf.name in json.loads((desk.folder / "out" / "run.json").read_text())["inputs"]
