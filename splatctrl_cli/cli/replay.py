@@ -16,7 +16,7 @@ from splatctrl_cli.cli.common import (
     configured,
 )
 from splatctrl_cli.cli.lockstep import add_lockstep, check_lockstep
-from splatctrl_cli.cli.replay_baseline import add_baseline, read_zone
+from splatctrl_cli.cli.replay_baseline import add_baseline, read_baselines, read_zone
 from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose, seconds
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, read_robot
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     fields = ("exact", "barrier", *(("certified",) if args.field is not None else ()))
     check_gate_names(
         args.require,
-        metric_names(args.mode, fields, has_truth=args.truth is not None, has_baseline=args.baseline is not None),
+        metric_names(args.mode, fields, has_truth=args.truth is not None, baselines=read_baselines(args)),
     )
     golden = read_golden(args)
     read_zone(args)

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.cli.replay_baseline import BESIDE, FIGURES, separation_figures
+from splatctrl_cli.cli.replay_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
+from splatctrl_cli.cli.replay_compare import figure_names, figures_of
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_modes import Replay
@@ -40,13 +41,16 @@ _CLOSED_LOOP = (
 _TRUTH = ("num_compared", "median", "p95", "largest", "largest_over", "share_within")
 
 
-def metric_names(mode: str, fields: Sequence[str], *, has_truth: bool, has_baseline: bool = False) -> tuple[str, ...]:
-    """The names that `metrics_of` gives for a --mode, with fields by name ("exact" first)."""
+def metric_names(
+    mode: str, fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """The names that `metrics_of` gives for a --mode and --baseline, with fields by name ("exact" first)."""
     names = [*_HEAD, *(f"min_clearance_{name}" for name in fields if name != "exact"), *_TAIL]
     names += [] if mode == "audit" else _STEPS
     names += {"audit": (), "open-loop": _OPEN_LOOP, "closed-loop": _CLOSED_LOOP}[mode]
-    if has_baseline:
+    if STANDSTILL in baselines:
         names += [f"{motion}_{figure}" for motion in BESIDE for figure in FIGURES]
+    names += figure_names(baselines, has_truth=has_truth)
     if has_truth:
         names += [*(f"truth_{figure}_{name}" for name in fields for figure in _TRUTH), "truth_tolerance"]
     return tuple(names)
@@ -87,6 +91,7 @@ def metrics_of(replay: "Replay") -> Metrics:
     for motion, separation in replay.separations.items():
         figures = separation_figures(separation, replay.period)
         metrics |= {f"{motion}_{figure}": value for figure, value in figures.items()}
+    metrics |= figures_of(replay.comparison)
     for name, agreement in replay.agreement.items():
         metrics[f"truth_num_compared_{name}"] = agreement.num_states
         metrics[f"truth_median_{name}"] = agreement.median

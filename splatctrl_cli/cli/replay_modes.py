@@ -10,7 +10,8 @@ import numpy as np
 
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.known_scene import KnownScene
-from splatctrl_cli.cli.replay_baseline import read_zone, separations
+from splatctrl_cli.cli.replay_baseline import read_baselines, read_zone, separations
+from splatctrl_cli.cli.replay_compare import Comparison, compared
 from splatctrl_cli.cli.replay_goal import goal_waypoints
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, audit, checked_states
@@ -63,7 +64,8 @@ class Replay:
 
     num_before_scene: logged states earlier than the first scene, left out; start_time_s: of the first state in the
     log [s]; obstacles (T,): what is nearest to the nearest sphere; map_age_s (T,): of the scene in use; separations:
-    with a baseline the distances from people, by name of the motion, sampled at `period` [s].
+    with a standstill the distances from people, by name of the motion, sampled at `period` [s]; comparison: every
+    motion of --baseline and its figures.
     """
 
     model: "RobotModel"
@@ -82,6 +84,7 @@ class Replay:
     agreement: "Mapping[str, ClearanceAgreement]" = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     separations: "Mapping[str, Separation]" = field(default_factory=dict)
+    comparison: Comparison = field(default_factory=Comparison)
     period: float = 0.0
 
     @property
@@ -101,12 +104,13 @@ def replayed(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", c
     mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[args.mode]
     zone = read_zone(args)
     replay = mode(args, inputs, config, console)
-    return replace(
+    replay = replace(
         replay,
         events=_explained(replay, inputs, args.max_map_age),
         separations=separations(args, zone, inputs, replay, config),
         period=config.control.period,
     )
+    return replace(replay, comparison=compared(args, read_baselines(args), inputs, replay, config, console))
 
 
 def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:

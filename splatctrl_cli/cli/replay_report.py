@@ -5,6 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatctrl_cli.cli import replay_compare
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.replay_baseline import FIGURES
 
@@ -44,6 +45,8 @@ def write_replay(
 
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
+    if replay.comparison.methods:
+        write_json(folder / "methods.json", replay_compare.document_of(replay.comparison))
     write_json(folder / "summary.json", summary_of(replay, metrics, coverage_words(replay.model, config.control)))
     with stopwatch.stage("picture"):
         _draw(folder, replay)
@@ -143,6 +146,7 @@ def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> list[
             (figure, *(_shown(metrics[f"{motion}_{figure}"]) for motion in replay.separations)) for figure in FIGURES
         ]
         lines += ["", "Beside people, from the same moment:", *table(("", *replay.separations), rows)]
+    lines += replay_compare.lines_of(replay.comparison)
     if replay.static_violations:
         rows = [(violation.sphere, f"{violation.clearance:.4f}") for violation in replay.static_violations]
         lines += ["", "Spheres that no joint moves, within the margin:", *table(("sphere", "clearance"), rows)]

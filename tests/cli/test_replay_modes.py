@@ -274,7 +274,7 @@ def test_the_standstill_waits_where_the_controller_goes_on(
     assert metrics["closed_loop_num_stops"] == 0
     assert 0.25 < metrics["closed_loop_min_human_distance"] < 0.9
     assert "Beside people, from the same moment:" in capsys.readouterr().out
-    names = metric_names("closed-loop", ("exact", "barrier"), has_truth=False, has_baseline=True)
+    names = metric_names("closed-loop", ("exact", "barrier"), has_truth=False, baselines=["standstill"])
     assert set(metrics) == set(names)
 
 

@@ -1,0 +1,301 @@
+"""The methods of ``--baseline`` beside the closed loop and the log: one task, one scene, one table."""
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.common import table
+from splatctrl_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.cli.common import Console
+    from splatctrl_cli.cli.known_scene import KnownFields
+    from splatctrl_cli.cli.replay_modes import Replay, ReplayInputs
+    from splatctrl_cli.config import Config
+    from splatctrl_cli.control.audit import DistanceFunction
+    from splatctrl_cli.control.comparison import Motion, MotionFigures, Yardstick
+    from splatctrl_cli.control.planned import PlannedPath
+    from splatctrl_cli.control.replay import ReplayTask
+    from splatctrl_cli.records import Float64
+
+BIRRT, BIRRT_IK = "birrt", "birrt-ik"
+ALWAYS = ("closed_loop", "log")  # what stands in every comparison
+ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
+_MOTION = (
+    *("success", "goal_reached", "duration_s", "joint_path_rad", "effector_path_m", "effector_path_deg"),
+    *("min_clearance_barrier", "min_clearance", "min_clearance_proved", "min_clearance_true", "num_interventions"),
+)
+_PLAN = ("planning_time_s", "planned_margin", "planned_self_margin", "num_edges", "num_edges_proved")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Motions and their figures by method, and plans of the methods that plan; without a path there is no motion."""
+
+    motions: "Mapping[str, Motion]" = field(default_factory=dict)
+    figures: "Mapping[str, MotionFigures]" = field(default_factory=dict)
+    plans: "Mapping[str, PlannedPath]" = field(default_factory=dict)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Every method, in the order in which they stand side by side."""
+        return tuple(dict.fromkeys((*self.motions, *self.plans)))
+
+
+def method_named(baseline: str) -> str:
+    """The method of a baseline, as metrics begin with it."""
+    return baseline.replace("-", "_")
+
+
+def figure_names(baselines: Sequence[str], *, has_truth: bool) -> tuple[str, ...]:
+    """The names that `figures_of` gives; none without a baseline."""
+    if not baselines:
+        return ()
+    methods = (*ALWAYS, *map(method_named, baselines))
+    plans = {method_named(name) for name in (BIRRT, BIRRT_IK)}
+    names = [(method, name) for method in methods for name in (*_MOTION, *(_PLAN if method in plans else ()))]
+    return tuple(f"{method}_{name}" for method, name in names if has_truth or name != "min_clearance_true")
+
+
+def figures_of(comparison: Comparison) -> dict[str, float | None]:
+    """Every figure of every method, by `figure_names`."""
+    has_truth = any(figures.true_clearance is not None for figures in comparison.figures.values())
+    found: dict[str, float | None] = {}
+    for method in comparison.methods:
+        values = _motion_values(comparison.figures.get(method))
+        if not has_truth:
+            del values["min_clearance_true"]
+        if method in comparison.plans:
+            values |= _plan_values(comparison.plans[method])
+        found |= {f"{method}_{name}": value for name, value in values.items()}
+    return found
+
+
+def lines_of(comparison: Comparison) -> list[str]:
+    """The table of all methods side by side, and a line for each plan that was not found or has a smaller margin."""
+    if not comparison.methods:
+        return []
+    figures, methods = figures_of(comparison), comparison.methods
+    names = [name for name in (*_MOTION, *_PLAN) if any(f"{method}_{name}" in figures for method in methods)]
+    rows = [(name, *(_shown(figures.get(f"{method}_{name}")) for method in methods)) for name in names]
+    lines = ["", "Side by side, from the same state to the same goal:", *table(("", *methods), rows)]
+    return lines + [
+        f"{method}: no path: {plan.outcome}" for method, plan in comparison.plans.items() if not plan.path
+    ]
+
+
+def document_of(comparison: Comparison) -> dict[str, Any]:
+    """methods.json: figures by method, and what was planned."""
+    figures = figures_of(comparison)
+    by_method = {
+        method: {name: figures[f"{method}_{name}"] for name in (*_MOTION, *_PLAN) if f"{method}_{name}" in figures}
+        for method in comparison.methods
+    }
+    plans = {
+        method: {"outcome": str(plan.outcome), "waypoints": plan.path.waypoints.tolist() if plan.path else []}
+        for method, plan in comparison.plans.items()
+    }
+    return {"units": "m, rad, s, degrees where the name says so", "methods": by_method, "plans": plans}
+
+
+def check_comparable(args: argparse.Namespace, baselines: Sequence[str]) -> None:
+    """Raise UsageError where a planner is asked for more than one goal."""
+    if not {BIRRT, BIRRT_IK} & set(baselines):
+        return
+    for option, given in (
+        ("--waypoints", args.waypoints),
+        ("--follow", args.follow),
+        ("--re-anchor", args.re_anchor),
+    ):
+        if given:
+            raise UsageError(f"--baseline birrt: expected a single goal, got {option}", remedy=f"leave out {option}")
+
+
+def compared(
+    args: argparse.Namespace,
+    baselines: Sequence[str],
+    inputs: "ReplayInputs",
+    replay: "Replay",
+    config: "Config",
+    console: "Console",
+) -> Comparison:
+    """The closed loop, the log and every baseline, each in the scene as it was known at its time.
+
+    Planned paths are those of the scene known at the start; they begin there and then, as if planning took no time.
+    """
+    import numpy as np
+
+    from splatctrl_cli.cli.replay_modes import logged_motion
+    from splatctrl_cli.control.comparison import Motion
+    from splatctrl_cli.control.open_loop import is_shaped
+
+    trace = replay.closed_loop
+    if not baselines or trace is None:
+        return Comparison()
+    start_ns, control = int(trace.stamp_ns[0]), config.control
+    log = logged_motion(inputs)
+    task = _task(args, inputs, trace.position[0], start_ns, log.position[-1])
+    shaped = np.array([is_shaped(step) for step in trace.steps], dtype=np.bool_)
+    num = max(math.ceil((log.last_ns - start_ns) * 1e-9 / control.period - 1e-6), 0) + 1
+    stamps = _stamps(start_ns, num, control.period)
+    motions = {
+        "closed_loop": Motion(stamp_ns=trace.stamp_ns, position=trace.position, is_intervened=shaped),
+        "log": Motion(stamp_ns=stamps, position=np.array([log.at(int(stamp))[0] for stamp in stamps])),
+    }
+    if "standstill" in baselines:
+        held = replay.separations["standstill"]
+        motions["standstill"] = Motion(stamp_ns=held.stamp_ns, position=held.position, is_intervened=held.is_stopped)
+    plans: dict[str, PlannedPath] = {}
+    if {BIRRT, BIRRT_IK} & set(baselines):
+        plans, followed = _planned(baselines, inputs, task, config, console)
+        motions |= followed
+    yardstick = _yardstick(inputs, task, config)
+    order = (*ALWAYS, *map(method_named, baselines))
+    motions = {method: motions[method] for method in order if method in motions}
+    return Comparison(
+        motions=motions,
+        figures={method: yardstick.figures(motion) for method, motion in motions.items()},
+        plans=plans,
+    )
+
+
+def _planned(
+    baselines: Sequence[str], inputs: "ReplayInputs", task: "ReplayTask", config: "Config", console: "Console"
+) -> "tuple[dict[str, PlannedPath], dict[str, Motion]]":
+    """One plan for both ways to follow it, and how each went."""
+    import numpy as np
+
+    from splatctrl_cli.control.comparison import Motion
+    from splatctrl_cli.control.open_loop import is_shaped
+    from splatctrl_cli.control.planned import planned_path
+    from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
+
+    scene, control, planner = inputs.scene, config.control, config.planner
+    known = _Certified(distance=certified_distance(scene.at(task.stamp_ns)))
+    plan = planned_path(inputs.model, known, task, planner, control)
+    console.log(f"replay: planned in {plan.seconds:.2f} s: {plan.outcome}")
+    plans, motions = {}, {}
+    for baseline in (name for name in baselines if name in (BIRRT, BIRRT_IK)):
+        plans[method_named(baseline)] = plan
+        if plan.path is None:
+            continue
+        if baseline == BIRRT:
+            run = follow_joints(plan.path, plan.clearance, task.frame, planner, control)
+        else:
+            run = follow_with_controller(
+                plan.path, plan.clearance, lambda stamp: scene.at(stamp).barrier, task.frame, planner, control,
+                stamp_ns=task.stamp_ns, scene_step_at=scene.step_at,
+            )  # fmt: skip
+        shaped = np.array([is_shaped(step) for step in run.steps], dtype=np.bool_)
+        motions[method_named(baseline)] = Motion(
+            stamp_ns=_stamps(task.stamp_ns, len(run.position), control.period),
+            position=run.position,
+            is_intervened=shaped if baseline == BIRRT_IK else None,
+        )
+    return plans, motions
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Certified:
+    """A scene to plan in: a lower bound of the exact distance to the splats."""
+
+    distance: "DistanceFunction"
+
+
+def certified_distance(fields: "KnownFields") -> "DistanceFunction":
+    """A lower bound of a 1-Lipschitz distance: of a grid its certified one, of splats the exact one less rounding.
+
+    Both bound the exact distance to the splats, so what is proved of an edge is proved of that. Of the kernel fields
+    nothing can be proved from samples: their slope has no useful bound.
+    """
+    certified = fields.distances.get("certified")
+    if certified is not None:
+        return certified
+    exact = fields.distances["exact"]
+    return lambda points: exact(points) - ROUNDING
+
+
+def _yardstick(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> "Yardstick":
+    from splatctrl_cli.control.comparison import Yardstick
+
+    scene, truth = inputs.scene, inputs.truth
+    known: list[tuple[KnownFields, DistanceFunction]] = []  # the scene in use
+
+    def certified_at(stamp_ns: int) -> "DistanceFunction":
+        fields = scene.at(stamp_ns)
+        if not known or known[0][0] is not fields:
+            known[:] = [(fields, certified_distance(fields))]
+        return known[0][1]
+
+    def true_distance(points: "Float64", stamp_ns: int) -> "Float64":
+        assert truth is not None
+        return truth.closest(points, stamp_ns)[0]
+
+    return Yardstick(
+        model=inputs.model,
+        frame=task.frame,
+        T_world_goal=task.T_world_goal,
+        config=config.control,
+        distances_at=lambda stamp: scene.at(stamp).distances,
+        certified_at=certified_at,
+        truth=None if truth is None else true_distance,
+    )
+
+
+def _task(
+    args: argparse.Namespace, inputs: "ReplayInputs", start: "Float64", stamp_ns: int, logged_end: "Float64"
+) -> "ReplayTask":
+    """What the closed loop was asked for; without a posture the logged one at the end is where goals are sought."""
+    from splatctrl_cli.cli.replay_goal import goal_waypoints
+    from splatctrl_cli.control.replay import ReplayTask
+
+    frame = args.frame or inputs.model.frame_names[-1]
+    goal = goal_waypoints(args, inputs.model, frame, logged_end)[-1]
+    return ReplayTask(
+        start=start,
+        T_world_goal=goal.T_world_goal,
+        frame=frame,
+        stamp_ns=stamp_ns,
+        home=logged_end if goal.posture is None else goal.posture,
+    )
+
+
+def _stamps(start_ns: int, num: int, period: float) -> Any:
+    import numpy as np
+
+    return start_ns + np.round(np.arange(num) * period * 1e9).astype(np.int64)
+
+
+def _motion_values(figures: "MotionFigures | None") -> dict[str, float | None]:
+    if figures is None:
+        return {"success": 0, "goal_reached": 0, **dict.fromkeys(_MOTION[2:])}
+    return {
+        "success": int(figures.is_success),
+        "goal_reached": int(figures.has_arrived),
+        "duration_s": figures.duration,
+        "joint_path_rad": figures.joint_path,
+        "effector_path_m": figures.effector_path,
+        "effector_path_deg": figures.effector_turn,
+        "min_clearance_barrier": _finite(figures.clearance["barrier"]),
+        "min_clearance": _finite(figures.clearance["exact"]),
+        "min_clearance_proved": _finite(figures.proved),
+        "min_clearance_true": None if figures.true_clearance is None else _finite(figures.true_clearance),
+        "num_interventions": figures.num_interventions,
+    }
+
+
+def _plan_values(plan: "PlannedPath") -> dict[str, float | None]:
+    values = (plan.seconds, _finite(plan.margin), _finite(plan.self_margin), plan.num_edges, plan.num_proved)
+    return dict(zip(_PLAN, values, strict=True))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
