@@ -142,10 +142,13 @@ class ControlConfig:
     slack_cost: float = 1e3  # L1 cost of an external slack [1 / (m/s)]: above every multiplier met, so exact
     self_slack_cost: float = 1e5  # the same for self-collision rows: given up last
     posture_weight: float = 1e-3  # lambda on joint velocity; without it 7 joints on a 6-D task are undetermined
+    smoothness_weight: float = 0.0  # weight on the change of joint velocity since the last step; see replay.md
     posture_gain: float = 0.5  # [1/s] pull towards the home posture, under posture_weight
     pose_gain: float = 2.0  # [1/s] pose error to end-effector velocity
     max_linear_speed: float = 0.25  # [m/s] cap of the reference: a usual speed beside people
     max_angular_speed: float = 1.0  # [rad/s]
+    twist_timeout: float = 0.5  # [s] a logged twist holds; then the arm is asked to stand still
+    max_acceleration: float | tuple[float, ...] = 0.0  # [rad/s^2] of every joint, or one for each; 0: no limit
     distance_rate: str = "snapshots"  # dd/dt of the rows: what distances lost between the two newest scenes; or none
     max_distance_rate: float = 1.6  # [m/s] that a scene is taken to approach with at most: a walking person
     max_residual: float = 1e-5  # a solution whose relative KKT residual exceeds this is not used
@@ -157,6 +160,7 @@ class ControlConfig:
     max_time: float = 30.0  # [s] of a closed-loop replay
     stall_time: float = 2.0  # [s] a local minimum: over this long ...
     stall_speed: float = 2e-3  # [rad/s] ... the joints moved on average slower than this
+    stop_acceleration: float = 7.5  # [rad/s^2] a monitored standstill brakes and starts with, the Panda's; 0: at once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,6 +250,7 @@ _AT_LEAST_ZERO = (
         "field.noise",
         "field.padding",
         "scene.noise",
+        "control.stop_acceleration",
     ),
     *("planner.seed", "planner.max_iterations", "planner.max_time", "planner.shortcut_rounds"),
     *("planner.follow_gain", "planner.limit_tolerance"),
@@ -368,6 +373,8 @@ def _some(names: typing.Collection[str]) -> str:
 
 def _checked(value: Any, hint: Any, where: str) -> Any:
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if isinstance(value, list) and tuple[float, ...] in options:
+        return tuple(_checked(item, float, f"{where}[{index}]") for index, item in enumerate(value))
     if float in options and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not any(type(value) is option for option in options):

@@ -20,6 +20,7 @@ from splatctrl_cli.cli.replay_baseline import add_baseline, read_baselines, read
 from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose, seconds
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, read_robot
+from splatctrl_cli.cli.replay_twists import check_twists
 from splatctrl_cli.cli.source_options import add_source
 from splatctrl_cli.errors import NotEvaluableError
 
@@ -95,11 +96,18 @@ def run(args: argparse.Namespace) -> int:
     fields = ("exact", "barrier", *(("certified",) if args.field is not None else ()))
     check_gate_names(
         args.require,
-        metric_names(args.mode, fields, has_truth=args.truth is not None, baselines=read_baselines(args)),
+        metric_names(
+            args.mode,
+            fields,
+            has_truth=args.truth is not None,
+            baselines=read_baselines(args),
+            has_twists=args.twist_topic is not None,
+        ),
     )
     golden = read_golden(args)
     read_zone(args)
     check_lockstep(args)
+    check_twists(args)
     out = args.out or Path("replay")
     with output_path(out, force=args.force, is_folder=True) as folder:
         with stopwatch.stage("read"):

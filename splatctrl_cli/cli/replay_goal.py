@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatctrl_cli.cli.replay_twists import add_twists
 from splatctrl_cli.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the logged pose of each time is the goal (the default of --mode open-loop)",
     )
+    add_twists(parser, goal)
     parser.add_argument("--start-time", type=float, metavar="S", help="start at this time of the log [s]")
     parser.add_argument(
         "--re-anchor", type=seconds, metavar="S", help="put the arm back into the logged posture every S seconds"

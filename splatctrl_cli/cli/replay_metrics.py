@@ -7,6 +7,7 @@ import numpy as np
 
 from splatctrl_cli.cli.replay_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
 from splatctrl_cli.cli.replay_compare import figure_names, figures_of
+from splatctrl_cli.cli.replay_twists import FIGURES as TWIST_FIGURES
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_modes import Replay
@@ -42,12 +43,13 @@ _TRUTH = ("num_compared", "median", "p95", "largest", "largest_over", "share_wit
 
 
 def metric_names(
-    mode: str, fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = ()
+    mode: str, fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = (), has_twists: bool = False
 ) -> tuple[str, ...]:
     """The names that `metrics_of` gives for a --mode and --baseline, with fields by name ("exact" first)."""
     names = [*_HEAD, *(f"min_clearance_{name}" for name in fields if name != "exact"), *_TAIL]
     names += [] if mode == "audit" else _STEPS
     names += {"audit": (), "open-loop": _OPEN_LOOP, "closed-loop": _CLOSED_LOOP}[mode]
+    names += TWIST_FIGURES if has_twists else ()
     if STANDSTILL in baselines:
         names += [f"{motion}_{figure}" for motion in BESIDE for figure in FIGURES]
     names += figure_names(baselines, has_truth=has_truth)
@@ -88,6 +90,7 @@ def metrics_of(replay: "Replay") -> Metrics:
         metrics |= _open_loop_metrics(replay)
     if replay.closed_loop is not None:
         metrics |= _closed_loop_metrics(replay)
+    metrics |= replay.twist_figures
     for motion, separation in replay.separations.items():
         figures = separation_figures(separation, replay.period)
         metrics |= {f"{motion}_{figure}": value for figure, value in figures.items()}

@@ -13,6 +13,7 @@ from splatctrl_cli.cli.known_scene import KnownScene
 from splatctrl_cli.cli.replay_baseline import read_baselines, read_zone, separations
 from splatctrl_cli.cli.replay_compare import Comparison, compared
 from splatctrl_cli.cli.replay_goal import goal_waypoints
+from splatctrl_cli.cli.replay_twists import twist_figures, twist_track
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, audit, checked_states
 from splatctrl_cli.control.checks import StaticViolation, static_violations
@@ -22,6 +23,7 @@ from splatctrl_cli.control.open_loop import OpenLoopTask, OpenLoopTrace, open_lo
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence
 from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.clearance import clearance_agreement, mark_seen
 from splatctrl_cli.records import Float64, JointState, RecordSource, RgbdFrame
@@ -85,6 +87,7 @@ class Replay:
     events: tuple[Event, ...] = ()
     separations: "Mapping[str, Separation]" = field(default_factory=dict)
     comparison: Comparison = field(default_factory=Comparison)
+    twist_figures: "Mapping[str, float | None]" = field(default_factory=dict)
     period: float = 0.0
 
     @property
@@ -153,7 +156,8 @@ def _asked(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", con
     velocity = np.array([state.velocity for state in inputs.states[replay.num_before_scene :]])
     motion = LoggedMotion(stamp_ns=trace.stamp_ns, position=trace.position, velocity=velocity)
     frame = args.frame or model.frame_names[-1]
-    task = OpenLoopTask(frame=frame)
+    twists = twist_track(args, model, _span(inputs), console)
+    task = OpenLoopTask(frame=frame, twists=twists)
     if any(given is not None for given in (args.goal, args.goal_joints, args.waypoints)):
         goals = goal_waypoints(args, model, frame, trace.position[-1])
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
@@ -168,16 +172,17 @@ def _asked(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", con
         has_distance=has_distance,
         scene_step_at=scene.step_at,
     )
-    return replace(replay, open_loop=asked)
+    figures = twist_figures(model, config.control, frame, twists, trace.stamp_ns, trace.position, asked.steps)
+    return replace(replay, open_loop=asked, twist_figures=figures)
 
 
 def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
     """The closed loop, the audit of the states it went through, and how far they are from the log."""
     scene, model = inputs.scene, inputs.model
     motion = logged_motion(inputs)
-    task = _task(args, inputs, motion)
+    task = _task(args, inputs, motion, twist_track(args, model, _span(inputs), console))
     start_s = (task.stamp_ns - inputs.states[0].stamp_ns) * 1e-9
-    limit = "to the log's end" if task.follow else f"at most {config.control.max_time:g} s"
+    limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
     trace = closed_loop(
         model, config.control, task, lambda stamp: scene.at(stamp).barrier, scene_step_at=scene.step_at
@@ -192,6 +197,9 @@ def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", co
         _replay(inputs, config, audited, trace.static_violations, num_before=0, radius_of=0),
         closed_loop=trace,
         divergence=Divergence(joints=joints, position=position, rotation=rotation),
+        twist_figures=twist_figures(
+            model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
+        ),
     )
 
 
@@ -237,7 +245,13 @@ def logged_motion(inputs: ReplayInputs) -> LoggedMotion:
     )
 
 
-def _task(args: argparse.Namespace, inputs: ReplayInputs, motion: LoggedMotion) -> ReplayTask:
+def _span(inputs: ReplayInputs) -> tuple[int, int]:
+    return int(inputs.states[0].stamp_ns), int(inputs.states[-1].stamp_ns)
+
+
+def _task(
+    args: argparse.Namespace, inputs: ReplayInputs, motion: LoggedMotion, twists: TwistTrack | None
+) -> ReplayTask:
     """The start (logged, and not before the scene is known) and the goal (given, or the logged end)."""
     stamps, positions = motion.stamp_ns, motion.position
     earliest = stamps[0] if args.start_time is None else stamps[0] + round(args.start_time * 1e9)
@@ -251,7 +265,8 @@ def _task(args: argparse.Namespace, inputs: ReplayInputs, motion: LoggedMotion) 
             remedy="give an earlier --start-time",
         )
     frame = args.frame or inputs.model.frame_names[-1]
-    *via, goal = goal_waypoints(args, inputs.model, frame, positions[-1])
+    end = positions[-1] if twists is None else positions[start]
+    *via, goal = goal_waypoints(args, inputs.model, frame, end)
     return ReplayTask(
         start=positions[start],
         T_world_goal=goal.T_world_goal,
@@ -260,6 +275,8 @@ def _task(args: argparse.Namespace, inputs: ReplayInputs, motion: LoggedMotion) 
         home=goal.posture,
         via=tuple(via),
         follow=motion if args.follow else None,
+        twists=twists,
+        end_ns=motion.last_ns,
         anchors=motion if args.re_anchor else None,
         anchor_period=args.re_anchor or 0.0,
     )

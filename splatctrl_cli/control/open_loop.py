@@ -12,6 +12,7 @@ from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.rates import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController, RowKind, VelocityMargin
+from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 FieldAt = Callable[[int], DistanceField]
@@ -19,7 +20,8 @@ FieldAt = Callable[[int], DistanceField]
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoopTask:
-    """What the controller is asked for at each state: the logged motion itself, or a goal pose (4, 4) of the frame.
+    """What the controller is asked for at each state: the logged motion itself, or a goal pose (4, 4) of the frame,
+    or the twists of the log.
 
     home (J,) [rad] is the posture leant to beside a goal pose; None is the middle of the limits.
     """
@@ -27,6 +29,7 @@ class OpenLoopTask:
     frame: str
     T_world_goal: Float64 | None = None
     home: Float64 | None = None
+    twists: TwistTrack | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +81,12 @@ def open_loop(
             field = field_at(int(stamp))
             controller = controller.with_field(field)
         goal, guide = (task.T_world_goal, None)
-        if goal is None:
+        if task.twists is not None:
+            goal, guide = task.twists.goal_at(model, config, task.frame, q, int(stamp))
+        elif goal is None:
             goal, guide = guided_goal(model, task.frame, q, v)
         rate = rate_of(config, model, scene_step_at, int(stamp), q)
-        step = controller.step(q, goal, distance_rate=rate, guide=guide)
+        step = controller.step(q, goal, distance_rate=rate, guide=guide, last_velocity=v)
         commanded[index] = step.velocity
         steps.append(step)
         margins.append(controller.margin_of(q, v, distance_rate=rate))

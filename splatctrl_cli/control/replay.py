@@ -26,6 +26,7 @@ from splatctrl_cli.control.rates import SceneStepAt, rate_of
 from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.control.target import Guide, pose_error
+from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.records import DistanceField, Float64
 
 FieldAt = Callable[[int], DistanceField]
@@ -54,7 +55,8 @@ class ReplayTask:
 
     home (J,) [rad] is the posture the arm leans to where the task leaves it free; None is the middle of the limits.
     via: poses to reach before the goal, one after the other. follow: the goal is the logged pose of each time, and
-    the run ends with the log. anchors: every anchor_period [s] the arm is put back into the posture logged then.
+    the run ends with the log. twists: the velocity to reach for instead of a goal, until end_ns. anchors: every
+    anchor_period [s] the arm is put back into the posture logged then.
     """
 
     start: Float64
@@ -64,8 +66,17 @@ class ReplayTask:
     home: Float64 | None = None
     via: tuple[Waypoint, ...] = ()
     follow: LoggedMotion | None = None
+    twists: TwistTrack | None = None
+    end_ns: int = 0
     anchors: LoggedMotion | None = None
     anchor_period: float = 0.0
+
+    @property
+    def last_ns(self) -> int | None:
+        """The stamp that it lasts to, None where it ends at a goal."""
+        if self.twists is not None:
+            return self.end_ns
+        return None if self.follow is None else self.follow.last_ns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,31 +137,31 @@ def closed_loop(
     controller = QpIkController(model, config, field, frame=task.frame, home=task.home, solver=solver)
     check_free(model, field, q)
     statics = static_violations(model, field, q, scene_margin(model, config))
-    course = _Course(model, config, task)
+    course, last_velocity = _Course(model, config, task), np.zeros(len(q))
     stamps, positions, steps, changes, anchored = [], [], [], [], []
-    outcome = Outcome.LOG_ENDED if task.follow is not None else Outcome.TIMEOUT
+    outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
         if course.is_anchor(index):
-            q = course.anchor(stamp)
+            q, last_velocity = course.anchor(stamp)
             anchored.append(index)
         if field_at(stamp) is not field:
             changes.append(_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
             controller = controller.with_field(field)
         rate = rate_of(config, model, scene_step_at, stamp, q)
-        goal, guide = course.goal(stamp)
-        step = controller.step(q, goal, distance_rate=rate, guide=guide)
+        goal, guide = course.goal(stamp, q)
+        step = controller.step(q, goal, distance_rate=rate, guide=guide, last_velocity=last_velocity)
         stamps.append(stamp)
         positions.append(q)
         steps.append(step)
         if course.has_ended(stamp, index, step):
             outcome = Outcome.GOAL_REACHED
             break
-        if task.follow is None and _has_stalled(positions[course.since :], config):
+        if task.last_ns is None and _has_stalled(positions[course.since :], config):
             outcome = Outcome.STALLED
             break
-        q = q + config.period * step.velocity
+        q, last_velocity = q + config.period * step.velocity, step.velocity
     return ReplayTrace(
         stamp_ns=np.array(stamps, dtype=np.int64),
         position=np.array(positions),
@@ -171,9 +182,8 @@ class _Course:
         self._waypoints = (*task.via, Waypoint(T_world_goal=task.T_world_goal, posture=None))
         self.num_reached = 0
         self.since = 0  # the step from which a stall counts: the last anchor or waypoint
-        left = (
-            config.max_time if task.follow is None else (task.follow.last_ns - task.stamp_ns) * 1e-9 + config.period
-        )
+        last_ns = task.last_ns
+        left = config.max_time if last_ns is None else (last_ns - task.stamp_ns) * 1e-9 + config.period
         self.num_steps = max(round(left / config.period), 1)
 
     def is_anchor(self, index: int) -> bool:
@@ -188,14 +198,16 @@ class _Course:
         self.since = index
         return True
 
-    def anchor(self, stamp_ns: int) -> Float64:
-        """The posture that was logged at a stamp."""
+    def anchor(self, stamp_ns: int) -> tuple[Float64, Float64]:
+        """The posture and velocity that were logged at a stamp."""
         assert self._task.anchors is not None
-        return self._task.anchors.at(stamp_ns)[0]
+        return self._task.anchors.at(stamp_ns)
 
-    def goal(self, stamp_ns: int) -> tuple[Float64, Guide | None]:
-        """The goal's pose at a stamp, and how it moves."""
+    def goal(self, stamp_ns: int, q: Float64) -> tuple[Float64, Guide | None]:
+        """The goal's pose at a stamp and posture (J,), and how it moves."""
         task = self._task
+        if task.twists is not None:
+            return task.twists.goal_at(self._model, self._config, task.frame, q, stamp_ns)
         if task.follow is not None:
             return task.follow.goal_at(self._model, task.frame, stamp_ns)
         waypoint = self._waypoints[self.num_reached]
@@ -205,8 +217,8 @@ class _Course:
         return waypoint.T_world_goal, Guide(twist=np.zeros(6), posture=waypoint.posture, velocity=still)
 
     def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
-        """True at the last goal; on the way there a goal that is reached gives way to the next."""
-        if not is_at_goal(step.pose_error, self._config):
+        """True at the last goal; on the way there a goal that is reached gives way to the next; a twist has none."""
+        if self._task.twists is not None or not is_at_goal(step.pose_error, self._config):
             return False
         if self._task.follow is not None:
             return stamp_ns >= self._task.follow.last_ns

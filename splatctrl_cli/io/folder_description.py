@@ -2,6 +2,7 @@
 
 import difflib
 import tomllib
+from collections.abc import Collection
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -125,10 +126,10 @@ def read_description(path: Path, root: Path | None = None) -> Description:
     return _read(_content(path), path, root)
 
 
-def read_table(kind: type[T], path: Path, name: str) -> T:
-    """The table [name] of a TOML file that holds no other. Raises InputError as `read_description`."""
+def read_table(kind: type[T], path: Path, name: str, *, beside: Collection[str] = ()) -> T:
+    """The table [name] of a TOML file that holds none but those `beside`. Raises InputError as `read_description`."""
     content = _content(path)
-    _check_keys(content, {name}, str(path), "")
+    _check_keys(content, {name, *beside}, str(path), "")
     return _required(kind, content, name, path)
 
 

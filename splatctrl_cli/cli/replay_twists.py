@@ -1,0 +1,108 @@
+"""``--twist-topic``: the velocity that a log's own operator asked for, as what a replay's controller reaches for."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.cli.common import Console
+    from splatctrl_cli.config import ControlConfig
+    from splatctrl_cli.control.arm import ArmModel
+    from splatctrl_cli.control.audit import Stamps
+    from splatctrl_cli.control.step import ControlStep
+    from splatctrl_cli.control.twists import TwistTrack
+    from splatctrl_cli.records import Float64
+    from splatctrl_cli.robot.model import RobotModel
+
+WORLD = "world"
+FIGURES = (
+    *("twist_share", "twist_share_capped", "mean_twist_error_linear", "max_twist_error_linear"),
+    *("mean_twist_error_angular", "max_twist_error_angular"),
+)
+
+
+def add_twists(parser: argparse.ArgumentParser, goal: argparse._ActionsContainer) -> None:
+    """``--twist-topic`` among the goals, and ``--twist-frame``."""
+    goal.add_argument(
+        "--twist-topic",
+        metavar="NAME",
+        help="reach for the twists of this topic of LOG (Twist, TwistStamped), or of a .toml's table: twists",
+    )
+    parser.add_argument(
+        "--twist-frame", metavar="LINK", help="whose axes they are in: world or a link (default: as the log says)"
+    )
+
+
+def check_twists(args: argparse.Namespace) -> None:
+    """Raise UsageError for twists where no controller runs, or a frame without them."""
+    if args.twist_topic is not None and args.mode == "audit":
+        raise UsageError("--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit asks nobody")
+    if args.twist_frame is not None and args.twist_topic is None:
+        raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
+
+
+def twist_track(
+    args: argparse.Namespace, model: "RobotModel", span_ns: tuple[int, int], console: "Console"
+) -> "TwistTrack | None":
+    """The twists that --twist-topic names, None without it. span_ns: first and last joint state.
+
+    Raises InputError where they are in no frame that is known, or all at other times.
+    """
+    from splatctrl_cli.control.twists import TwistTrack
+    from splatctrl_cli.io.twists import read_twists
+
+    if args.twist_topic is None:
+        return None
+    logged = read_twists(args.log, args.twist_topic)
+    frame = logged.frame if args.twist_frame is None else args.twist_frame
+    if frame != WORLD and frame not in model.frame_names:
+        raise InputError(
+            f"{logged.where}: expected twists in world or a link of the robot, got frame {frame!r}",
+            remedy=f"give --twist-frame, one of: world, {', '.join(model.frame_names)}",
+        )
+    first, last = int(logged.stamp_ns[0]), int(logged.stamp_ns[-1])
+    if last < span_ns[0] or first > span_ns[1]:
+        raise InputError(
+            f"{logged.where}: mixed clocks: expected twists between the joint states' stamps {span_ns[0]} and "
+            f"{span_ns[1]} ns, got {first} to {last} ns",
+            remedy="record both by one clock",
+        )
+    from_s, to_s = ((stamp - span_ns[0]) * 1e-9 for stamp in (first, last))
+    console.log(f"replay: {len(logged.stamp_ns)} twists in {frame}, {from_s:.2f} to {to_s:.2f} s of the log")
+    for note in logged.notes:
+        console.log(f"replay: {args.twist_topic}: {note}")
+    return TwistTrack(stamp_ns=logged.stamp_ns, twist=logged.twist, axes=None if frame == WORLD else frame)
+
+
+def twist_figures(
+    model: "ArmModel",
+    config: "ControlConfig",
+    frame: str,
+    track: "TwistTrack | None",
+    stamp_ns: "Stamps",
+    position: "Float64",
+    steps: "Sequence[ControlStep | None]",
+) -> Mapping[str, float | None]:
+    """`FIGURES` of a controller's T steps: the share of states where a twist holds, the share of these where it was
+    capped, and by how much [m/s, rad/s] the commanded twist misses it. Empty without twists.
+    """
+    import numpy as np
+
+    if track is None:
+        return {}
+    is_known = track.is_known(stamp_ns, config.twist_timeout)
+    capped, linear, angular = [], [], []
+    for stamp, q, step, known in zip(stamp_ns, position, steps, is_known, strict=True):
+        reference = track.reference(model, config, q, int(stamp))
+        if known:
+            capped.append(not np.array_equal(reference, track.asked(model, q, int(stamp), config.twist_timeout)))
+        if step is not None:
+            missed = model.frame_jacobian(q, frame) @ step.velocity - reference
+            linear.append(np.linalg.norm(missed[:3]))
+            angular.append(np.linalg.norm(missed[3:]))
+    values = [float(is_known.mean()), float(np.mean(capped)) if capped else None]
+    for errors in (linear, angular):
+        values += [float(np.mean(errors)), float(np.max(errors))] if errors else [None, None]
+    return dict(zip(FIGURES, values, strict=True))
