@@ -11,7 +11,7 @@ from splatctrl_cli.errors import NotEvaluableError, UsageError
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_modes import Replay, ReplayInputs
     from splatctrl_cli.config import Config
-    from splatctrl_cli.control.standstill import DistanceToPeople, Separation, Zone
+    from splatctrl_cli.control.standstill import DistanceToPeople, Separation, StopZone
     from splatctrl_cli.records import Float64
 
 PEOPLE = ("human*", "person*")  # names of a truth's primitives
@@ -25,7 +25,7 @@ BASELINES = (STANDSTILL, BIRRT, BIRRT_IK)
 
 
 def add_baseline(parser: argparse.ArgumentParser) -> None:
-    """``--baseline``, ``--zone``, ``--human``."""
+    """``--baseline``, ``--zone``, ``--zone-box``, ``--human``."""
     parser.add_argument(
         "--baseline",
         type=_baselines,
@@ -37,6 +37,11 @@ def add_baseline(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--zone", default="0.5,0.6", metavar="STOP,RESUME", help="distances [m] of that zone (default: 0.5,0.6)"
+    )
+    parser.add_argument(
+        "--zone-box",
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        help="a box [m] instead: stop while a person is in it, until nobody is within RESUME - STOP of it",
     )
     parser.add_argument(
         "--human",
@@ -65,9 +70,13 @@ def read_baselines(args: argparse.Namespace) -> tuple[str, ...]:
     return names
 
 
-def read_zone(args: argparse.Namespace) -> "Zone | None":
-    """The zone of --zone, None without a standstill. Raises UsageError as `read_baselines`, or for a bad zone."""
-    from splatctrl_cli.control.standstill import Zone
+def read_zone(args: argparse.Namespace) -> "StopZone | None":
+    """The zone of --zone or --zone-box, None without a standstill.
+
+    Raises UsageError as `read_baselines`, or for a zone that is none.
+    """
+    from splatctrl_cli.control.standstill import BoxZone, Zone
+    from splatctrl_cli.records import Box
 
     if STANDSTILL not in read_baselines(args):
         return None
@@ -75,11 +84,14 @@ def read_zone(args: argparse.Namespace) -> "Zone | None":
         stop, resume = (float(part) for part in args.zone.split(","))
     except ValueError:
         raise UsageError(f"--zone {args.zone}: expected STOP,RESUME [m]") from None
-    return Zone(stop=stop, resume=resume)
+    zone = Zone(stop=stop, resume=resume)
+    if args.zone_box is None:
+        return zone
+    return BoxZone(box=Box.from_text(args.zone_box), hysteresis=zone.resume - zone.stop)
 
 
 def separations(
-    args: argparse.Namespace, zone: "Zone | None", inputs: "ReplayInputs", replay: "Replay", config: "Config"
+    args: argparse.Namespace, zone: "StopZone | None", inputs: "ReplayInputs", replay: "Replay", config: "Config"
 ) -> "Mapping[str, Separation]":
     """The closed loop and the standstill beside people, from the same moment; empty without a standstill."""
     from splatctrl_cli.cli.replay_modes import logged_motion
@@ -109,6 +121,7 @@ def separations(
         start_ns=int(trace.stamp_ns[0]),
         period=control.period,
         max_wait=control.max_time,
+        max_acceleration=control.stop_acceleration,
     )
     return dict(zip(BESIDE, (driven, held), strict=True))
 

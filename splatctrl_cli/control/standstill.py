@@ -1,7 +1,9 @@
-"""The monitored standstill: the logged path, held while a person is near, as the baseline of IV-E (no compliance)."""
+"""The monitored standstill: a path, held while a person is in a zone, as the baseline of IV-E (no compliance)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Protocol
 
 import numpy as np
 
@@ -9,10 +11,23 @@ from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.records import Bool, Box, Float64
 
 DistanceToPeople = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""
+
+RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
+EIGHTHS = np.array(list(product((-0.5, 0.5), repeat=3)))
+
+
+class StopZone(Protocol):
+    """Where people must not be for the arm to move."""
+
+    def is_entered(
+        self, model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
+    ) -> bool:
+        """Whether the arm at q (J,) has to hold; one that is held already goes on only after more room."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +40,50 @@ class Zone:
     def __post_init__(self) -> None:
         if not 0 < self.stop <= self.resume:
             raise UsageError(f"zone: expected 0 < stop <= resume, got {self.stop:g} and {self.resume:g} m")
+
+    def is_entered(
+        self, model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
+    ) -> bool:
+        """See `StopZone`."""
+        return distance_to_people(model, q, stamp_ns, people) < (self.resume if is_held else self.stop)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxZone:
+    """The arm stops where a person is in a box, and goes on where nobody is within `hysteresis` [m] of its sides."""
+
+    box: Box
+    hysteresis: float
+
+    def __post_init__(self) -> None:
+        if not self.hysteresis >= 0:
+            raise UsageError(f"zone: expected a hysteresis of 0 or more, got {self.hysteresis:g} m")
+
+    def is_entered(
+        self, model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool
+    ) -> bool:
+        """See `StopZone`; wherever the arm is."""
+        room = self.hysteresis if is_held else 0.0
+        return is_anybody_in(Box(lower=self.box.lower - room, upper=self.box.upper + room), people, stamp_ns)
+
+
+def is_anybody_in(box: Box, people: DistanceToPeople, stamp_ns: int) -> bool:
+    """Whether a person reaches into a box, or comes as near as `RESOLUTION`.
+
+    A distance changes by no more than a metre per metre: a cell whose middle is farther from everybody than from its
+    own corners holds nobody, one whose middle is inside somebody does; the others are cut into eight.
+    """
+    middles, half = (box.lower + box.upper)[None] / 2, (box.upper - box.lower) / 2
+    while len(middles):
+        distance = people(np.ascontiguousarray(middles), stamp_ns)
+        if np.any(distance <= 0):
+            return True
+        is_open = distance < np.linalg.norm(half)
+        if np.linalg.norm(half) < RESOLUTION:
+            return bool(np.any(is_open))
+        middles = (middles[is_open, None] + EIGHTHS * half).reshape(-1, 3)
+        half = half / 2
+    return False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,45 +111,61 @@ def distance_to_people(model: ArmModel, q: Float64, stamp_ns: int, people: Dista
     return float(np.min(people(centers, stamp_ns) - model.sphere_set.radii[moving]))
 
 
-def monitored_standstill(
-    model: ArmModel,
-    motion: LoggedMotion,
-    people: DistanceToPeople,
-    zone: Zone,
-    *,
-    start_ns: int,
-    period: float,
-    max_wait: float,
-) -> Separation:
-    """The logged path from `start_ns`, delayed by every stop; people move in the log's time, whatever the arm does.
-
-    The arm stops and goes on without delay, which favours it. After the log's end the last scene stays; a stop that
-    then lasts longer than `max_wait` [s] ends the run.
+@dataclass(frozen=True, kw_only=True)
+class Standstill(Separation):
+    """The separation of a path that was held: path_s (T,) [s], the path's own time at each state, and path_speed
+    (T,), how much of it passes per second until the next state: 1 as recorded, 0 held.
     """
-    tick = round(period * 1e9)
-    stamp = path_ns = start_ns
-    stamps, positions, distances, stops = [], [], [], []
-    is_stopped, waited = False, 0
+
+    path_s: Float64 = field(default_factory=lambda: np.zeros(0))
+    path_speed: Float64 = field(default_factory=lambda: np.zeros(0))
+
+
+def monitored_standstill(
+    model: ArmModel, motion: LoggedMotion, people: DistanceToPeople, zone: StopZone, *,
+    start_ns: int, period: float, max_wait: float, max_acceleration: float = 0.0,
+) -> Standstill:  # fmt: skip
+    """The path of `motion` from `start_ns`, time-stretched by every stop; people move in the log's time all along.
+
+    q(t) = path(s(t)) with 0 <= s' <= 1: the arm never leaves the path, and goes on from where it was held. It brakes
+    and starts with |s''| <= max_acceleration / (the path's fastest joint speed), so that no joint changes its speed
+    by more than `max_acceleration` [rad/s^2] on that account; 0 stops it at once, which favours it. With somebody in
+    the zone from the start it stands. After the log's end the last scene stays; a stop that then lasts longer than
+    `max_wait` [s] ends the run.
+    """
+    tick, end_s = round(period * 1e9), (motion.last_ns - start_ns) * 1e-9
+    change = np.inf if max_acceleration == 0 else period * max_acceleration / max(_fastest(motion, start_ns), 1e-9)
+    stamp, path_s, speed, waited, is_held = start_ns, 0.0, -1.0, 0, False
+    rows: list[tuple[int, Float64, float, float, float]] = []
     while True:
-        q = motion.at(path_ns)[0]
-        distance = distance_to_people(model, q, stamp, people)
-        is_stopped = distance < (zone.resume if is_stopped else zone.stop)
-        stamps.append(stamp)
-        positions.append(q)
-        distances.append(distance)
-        stops.append(is_stopped)
-        waited = waited + tick if is_stopped and stamp > motion.last_ns else 0
-        if path_ns >= motion.last_ns or waited > max_wait * 1e9:
+        q = motion.at(start_ns + round(path_s * 1e9))[0]
+        is_held = zone.is_entered(model, q, stamp, people, is_held=is_held)
+        aim = 0.0 if is_held else 1.0
+        speed = aim if speed < 0 else float(np.clip(aim, speed - change, speed + change))
+        rows.append((stamp, q, distance_to_people(model, q, stamp, people), path_s, speed))
+        waited = waited + tick if speed == 0 and stamp > motion.last_ns else 0
+        if path_s >= end_s - 1e-9 or waited > max_wait * 1e9:
             break
         stamp += tick
-        path_ns += 0 if is_stopped else tick
-    return Separation(
+        path_s = min(path_s + period * speed, end_s)
+    stamps, positions, distances, path, speeds = zip(*rows, strict=True)
+    return Standstill(
         stamp_ns=np.array(stamps, dtype=np.int64),
         position=np.array(positions),
         distance=np.array(distances),
-        is_stopped=np.array(stops, dtype=np.bool_),
-        is_complete=path_ns >= motion.last_ns,
+        is_stopped=np.array(speeds) == 0,
+        is_complete=path_s >= end_s - 1e-9,
+        path_s=np.array(path),
+        path_speed=np.array(speeds),
     )
+
+
+def _fastest(motion: LoggedMotion, start_ns: int) -> float:
+    """The fastest joint [rad/s] between any two states of the path from `start_ns` on."""
+    seconds = np.diff(motion.stamp_ns) * 1e-9
+    is_used = (seconds > 0) & (motion.stamp_ns[1:] > start_ns)
+    moved = np.abs(np.diff(motion.position, axis=0))[is_used]
+    return float(np.max(moved / seconds[is_used, None], initial=0.0))
 
 
 def separation_of(
