@@ -12,6 +12,7 @@ from splatctrl_cli.control.goal_postures import goal_postures
 from splatctrl_cli.control.path import TimedPath, effector_rates, timed
 from splatctrl_cli.control.planner import PlanOutcome, plan
 from splatctrl_cli.control.replay import ReplayTask
+from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.records import Float64
 
 NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision", "goal-in-collision"
@@ -46,7 +47,9 @@ def planned_path(
     sought from the task's home, the start, and random ones.
     """
     began = time.perf_counter()
-    room, start, frame = Clearance.of(model, scene), task.start, task.frame
+    start, frame = task.start, task.frame
+    extra = scene_margin(model, control) - control.margin  # what the spheres leave uncovered, where that is kept too
+    room = Clearance.of(model, scene, margin=extra)
     random = np.random.default_rng(planner.seed)
     drawn = random.uniform(model.lower, model.upper, (GUESSES * planner.goal_postures, len(start)))
     guesses = np.vstack([model.middle if task.home is None else task.home, start, drawn])
@@ -57,7 +60,7 @@ def planned_path(
         outcome = START_BLOCKED if len(goals) else GOAL_BLOCKED
     path, num_proved, num_edges = None, 0, 0
     if min(margin, own) > 0:
-        room = Clearance.of(model, scene, margin=margin, self_margin=own)
+        room = Clearance.of(model, scene, margin=margin + extra, self_margin=own)
         found = plan(room, np.clip(start, model.lower, model.upper), goals, planner, seed=planner.seed)
         outcome = found.outcome
         if found.outcome is PlanOutcome.SOLVED:

@@ -84,3 +84,15 @@ def test_the_same_seed_plans_the_same_path() -> None:
     one, again = (planned_path(ARM, one_wall(), task(), PLANNER, CONFIG) for _ in range(2))
     assert one.path is not None and again.path is not None
     np.testing.assert_array_equal(one.path.waypoints, again.path.waypoints)
+
+
+def test_what_the_spheres_leave_uncovered_is_kept_as_well_where_the_controller_keeps_it() -> None:
+    class Bare(LeveredArm):
+        def __init__(self) -> None:
+            super().__init__()
+            self.sphere_deficit = np.full(5, 0.03)
+
+    thin = planned_path(Bare(), one_wall(), task(), PLANNER, CONFIG)
+    kept = planned_path(Bare(), one_wall(), task(), PLANNER, replace(CONFIG, coverage="margin"))
+    assert thin.margin == kept.margin == CONFIG.margin
+    np.testing.assert_allclose(thin.clearance.at(START[None]) - kept.clearance.at(START[None]), 0.03)
