@@ -21,6 +21,7 @@ from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose, seconds
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, read_robot
 from splatctrl_cli.cli.replay_twists import check_twists
+from splatctrl_cli.cli.replay_worst import add_worst_frames, draw_worst_frames
 from splatctrl_cli.cli.source_options import add_source
 from splatctrl_cli.errors import NotEvaluableError
 
@@ -77,6 +78,7 @@ def register(subparsers: Subparsers) -> None:
     )
     add_golden(parser)
     add_baseline(parser)
+    add_worst_frames(parser)
     parser.add_argument("--steps", action="store_true", help="print a row per step as well")
     add_source(parser)
     add_output(parser, default="replay", what="folder to write")
@@ -120,10 +122,12 @@ def run(args: argparse.Namespace) -> int:
             replay = with_truth(inputs, replay)
         inputs.scene.finish()
         metrics = metrics_of(replay)
+        with stopwatch.stage("worst_frames"):
+            unseen = draw_worst_frames(folder, inputs, replay, args.worst_frames)
         write_json(folder / "states.json", logged.as_dict())
         write_replay(folder, replay, metrics, config=config, inputs=inputs.digests, stopwatch=stopwatch)
     lines = lines_of(replay, metrics, with_steps=args.steps or args.verbose > 0)
-    lines += [coverage_words(inputs.model, config.control), *logged.lines()]
+    lines += [coverage_words(inputs.model, config.control), *unseen, *logged.lines()]
     console.result({"out": str(out), **metrics}, lines)
     return _verdict(args, replay, metrics, golden, inputs.source)
 

@@ -1,0 +1,104 @@
+"""``--worst-frames``: pictures of the moments at which a replay was nearest to the scene."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from splatctrl_cli.cli.replay_modes import Replay, ReplayInputs
+    from splatctrl_cli.evaluate.worst_frames import Moment, Sight
+    from splatctrl_cli.records import RgbdFrame
+
+NAMES = {"exact": "exact", "barrier": "barrier", "certified": "certified bound"}  # of the fields, in a caption
+
+
+def add_worst_frames(parser: argparse.ArgumentParser) -> None:
+    """``--worst-frames``."""
+    parser.add_argument(
+        "--worst-frames",
+        type=_count,
+        default=3,
+        metavar="N",
+        help="write worst_1.png ...: camera images of the N events of least clearance (default: 3)",
+    )
+
+
+def _count(text: str) -> int:
+    """A whole number from 0, for argparse."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0, got {text!r}")
+    return int(text)
+
+
+def draw_worst_frames(folder: Path, inputs: "ReplayInputs", replay: "Replay", num: int) -> list[str]:
+    """Write worst_1.png (the least clearance), worst_2.png ... into a folder; returns what there is to say of it."""
+    from splatctrl_cli.evaluate.worst_frames import draw_sight, sights_of, worst_moments
+
+    audit = replay.audit
+    states = worst_moments(audit.stamp_ns, audit.clearance["exact"].distance, num)
+    if not states or not inputs.source.has_clock:
+        return []
+    moments = [_moment(inputs, replay, state) for state in states]
+    sights = sights_of(moments, _frames(inputs))
+    seen = [sight for sight in sights if sight is not None]
+    for number, sight in enumerate(seen, start=1):
+        draw_sight(folder / f"worst_{number}.png", _explained(sight, number, replay))
+    if len(seen) < len(states):
+        return [f"worst frames: no camera image at or before {len(states) - len(seen)} of {len(states)} moments"]
+    return []
+
+
+def _frames(inputs: "ReplayInputs") -> "Iterator[RgbdFrame]":
+    from splatctrl_cli.records import RgbdFrame
+
+    return (record for record in inputs.source.records() if isinstance(record, RgbdFrame))
+
+
+def _moment(inputs: "ReplayInputs", replay: "Replay", state: int) -> "Moment":
+    """A state with the obstacle that is nearest to its nearest sphere."""
+    import numpy as np
+
+    from splatctrl_cli.control.arm import sphere_names
+    from splatctrl_cli.evaluate.worst_frames import Moment
+
+    audit, model = replay.audit, replay.model
+    stamp, worst = int(audit.stamp_ns[state]), int(audit.clearance["exact"].sphere[state])
+    centers = model.sphere_centers(np.asarray(audit.position[state]))
+    (obstacle,) = inputs.scene.at(stamp).obstacles(np.ascontiguousarray(centers[[worst]]))
+    figures = [f"{NAMES.get(name, name)} {_cm(float(of.distance[state]))}" for name, of in audit.clearance.items()]
+    if replay.true_clearance is not None:
+        figures.append(f"truth {_cm(float(replay.true_clearance[state]))}")
+    step = replay.steps[state] if replay.steps else None
+    rung = "" if step is None else f"   step: {step.rung}" + (f", scaled by {step.scale:g}" if step.scale < 1 else "")
+    seconds = (stamp - int(audit.stamp_ns[0])) * 1e-9
+    return Moment(
+        stamp_ns=stamp,
+        centers=centers,
+        radii=np.asarray(model.sphere_set.radii),
+        is_moving=np.asarray(model.moving_spheres),
+        worst=worst,
+        obstacle=np.array(obstacle.position),
+        caption=(
+            f"{seconds:.2f} s   {sphere_names(model.sphere_set)[worst]}   clearance: {', '.join(figures)}{rung}",
+            f"nearest: {obstacle}",
+        ),
+    )
+
+
+def _explained(sight: "Sight", number: int, replay: "Replay") -> "Sight":
+    """The sight with its number, camera, and whose spheres are drawn."""
+    from dataclasses import replace
+
+    first, *rest = sight.moment.caption
+    whose = (
+        "spheres of the driven arm; the image shows the logged one"
+        if replay.mode == "closed-loop"
+        else "spheres of the logged posture"
+    )
+    caption = (f"worst {number}   {first}", *rest, f"{sight.frame.camera}, taken {sight.age_s:.2f} s before; {whose}")
+    return replace(sight, moment=replace(sight.moment, caption=caption))
+
+
+def _cm(metres: float) -> str:
+    return f"{100 * metres:.2f} cm"

@@ -1,0 +1,202 @@
+"""The moments of least clearance, drawn over the camera image of that time."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import WriteError
+from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame, UInt8
+
+APART = 0.5  # [s] between the moments of two events, at least
+WIDTH = 960  # [px] of a picture, at least
+NEAR = 0.05  # [m] in front of a camera below which nothing is drawn
+HIDDEN = 0.03  # [m] by which a surface must stand before a sphere to hide it
+OUTLINE = np.linspace(0.0, 2.0 * np.pi, 49)
+FONT, FONT_SCALE, LINE_HEIGHT, EDGE = cv2.FONT_HERSHEY_DUPLEX, 0.52, 24, 10
+BODY, STILL, WORST, POINT = (253, 214, 150), (190, 190, 190), (0, 94, 213), (66, 228, 240)  # BGR
+INK, PAPER = (34, 34, 34), (255, 255, 255)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """What is drawn: spheres (S, 3) [m], world, and radii (S,) [m] at a stamp; the worst of them; the nearest surface
+    point (3,) of an obstacle, NaN where none is known; the lines of text under the image.
+
+    is_moving (S,): whether a joint moves a sphere.
+    """
+
+    stamp_ns: int
+    centers: Float64
+    radii: Float64
+    is_moving: NDArray[np.bool_]
+    worst: int
+    obstacle: Float64
+    caption: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sight:
+    """The image that shows a moment best."""
+
+    moment: Moment
+    frame: RgbdFrame
+
+    @property
+    def age_s(self) -> float:
+        """By how much [s] the image is older than the moment."""
+        return (self.moment.stamp_ns - self.frame.stamp_ns) * 1e-9
+
+
+def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int, apart_s: float = APART) -> list[int]:
+    """Indices of at most `num` states with least clearance (T,), the least first: each the least within `apart_s` on
+    either side, so that the flank of an event is not another one. NaN is no clearance.
+    """
+    values = np.where(np.isnan(clearance), np.inf, clearance)
+    beside = np.concatenate([[np.inf], values, [np.inf]])
+    lowest = np.flatnonzero((values < beside[:-2]) & (values <= beside[2:]) & np.isfinite(values))
+    apart_ns = round(apart_s * 1e9)
+    chosen: list[int] = []
+    for index in lowest[np.argsort(values[lowest], kind="stable")]:
+        if len(chosen) == num:
+            break
+        stamp = stamp_ns[index]
+        first, last = np.searchsorted(stamp_ns, (stamp - apart_ns + 1, stamp + apart_ns))
+        is_new = all(abs(int(stamp_ns[other]) - int(stamp)) >= apart_ns for other in chosen)
+        if is_new and values[index] <= values[first:last].min():
+            chosen.append(int(index))
+    return chosen
+
+
+def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Sight | None]:
+    """For each moment the newest image not later of the camera that sees its worst sphere best, None without any.
+
+    One pass over the frames (by stamp), which ends with the last moment; of each camera one frame is held.
+    """
+    found: list[Sight | None] = [None] * len(moments)
+    waiting = sorted(range(len(moments)), key=lambda i: -moments[i].stamp_ns)
+    newest: dict[str, RgbdFrame] = {}
+    for frame in frames:
+        while waiting and moments[waiting[-1]].stamp_ns < frame.stamp_ns:
+            index = waiting.pop()
+            found[index] = _best(moments[index], newest)
+        if not waiting:
+            return found
+        newest[frame.camera] = frame
+    for index in waiting:
+        found[index] = _best(moments[index], newest)
+    return found
+
+
+def draw_sight(path: Path, sight: Sight) -> None:
+    """Write the image with every sphere's outline, the worst one bold, a line to its obstacle, and the caption."""
+    moment, frame = sight.moment, sight.frame
+    zoom = max(1, -(-WIDTH // frame.intrinsics.width))
+    image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+    picture = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    T_camera_world = np.linalg.inv(frame.T_world_camera)
+    centers = moment.centers @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    for index in np.argsort(-centers[:, 2]):
+        color = BODY if moment.is_moving[index] else STILL
+        _outline(picture, centers[index], moment.radii[index], frame.intrinsics, zoom, color, 1)
+    worst = centers[moment.worst]
+    _outline(picture, worst, moment.radii[moment.worst], frame.intrinsics, zoom, WORST, 3)
+    obstacle = T_camera_world[:3, :3] @ moment.obstacle + T_camera_world[:3, 3]
+    if np.isfinite(obstacle).all() and min(obstacle[2], worst[2]) > NEAR:
+        _join(
+            picture,
+            *(_pixel(point, frame.intrinsics, zoom) for point in (_surface(worst, obstacle, moment), obstacle)),
+        )
+    if not cv2.imwrite(str(path), np.vstack([picture, _captioned(moment.caption, picture.shape[1])])):
+        raise WriteError(f"{path}: could not be written")
+
+
+def _best(moment: Moment, newest: dict[str, RgbdFrame]) -> Sight | None:
+    frames = [newest[camera] for camera in sorted(newest)]
+    return Sight(moment=moment, frame=max(frames, key=lambda frame: _view(moment, frame))) if frames else None
+
+
+def _view(moment: Moment, frame: RgbdFrame) -> tuple[int, int, float]:
+    """How well an image shows the worst sphere: whether it and its obstacle are in it, whether nothing hides the
+    sphere, and how large it is [px].
+    """
+    R, t = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
+    sphere, obstacle = ((point - t) @ R for point in (moment.centers[moment.worst], moment.obstacle))
+    radius = float(moment.radii[moment.worst])
+    is_in = [_cell(point, frame.intrinsics) is not None for point in (sphere, obstacle)]
+    cell = _cell(sphere, frame.intrinsics)
+    if cell is None:
+        return 0, 0, 0.0
+    depth = float(frame.depth[cell])
+    is_hidden = 0.0 < depth < sphere[2] - radius - HIDDEN
+    return sum(is_in), int(not is_hidden), frame.intrinsics.fx * radius / float(sphere[2])
+
+
+def _cell(point: Float64, intrinsics: Intrinsics) -> tuple[int, int] | None:
+    """Row and column of a point in camera coordinates; None outside the image."""
+    if not np.isfinite(point).all() or point[2] <= NEAR:
+        return None
+    column, row = (round(float(v)) for v in _pixel(point, intrinsics, 1))
+    return (row, column) if 0 <= row < intrinsics.height and 0 <= column < intrinsics.width else None
+
+
+def _pixel(point: Float64, intrinsics: Intrinsics, zoom: int) -> Float64:
+    """(2,) column and row of a point before the camera, in an image that is enlarged by `zoom`."""
+    plane = np.array([intrinsics.fx, intrinsics.fy]) * point[:2] / point[2] + [intrinsics.cx, intrinsics.cy]
+    return np.asarray((plane + 0.5) * zoom - 0.5)
+
+
+def _outline(
+    picture: UInt8,
+    center: Float64,
+    radius: float,
+    intrinsics: Intrinsics,
+    zoom: int,
+    color: tuple[int, int, int],
+    thickness: int,
+) -> None:
+    """The silhouette of a sphere: the circle in which its tangent cone from the camera touches it, projected."""
+    away = float(np.linalg.norm(center))
+    if center[2] - radius <= NEAR:
+        return
+    share = 1.0 - (radius / away) ** 2
+    first = np.cross(center, [0.0, 1.0, 0.0] if abs(center[1]) < 0.9 * away else [1.0, 0.0, 0.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(center, first) / away
+    ring = center * share + radius * np.sqrt(share) * (
+        np.cos(OUTLINE)[:, None] * first + np.sin(OUTLINE)[:, None] * second
+    )
+    pixels = np.array([_pixel(point, intrinsics, zoom) for point in ring])
+    points = [np.round(16 * pixels).astype(np.int32)]
+    cv2.polylines(picture, points, True, INK, thickness + 2, cv2.LINE_AA, 4)
+    cv2.polylines(picture, points, True, color, thickness, cv2.LINE_AA, 4)
+
+
+def _surface(center: Float64, obstacle: Float64, moment: Moment) -> Float64:
+    """The sphere's surface point towards the obstacle, in camera coordinates."""
+    offset = obstacle - center
+    length = max(float(np.linalg.norm(offset)), 1e-9)
+    return np.asarray(center + offset * (moment.radii[moment.worst] / length))
+
+
+def _join(picture: UInt8, start: Float64, end: Float64) -> None:
+    """A line from the sphere to the obstacle's nearest point, which is marked."""
+    a, b = (tuple(int(v) for v in np.round(point)) for point in (start, end))
+    for color, thickness in ((INK, 4), (POINT, 2)):
+        cv2.line(picture, a, b, color, thickness, cv2.LINE_AA)
+    for color, thickness in ((INK, 5), (POINT, 2)):
+        cv2.drawMarker(picture, b, color, cv2.MARKER_TILTED_CROSS, 16, thickness, cv2.LINE_AA)
+
+
+def _captioned(lines: Sequence[str], width: int) -> UInt8:
+    """The lines of text on a strip of paper, made smaller where one is too long."""
+    strip = np.full((LINE_HEIGHT * len(lines) + 2 * EDGE, width, 3), PAPER, np.uint8)
+    for number, line in enumerate(lines):
+        (length, _), _ = cv2.getTextSize(line, FONT, FONT_SCALE, 1)
+        scale = FONT_SCALE * min(1.0, (width - 2 * EDGE) / max(length, 1))
+        place = (EDGE, EDGE + LINE_HEIGHT * number + 16)
+        cv2.putText(strip, line, place, FONT, scale, INK, 1, cv2.LINE_AA)
+    return strip

@@ -1,0 +1,119 @@
+"""Which moments are the worst, which image shows each, and what is drawn on it."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.evaluate.worst_frames import WORST, Moment, Sight, draw_sight, sights_of, worst_moments
+from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
+
+SECOND = 1_000_000_000
+LENS = Intrinsics(fx=100.0, fy=100.0, cx=79.5, cy=59.5, width=160, height=120)
+MOMENT = Moment(
+    stamp_ns=SECOND,
+    centers=np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]]),
+    radii=np.array([0.1, 0.05]),
+    is_moving=np.array([False, True]),
+    worst=1,
+    obstacle=np.array([0.35, 0.0, 0.0]),
+    caption=("a line", "a longer line " * 12),
+)
+
+
+def frame(stamp_ns: int, camera: str = "near", *, away: float = 1.0, depth: float = 0.0, x: float = 0.0) -> RgbdFrame:
+    """A camera that looks along world z from `away` before the origin; a grey image of its stamp in tenths."""
+    T = np.eye(4)
+    T[:3, 3] = [x, 0.0, -away]
+    return RgbdFrame(
+        stamp_ns=stamp_ns,
+        camera=camera,
+        color=np.full((120, 160, 3), stamp_ns * 10 // SECOND, np.uint8),
+        depth=np.full((120, 160), depth, np.float32),
+        intrinsics=LENS,
+        T_world_camera=T,
+    )
+
+
+@pytest.mark.parametrize("num", [0, 1, 2, 3, 9])
+def test_the_worst_moments_are_those_of_separate_events(num: int) -> None:
+    seconds = np.arange(0, 10, 0.01)
+    clearance = 1.0 - 0.5 * np.exp(-((seconds - 2) ** 2)) - 0.7 * np.exp(-((seconds - 6) ** 2))
+    clearance += 1e-3 * np.cos(40 * np.pi * seconds)  # ripples are no events
+    clearance[:50] = np.nan
+    found = worst_moments(np.round(seconds * SECOND).astype(np.int64), clearance, num)
+    assert min(num, 2) <= len(found) <= num
+    np.testing.assert_allclose(seconds[found][:2], [6.0, 2.0][:num], atol=0.06)
+    assert np.all(np.diff(clearance[found]) >= 0)
+    assert all(abs(seconds[a] - seconds[b]) >= 0.5 for a in found for b in found if a != b)
+
+
+def test_the_flank_of_an_event_is_not_another() -> None:
+    stamps = np.arange(0, 4 * SECOND, SECOND // 100)
+    falling = np.linspace(1.0, 0.1, len(stamps))
+    assert worst_moments(stamps, falling, 3) == [len(stamps) - 1]
+    assert worst_moments(stamps, np.full(len(stamps), np.nan), 3) == []
+
+
+def test_a_moment_is_shown_by_the_newest_image_not_later() -> None:
+    frames = [frame(k * SECOND // 10) for k in range(0, 40, 4)]
+    late, early = MOMENT, replace(MOMENT, stamp_ns=SECOND // 2)
+    before = replace(MOMENT, stamp_ns=-1)
+    found = sights_of([late, early, before], iter(frames))
+    stamps = [None if sight is None else sight.frame.stamp_ns for sight in found]
+    assert stamps == [8 * SECOND // 10, 4 * SECOND // 10, None]
+    assert found[0] is not None and found[0].age_s == pytest.approx(0.2)
+
+
+def test_the_images_are_read_once_and_no_further_than_needed() -> None:
+    num_read = 0
+
+    def counted() -> Iterator[RgbdFrame]:
+        nonlocal num_read
+        for k in range(50):
+            num_read += 1
+            yield frame(k * SECOND // 10)
+
+    sights_of([MOMENT, replace(MOMENT, stamp_ns=SECOND // 2)], counted())
+    assert num_read == 12
+
+
+@pytest.mark.parametrize(
+    ("others", "best"),
+    [
+        ([frame(0, "far", away=3.0)], "near"),  # larger in the near one
+        ([frame(0, "near", depth=0.5), frame(0, "far", away=3.0)], "far"),  # hidden by what is 0.5 m away
+        ([frame(0, "near", x=-0.65), frame(0, "far", away=3.0)], "far"),  # the obstacle is outside the near one
+    ],
+)
+def test_the_camera_that_sees_the_worst_sphere_best_is_taken(others: list[RgbdFrame], best: str) -> None:
+    (sight,) = sights_of([MOMENT], [frame(0, "near"), *others])
+    assert sight is not None and sight.frame.camera == best
+
+
+def drawn(path: Path, moment: Moment, view: RgbdFrame) -> Float64:
+    draw_sight(path, Sight(moment=moment, frame=view))
+    return np.asarray(cv2.imread(str(path)), dtype=np.float64)
+
+
+def test_the_worst_sphere_is_outlined_where_it_is(tmp_path: Path) -> None:
+    pixels = drawn(tmp_path / "worst.png", MOMENT, frame(SECOND))
+    assert pixels.shape[1] == 960 and pixels.shape[0] > 720
+    is_worst = np.all(np.abs(pixels[:720] - WORST) < 40, axis=2)
+    rows, columns = np.nonzero(is_worst)
+    zoom, center = 6, np.array([79.5 + 20.0, 59.5])  # 0.2 m to the right at 1 m
+    expected = (center + 0.5) * zoom - 0.5
+    np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=4)
+    radius = np.hypot(columns - columns.mean(), rows - rows.mean())
+    np.testing.assert_allclose(radius, 100 * 0.05 * zoom, atol=5)
+    assert np.median(radius) == pytest.approx(30, abs=1)
+    assert (pixels[720:].min(axis=(1, 2)) < 100).any()  # the caption
+
+
+def test_a_sphere_around_the_camera_or_behind_it_is_not_drawn(tmp_path: Path) -> None:
+    behind = replace(MOMENT, centers=MOMENT.centers - [0, 0, 2.0], obstacle=np.full(3, np.nan))
+    pixels = drawn(tmp_path / "worst.png", behind, frame(SECOND))
+    assert np.ptp(pixels[:720]) == 0
