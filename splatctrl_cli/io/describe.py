@@ -55,7 +55,7 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
         facts |= {"start_s": first * 1e-9, "end_s": last * 1e-9, "duration_s": (last - first) * 1e-9}
     if found.tf.frames:
         facts |= {"tf_frames": list(found.tf.frames), "tf_roots": list(found.tf.roots)}
-    joints = next((t.joints[0].names for t in found.topics.values() if t.joints), ())
+    joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
     if joints:
         facts["joints"] = list(joints)
     grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=[_topic_row(t) for t in _by_name(found)])]
@@ -104,8 +104,8 @@ def _first(entry: TopicSurvey) -> str:
     if calibration is not None:
         K = calibration.K
         return f"{calibration.width}x{calibration.height} fx {K[0, 0]:.1f} cx {K[0, 2]:.1f} cy {K[1, 2]:.1f}"
-    if entry.joints:
-        return f"{len(entry.joints[0].names)} joints"
+    if entry.joints.first_names is not None:
+        return f"{len(entry.joints.first_names)} joints"
     return "-"
 
 

@@ -11,7 +11,7 @@ from splatctrl_cli.records import JointState, LossReport
 
 def joint_records(
     survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
-) -> tuple[tuple[str, ...], list[JointState]]:
+) -> tuple[tuple[str, ...], Sequence[JointState]]:
     """Joint names and states by stamp; no names and no states where the log holds none.
 
     With `wanted` (a robot's joints), they are brought together from the topics that have them. Else the states are of

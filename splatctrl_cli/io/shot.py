@@ -57,7 +57,7 @@ def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot
             yield joints[position]
             position += 1
         yield shot
-    yield from joints[position:]
+    yield from (joints[index] for index in range(position, len(joints)))
 
 
 def check_depth(depth: Float32, where: str, scale: float) -> bool:

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.rows import ranges
 from splatctrl_cli.records import Float64, LossReport
 
 Stamps = NDArray[np.int64]
@@ -51,13 +52,16 @@ def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
         if np.ptp(late) > MIXED:
             raise _mixed(where, float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late)))) + 1)
         return
-    windows = np.median(np.lib.stride_tricks.sliding_window_view(late, n), axis=1)
+    windows = np.empty(len(late) - n + 1)
+    for first, last in ranges(len(windows)):
+        near = late[first : last + n - 1]
+        windows[first:last] = np.median(np.lib.stride_tricks.sliding_window_view(near, n), axis=1)
     change = np.abs(windows[n:] - windows[:-n])  # the n states before i + n against those from it on
     step = float(change.max(initial=0.0))
     if step <= STEP:
         return
-    near = int(np.argmax(change))
-    state = near + 1 + int(np.argmax(np.abs(np.diff(late[near : near + 2 * n]))))
+    at = int(np.argmax(change))
+    state = at + 1 + int(np.argmax(np.abs(np.diff(late[at : at + 2 * n]))))
     if step > MIXED:
         raise _mixed(where, step, state)
     loss.notes.append(f"{where}: stamps step by {step:.3f} s against the time of logging at state {state}")

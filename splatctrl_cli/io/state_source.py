@@ -31,12 +31,12 @@ class StateSource:
     has_clock = True
 
     def __init__(
-        self, name: str, files: Sequence[Path], names: tuple[str, ...], states: list[JointState], loss: LossReport
+        self, name: str, files: Sequence[Path], names: tuple[str, ...], states: Sequence[JointState], loss: LossReport
     ) -> None:
         self.name = name
         self.joint_names = names
         self._files = tuple(files)
-        self._states = states
+        self.states = states
         self._loss = loss
 
     @property
@@ -46,7 +46,7 @@ class StateSource:
 
     def records(self) -> Iterator[Record]:
         """Joint states by stamp."""
-        yield from self._states
+        yield from self.states
 
     def digests(self) -> dict[str, str]:
         """sha256 of the files."""

@@ -4,15 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import JOINT_STATE
+from splatctrl_cli.io.joint_log import JointStream
 from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.io.state_clock import checked_stamps
-from splatctrl_cli.io.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY, RawJoints
+from splatctrl_cli.io.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY
 from splatctrl_cli.io.state_track import RawTrack
 from splatctrl_cli.io.survey import Survey, TopicSurvey
-from splatctrl_cli.records import Float64, LossReport
+from splatctrl_cli.records import Bool, LossReport
 
 BRIDGED = 0.5  # [s] at most between the states of another topic that a position is interpolated over
 STILL = 1e-3  # [rad or m] by which a joint may differ across a longer gap
@@ -20,18 +23,15 @@ STILL = 1e-3  # [rad or m] by which a joint may differ across a longer gap
 
 @dataclass(frozen=True, kw_only=True)
 class _Stream:
-    """States of one topic that name the same joints."""
+    """States of one topic that name the same joints, under the names to take them by."""
 
-    topic: TopicSurvey
-    states: list[RawJoints]
-
-    @property
-    def where(self) -> str:
-        return self.topic.topic.name
+    where: str
+    names: tuple[str, ...]
+    states: JointStream
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self.states[0].names
+    def has_poses(self) -> bool:
+        return self.states.column("T_base_ee") is not None
 
 
 def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> list[TopicSurvey]:
@@ -39,7 +39,7 @@ def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> li
 
     Raises InputError where --joint-topic is none of them.
     """
-    found = [t for t in survey.of_type(*STATE_TYPES) if any(joints.names for joints in t.joints)]
+    found = [t for t in survey.of_type(*STATE_TYPES) if t.joints.streams]
     for topic in survey.of_type(*STATE_TYPES):
         if not topic.topic.definition and topic.topic.type_name not in STANDARD_TYPES:
             kind = topic.topic.type_name
@@ -90,9 +90,8 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     streams = _renamed(_streams(topics), wanted, loss)
 
     def rank(stream: _Stream) -> tuple[int, bool, bool, int, str]:
-        has_poses = any(state.T_base_ee is not None for state in stream.states)
         covered = len(set(stream.names) & set(wanted))
-        return (covered, has_poses, stream.where == "/joint_states", len(stream.states), stream.where)
+        return (covered, stream.has_poses, stream.where == "/joint_states", len(stream.states), stream.where)
 
     base = max(streams, key=rank)
     track = _raw(base, base.names, loss)
@@ -114,13 +113,11 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
 
 
 def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
-    streams: dict[tuple[str, frozenset[str]], _Stream] = {}
-    for topic in topics:
-        for state in topic.joints:
-            if state.names:
-                key = (topic.topic.name, frozenset(state.names))
-                streams.setdefault(key, _Stream(topic=topic, states=[])).states.append(state)
-    return list(streams.values())
+    return [
+        _Stream(where=topic.topic.name, names=stream.names, states=stream)
+        for topic in topics
+        for stream in topic.joints.streams
+    ]
 
 
 def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
@@ -129,10 +126,7 @@ def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) ->
     if not names or any(set(stream.names) & set(names.values()) for stream in streams):
         return streams
     loss.notes.append(f"joints without a prefix are taken by their number: joint1 is {names['joint1']}, and so on")
-    return [
-        replace(s, states=[replace(state, names=tuple(names.get(n, n) for n in state.names)) for state in s.states])
-        for s in streams
-    ]
+    return [replace(s, names=tuple(names.get(name, name) for name in s.names)) for s in streams]
 
 
 def with_prefix(wanted: Sequence[str]) -> dict[str, str]:
@@ -146,53 +140,34 @@ def with_prefix(wanted: Sequence[str]) -> dict[str, str]:
 def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
     """The states of a stream with `names` as columns."""
     states = stream.states
-    orders: dict[tuple[str, ...], list[int]] = {}
-    for state in states:
-        if state.names not in orders:
-            orders[state.names] = [state.names.index(name) for name in names]
-    log_ns = np.array([state.log_time_ns for state in states], dtype=np.int64)
-    stamp_ns = np.array([state.stamp_ns for state in states], dtype=np.int64)
-    poses = [state.T_base_ee for state in states]
+    order = np.array([stream.names.index(name) for name in names], dtype=np.int64)
+    position, velocity = states.column("position"), states.column("velocity")
+    commanded, poses = states.column("commanded_velocity"), states.column("T_base_ee")
+    assert position is not None
     return RawTrack(
         where=stream.where,
         names=names,
-        stamp_ns=checked_stamps(stamp_ns, log_ns, stream.where, loss),
-        position=np.array([s.position[orders[s.names]] for s in states]),
-        velocity=_columns(states, [s.velocity for s in states], orders),
-        commanded_velocity=_columns(states, [s.commanded_velocity for s in states], orders)
-        if any(len(s.commanded_velocity) for s in states)
-        else None,
-        T_base_ee=None
-        if all(T is None for T in poses)
-        else np.array([np.full((4, 4), np.nan) if T is None else T for T in poses]),
+        stamp_ns=checked_stamps(states.stamp_ns, states.log_time_ns, stream.where, loss),
+        position=position.of_columns(order),
+        velocity=absent(len(states), len(names)) if velocity is None else velocity.of_columns(order),
+        commanded_velocity=None if commanded is None else commanded.of_columns(order),
+        T_base_ee=poses,
     )
-
-
-def _columns(states: list[RawJoints], values: list[Float64], orders: dict[tuple[str, ...], list[int]]) -> Float64:
-    """values (T, J) in order, NaN where a state has none."""
-    rows = []
-    for state, row in zip(states, values, strict=True):
-        order = orders[state.names]
-        rows.append(row[order] if len(row) else np.full(len(order), np.nan))
-    return np.array(rows)
 
 
 def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     """`track` with the joints of `other`, interpolated at its stamps; states where that cannot be are left out."""
     order = np.argsort(other.stamp_ns, kind="stable")
-    at, values = other.stamp_ns[order], other.position[order]
+    at = other.stamp_ns[order]
     stamps = track.stamp_ns
     after = np.clip(np.searchsorted(at, stamps), 1, max(len(at) - 1, 1))
     if len(at) == 1:
-        at, values, order = np.repeat(at, 2), np.repeat(values, 2, axis=0), np.repeat(order, 2)
+        at, order = np.repeat(at, 2), np.repeat(order, 2)
     before = after - 1
     gap = (at[after] - at[before]) * 1e-9
-    is_still = np.abs(values[after] - values[before]).max(axis=1) < STILL
+    is_still = _is_still(other.position, order[before], order[after])
     keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= BRIDGED) | is_still)
     share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
-
-    def between(rows: Float64) -> Float64:
-        return np.asarray((1 - share) * rows[order][before] + share * rows[order][after])
 
     names = ", ".join(other.names)
     if not keep.any():
@@ -204,17 +179,35 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     if not keep.all():
         lost = f"{int((~keep).sum())} of {len(stamps)} states left out"
         loss.notes.append(f"{track.where}: {lost}: {names} of {other.where} are unknown then")
+
+    def joined(one: Table, two: Table) -> Table:
+        file = RowFile((len(track.names) + len(other.names),))
+        for first, last in ranges(len(stamps)):
+            part = slice(first, last)
+            between = (1 - share[part]) * two[order[before[part]]] + share[part] * two[order[after[part]]]
+            file.append(np.hstack([one[part], between]))
+        return Rows(file)
+
     commanded = track.commanded_velocity
     filled = RawTrack(
         where=track.where,
         names=(*track.names, *other.names),
         stamp_ns=stamps,
-        position=np.hstack([track.position, between(other.position)]),
-        velocity=np.hstack([track.velocity, between(other.velocity)]),
+        position=joined(track.position, other.position),
+        velocity=joined(track.velocity, other.velocity),
         commanded_velocity=None
         if commanded is None or other.commanded_velocity is None
-        else np.hstack([commanded, between(other.commanded_velocity)]),
+        else joined(commanded, other.commanded_velocity),
         T_base_ee=track.T_base_ee,
         T_world_ee=track.T_world_ee,
     )
     return filled.select(keep)
+
+
+def _is_still(table: Table, before: NDArray[np.int64], after: NDArray[np.int64]) -> Bool:
+    """Pairs of states (T,) of which no joint differs."""
+    is_still = np.zeros(len(before), dtype=np.bool_)
+    for first, last in ranges(len(before)):
+        change = np.abs(table[after[first:last]] - table[before[first:last]])
+        is_still[first:last] = change.max(axis=1) < STILL
+    return is_still

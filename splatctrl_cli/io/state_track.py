@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.io.state_velocity import Stamps, differentiated, gaps_of
-from splatctrl_cli.records import Bool, Float64, JointState, LossReport
+from splatctrl_cli.io.rows import RowFile, Rows, Table, of_columns, ranges, selected
+from splatctrl_cli.io.state_columns import StateColumns
+from splatctrl_cli.io.state_velocity import Stamps, differentiated, gaps_of, slopes_by_block
+from splatctrl_cli.records import Bool, Float64, LossReport
 
 STILL = 1e-3  # [rad or m] of motion under which a velocity of zero is believed
 CONFLICT = 1e-6  # [rad or m] between states of one stamp
@@ -28,40 +30,54 @@ class RawTrack:
     where: str
     names: tuple[str, ...]
     stamp_ns: Stamps
-    position: Float64
-    velocity: Float64
-    commanded_velocity: Float64 | None = None
-    T_base_ee: Float64 | None = None
-    T_world_ee: Float64 | None = None
+    position: Table
+    velocity: Table
+    commanded_velocity: Table | None = None
+    T_base_ee: Table | None = None
+    T_world_ee: Table | None = None
 
     def select(self, keep: Bool | NDArray[np.intp]) -> "RawTrack":
         """The states of a mask (T,), or of indices, in that order."""
+        index = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep.astype(np.int64)
         commanded, base, world = self.commanded_velocity, self.T_base_ee, self.T_world_ee
         return RawTrack(
             where=self.where,
             names=self.names,
-            stamp_ns=self.stamp_ns[keep],
-            position=self.position[keep],
-            velocity=self.velocity[keep],
-            commanded_velocity=None if commanded is None else commanded[keep],
-            T_base_ee=None if base is None else base[keep],
-            T_world_ee=None if world is None else world[keep],
+            stamp_ns=self.stamp_ns[index],
+            position=selected(self.position, index),
+            velocity=selected(self.velocity, index),
+            commanded_velocity=None if commanded is None else selected(commanded, index),
+            T_base_ee=None if base is None else selected(base, index),
+            T_world_ee=None if world is None else selected(world, index),
         )
 
     def of_joints(self, names: Sequence[str]) -> "RawTrack":
         """The columns of these joints, in that order."""
-        order = [self.names.index(name) for name in names]
+        order = np.array([self.names.index(name) for name in names], dtype=np.int64)
         commanded = self.commanded_velocity
         return replace(
             self,
             names=tuple(names),
-            position=self.position[:, order],
-            velocity=self.velocity[:, order],
-            commanded_velocity=None if commanded is None else commanded[:, order],
+            position=of_columns(self.position, order),
+            velocity=of_columns(self.velocity, order),
+            commanded_velocity=None if commanded is None else of_columns(commanded, order),
         )
 
 
-def cleaned(raw: RawTrack, loss: LossReport) -> list[JointState]:
+@dataclass(frozen=True, kw_only=True)
+class _Velocities:
+    """What is known of T velocities: is_missing, is_zero (J,) for joints that have none, or that move at zero;
+    num_missing: states without one of a joint, num_taken: states in which one has to be taken from the positions.
+    """
+
+    is_missing: Bool
+    is_all_missing: bool
+    is_zero: Bool
+    num_missing: int
+    num_taken: int
+
+
+def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     """The states by stamp, each stamp once, each with velocities; every change is noted in `loss`.
 
     States with a position that is not finite are damage and left out; of states with one stamp the first is kept;
@@ -73,34 +89,37 @@ def cleaned(raw: RawTrack, loss: LossReport) -> list[JointState]:
         longest = float(np.max(np.diff(ordered.stamp_ns)[gaps])) * 1e-9
         loss.state_gaps += len(gaps)
         loss.notes.append(f"{raw.where}: {len(gaps)} gaps between states, the longest {longest:.3f} s")
-    velocity = _with_velocity(ordered, loss) if len(ordered.stamp_ns) else ordered.velocity
-    commanded = _optional(ordered.commanded_velocity, len(ordered.stamp_ns))
-    base, world = (_optional(T, len(ordered.stamp_ns)) for T in (ordered.T_base_ee, ordered.T_world_ee))
-    num_without = sum(a is None and b is None for a, b in zip(base, world, strict=True))
-    if 0 < num_without < len(base):
-        loss.notes.append(f"{raw.where}: {num_without} of {len(base)} states have no valid end-effector pose")
-    return [
-        JointState(
-            stamp_ns=int(stamp),
-            position=ordered.position[index],
-            velocity=velocity[index],
-            commanded_velocity=commanded[index],
-            T_base_ee=base[index],
-            T_world_ee=world[index],
-        )
-        for index, stamp in enumerate(ordered.stamp_ns)
-    ]
+    num = len(ordered.stamp_ns)
+    velocity = _with_velocity(ordered, loss) if num else ordered.velocity
+    num_without = num - _num_posed(ordered)
+    if 0 < num_without < num:
+        loss.notes.append(f"{raw.where}: {num_without} of {num} states have no valid end-effector pose")
+    return StateColumns(
+        stamp_ns=ordered.stamp_ns,
+        position=ordered.position,
+        velocity=velocity,
+        commanded_velocity=ordered.commanded_velocity,
+        T_base_ee=ordered.T_base_ee,
+        T_world_ee=ordered.T_world_ee,
+    )
 
 
-def _optional(values: Float64 | None, num_states: int) -> list[Float64 | None]:
-    """A value per state, None where it is not finite."""
-    if values is None:
-        return [None] * num_states
-    return [value if np.isfinite(value).all() else None for value in values]
+def _num_posed(raw: RawTrack) -> int:
+    """States with an end-effector pose."""
+    num = 0
+    for first, last in ranges(len(raw.stamp_ns)):
+        there = np.zeros(last - first, dtype=np.bool_)
+        for poses in (raw.T_base_ee, raw.T_world_ee):
+            if poses is not None:
+                there |= np.isfinite(poses[first:last]).all(axis=(1, 2))
+        num += int(there.sum())
+    return num
 
 
 def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
-    is_finite: Bool = np.asarray(np.isfinite(raw.position).all(axis=1))
+    is_finite = np.zeros(len(raw.stamp_ns), dtype=np.bool_)
+    for first, last in ranges(len(is_finite)):
+        is_finite[first:last] = np.isfinite(raw.position[first:last]).all(axis=1)
     num_broken = int((~is_finite).sum())
     if not num_broken:
         return raw
@@ -119,45 +138,74 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
     num_again = int(is_again.sum())
     if not num_again:
         return raw
-    again = np.flatnonzero(is_again)
-    differs = np.abs(raw.position[again] - raw.position[again - 1]).max(axis=1) > CONFLICT
+    again, num_other = np.flatnonzero(is_again), 0
+    for first, last in ranges(num_again):
+        part = again[first:last]
+        differs = np.abs(raw.position[part] - raw.position[part - 1]).max(axis=1) > CONFLICT
+        num_other += int(differs.sum())
     loss.duplicate_states += num_again
-    more = f", {int(differs.sum())} of them with other positions" if differs.any() else ""
+    more = f", {num_other} of them with other positions" if num_other else ""
     loss.notes.append(f"{raw.where}: {num_again} states repeat a stamp{more}: the first of each is kept")
     return raw.select(~is_again)
 
 
-def _with_velocity(raw: RawTrack, loss: LossReport) -> Float64:
+def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
     """velocity (T, J) with what is missing taken from the positions."""
-    missing = ~np.isfinite(raw.velocity)
-    moved = np.ptp(raw.position, axis=0) > STILL
-    is_still = np.asarray((np.where(missing, 0.0, raw.velocity) == 0).all(axis=0))
-    is_zero = is_still & ~missing.all(axis=0) & moved
-    taken = missing | is_zero
-    if not taken.any():
+    found = _looked_at(raw)
+    if not found.num_taken:
         thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // COMPARED))
-        _compare_units(thinned, differentiated(thinned.stamp_ns, thinned.position), loss)
+        _compare_units(thinned, loss)
         return raw.velocity
-    loss.differentiated_velocities += int(taken.any(axis=1).sum())
-    loss.notes.append(f"{raw.where}: {_reason(raw, missing, is_zero)}; they are differences of the positions")
-    return np.where(taken, differentiated(raw.stamp_ns, raw.position), raw.velocity)
+    loss.differentiated_velocities += found.num_taken
+    loss.notes.append(f"{raw.where}: {_reason(raw, found)}; they are differences of the positions")
+    whole = RowFile(raw.velocity.shape[1:])
+    for first, slopes in slopes_by_block(raw.stamp_ns, raw.position):
+        logged = raw.velocity[first : first + len(slopes)]
+        whole.append(np.where(~np.isfinite(logged) | found.is_zero, slopes, logged))
+    return Rows(whole)
 
 
-def _reason(raw: RawTrack, missing: Bool, is_zero: Bool) -> str:
-    if missing.all():
+def _looked_at(raw: RawTrack) -> _Velocities:
+    num, num_joints = raw.position.shape[:2]
+    low, high = np.full(num_joints, np.inf), np.full(num_joints, -np.inf)
+    is_still, is_missing, is_there = (np.full(num_joints, first) for first in (True, False, False))
+    num_missing = 0
+    for first, last in ranges(num):
+        position, velocity = raw.position[first:last], raw.velocity[first:last]
+        missing = ~np.isfinite(velocity)
+        low, high = np.minimum(low, position.min(axis=0)), np.maximum(high, position.max(axis=0))
+        is_still &= (np.where(missing, 0.0, velocity) == 0).all(axis=0)
+        is_missing |= missing.any(axis=0)
+        is_there |= ~missing.all(axis=0)
+        num_missing += int(missing.any(axis=1).sum())
+    is_zero = np.asarray(is_still & is_there & (high - low > STILL))
+    return _Velocities(
+        is_missing=is_missing,
+        is_all_missing=not is_there.any(),
+        is_zero=is_zero,
+        num_missing=num_missing,
+        num_taken=num if is_zero.any() else num_missing,
+    )
+
+
+def _reason(raw: RawTrack, found: _Velocities) -> str:
+    if found.is_all_missing:
         return "no velocities recorded"
-    if is_zero.any():
-        joints = ", ".join(name for name, zero in zip(raw.names, is_zero, strict=True) if zero)
+    if found.is_zero.any():
+        joints = ", ".join(name for name, zero in zip(raw.names, found.is_zero, strict=True) if zero)
         return f"velocities of {joints} are zero throughout although they move"
-    joints = ", ".join(name for index, name in enumerate(raw.names) if missing[:, index].any())
-    return f"velocities of {joints} are missing or NaN in {int(missing.any(axis=1).sum())} states"
+    joints = ", ".join(name for name, missing in zip(raw.names, found.is_missing, strict=True) if missing)
+    return f"velocities of {joints} are missing or NaN in {found.num_missing} states"
 
 
-def _compare_units(raw: RawTrack, slopes: Float64, loss: LossReport) -> None:
+def _compare_units(raw: RawTrack, loss: LossReport) -> None:
+    """Of states that are few enough to be read at once."""
+    position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
+    slopes: Float64 = differentiated(raw.stamp_ns, position)
     is_fast = np.abs(slopes) > MOVING
     if is_fast.sum() < 10:
         return
-    ratio = float(np.median(np.abs(raw.velocity[is_fast])) / np.median(np.abs(slopes[is_fast])))
+    ratio = float(np.median(np.abs(velocity[is_fast])) / np.median(np.abs(slopes[is_fast])))
     if not 1 / SPEED_RATIO < ratio < SPEED_RATIO:
         loss.notes.append(
             f"{raw.where}: logged velocities are {ratio:.3g} times the change of the positions: other units, "

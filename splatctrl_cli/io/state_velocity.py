@@ -1,11 +1,13 @@
 """Joint velocities from positions whose stamps jitter."""
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from splatctrl_cli.io.rows import Table, ranges
 from splatctrl_cli.records import Float64
 
 Stamps = NDArray[np.int64]
@@ -38,21 +40,47 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
     lag = min(PERIOD_SAMPLES, len(seconds) - 1)
     period = float(np.median(seconds[lag:] - seconds[:-lag])) / lag
     number = _numbers(seconds, period)
-    index = np.arange(len(seconds))
-    first = np.maximum(index - CLOCK_SAMPLES, 0)
-    last = np.minimum(index + CLOCK_SAMPLES, len(seconds) - 1) + 1
-    residual = seconds - period * number  # small numbers: the sums below keep their digits
-
-    def over(values: Float64) -> Float64:
-        sums = np.concatenate([[0.0], np.cumsum(values)])
-        return np.asarray((sums[last] - sums[first]) / (last - first))
-
-    mean_k, mean_r = over(number), over(residual)
-    spread = over(number**2) - mean_k**2
-    slope = (over(number * residual) - mean_k * mean_r) / np.maximum(spread, 1e-12)
-    smooth = period * number + mean_r + slope * (number - mean_k)
+    smooth = np.empty_like(seconds)
+    sums = _Sums()
+    for begin, end in ranges(len(seconds)):
+        index = np.arange(begin, end)
+        first = np.maximum(index - CLOCK_SAMPLES, 0)
+        last = np.minimum(index + CLOCK_SAMPLES, len(seconds) - 1) + 1
+        k, residual = number[: last[-1]], seconds[sums.num : last[-1]] - period * number[sums.num : last[-1]]
+        sums.add(k[sums.num :], residual)  # small numbers: the sums below keep their digits
+        mean_k, mean_r, mean_kk, mean_kr = sums.means(first, last)
+        slope = (mean_kr - mean_k * mean_r) / np.maximum(mean_kk - mean_k**2, 1e-12)
+        smooth[begin:end] = period * number[begin:end] + mean_r + slope * (number[begin:end] - mean_k)
+        sums.forget(end - CLOCK_SAMPLES)
     is_regular = float(np.sqrt(np.mean((smooth - seconds) ** 2))) < 0.25 * period
-    return np.asarray(smooth) if is_regular and bool(np.all(np.diff(smooth) > 0)) else seconds
+    return smooth if is_regular and bool(np.all(np.diff(smooth) > 0)) else seconds
+
+
+class _Sums:
+    """Running sums of k, r, k^2 and k r over all states so far, of which the newest are kept."""
+
+    def __init__(self) -> None:
+        self._sums = np.zeros((4, 1))  # up to but not with state `_start` and those after it
+        self._start = 0
+
+    @property
+    def num(self) -> int:
+        """States that were added."""
+        return self._start + self._sums.shape[1] - 1
+
+    def add(self, k: Float64, r: Float64) -> None:
+        """The next states' (T,)."""
+        rows = [np.cumsum(np.concatenate([s[-1:], v])) for s, v in zip(self._sums, (k, r, k**2, k * r), strict=True)]
+        self._sums = np.hstack([self._sums, np.array(rows)[:, 1:]])
+
+    def means(self, first: NDArray[np.intp], last: NDArray[np.intp]) -> Float64:
+        """(4, T) of the states from each first up to its last."""
+        return np.asarray((self._sums[:, last - self._start] - self._sums[:, first - self._start]) / (last - first))
+
+    def forget(self, before: int) -> None:
+        """The sums that no later state asks for."""
+        if before > self._start:
+            self._sums, self._start = self._sums[:, before - self._start :].copy(), before
 
 
 def _numbers(seconds: Float64, period: float) -> Float64:
@@ -62,12 +90,15 @@ def _numbers(seconds: Float64, period: float) -> Float64:
     """
     numbers = np.zeros(len(seconds))
     clock, number = 0.0, 0
-    for index in range(1, len(seconds)):
-        ticks = max(round((seconds[index] - clock) / period), 1)
-        number += ticks
-        clock += ticks * period
-        clock += CLOCK_GAIN * (seconds[index] - clock)
-        numbers[index] = number
+    for first, last in ranges(len(seconds)):
+        block: list[int] = []
+        for second in seconds[first:last].tolist():
+            ticks = max(round((second - clock) / period), 1) if first or block else 0
+            number += ticks
+            clock += ticks * period
+            clock += CLOCK_GAIN * (second - clock)
+            block.append(number)
+        numbers[first:last] = block
     return numbers
 
 
@@ -77,12 +108,23 @@ def differentiated(stamp_ns: Stamps, position: Float64) -> Float64:
     The slope, at each state, of the parabola through it and its two neighbours on either side (a Savitzky-Golay
     derivative for uneven steps), on the smoothed clock; nothing is fitted across a gap. A state alone has velocity 0.
     """
-    velocity = np.zeros_like(position)
-    borders = [0, *(gaps_of(stamp_ns) + 1), len(stamp_ns)]
+    return np.concatenate([np.zeros((0, *position.shape[1:])), *(v for _, v in slopes_by_block(stamp_ns, position))])
+
+
+def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Float64]]:
+    """`differentiated` a block at a time: the first state of each and the velocities (K, J) there."""
+    borders = [0, *(gaps_of(stamp_ns) + 1).tolist(), len(stamp_ns)]
     for start, end in pairwise(borders):
-        if end - start > 1:
-            velocity[start:end] = _slopes(smoothed_seconds(stamp_ns[start:end]), position[start:end])
-    return velocity
+        if end - start == 1:
+            yield start, np.zeros((1, *position.shape[1:]))
+            continue
+        seconds = smoothed_seconds(stamp_ns[start:end])
+        size = min(2 * POSITION_SAMPLES + 1, end - start)
+        for first, last in ranges(end - start):
+            low, high = max(min(first - size // 2, end - start - size), 0), min(last + size // 2, end - start)
+            high = max(high, min(low + size, end - start))
+            slopes = _slopes(seconds[low:high], position[start + low : start + high])
+            yield start + first, slopes[first - low : last - low]
 
 
 def _slopes(seconds: Float64, position: Float64) -> Float64:

@@ -16,9 +16,10 @@ from splatctrl_cli.io.decoder import (
     is_ros,
     stamp_ns,
 )
+from splatctrl_cli.io.joint_log import JointLog
 from splatctrl_cli.io.messages import ImageMessage, read_image
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
-from splatctrl_cli.io.state_messages import STANDARD_TYPES, STATE_TYPES, RawJoints, read_states
+from splatctrl_cli.io.state_messages import STANDARD_TYPES, STATE_TYPES, read_states
 from splatctrl_cli.io.tf_tree import TfTree
 from splatctrl_cli.records import Float64
 
@@ -49,7 +50,7 @@ class TopicSurvey:
     stamps_ns: list[int] = field(default_factory=list)
     first_image: ImageMessage | None = None
     calibration: Calibration | None = None
-    joints: list[RawJoints] = field(default_factory=list)
+    joints: JointLog = field(default_factory=JointLog)
 
 
 @dataclass(kw_only=True)

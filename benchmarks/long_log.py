@@ -1,0 +1,155 @@
+"""`python -m benchmarks.long_log FOLDER SECONDS`: a moving arm logged at 1 kHz, and what a replay of it takes."""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.lib.format import write_array_header_1_0
+from rosbags.typesys import Stores, get_typestore
+
+from benchmarks.measure import SAMPLE
+from splatctrl_cli.records import Float64
+
+RATE = 1000  # states per second
+FORMS = ("npz", "csv", "mcap")
+BLOCK = 10_000  # states at once
+START_NS = 1_700_000_000_000_000_000
+MIDDLE = np.array([-0.2, 0.2, 0.0, -1.9, 0.0, 2.1, 0.8])  # [rad]
+SWING = np.array([0.6, 0.15, 0.2, 0.2, 0.3, 0.2, 0.5])  # [rad]
+PACE = np.array([0.31, 0.47, 0.23, 0.53, 0.29, 0.41, 0.37])  # [rad/s]
+NAMES = tuple(f"joint{number}" for number in range(1, 8))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spent:
+    """What a process took: wall time [s], largest resident memory [MB], and its exit code."""
+
+    seconds: float
+    megabytes: float
+    code: int
+
+
+def blocks(num: int) -> Iterator[tuple[Float64, Float64, Float64]]:
+    """Times (T,) [s], positions and velocities (T, 7) of `num` states, BLOCK at a time."""
+    for first in range(0, num, BLOCK):
+        t = np.arange(first, min(first + BLOCK, num)) / RATE
+        phase = t[:, None] * PACE
+        yield t, MIDDLE + SWING * np.sin(phase), SWING * PACE * np.cos(phase)
+
+
+def write_log(folder: Path, seconds: float, form: str = "npz", *, with_velocity: bool = True) -> Path:
+    """A log of the sample arm that swings above the table; returns what `splatctrl replay` takes.
+
+    npz: a table with its .toml; csv: libfranka's columns; mcap: JointState messages.
+    """
+    num = max(round(seconds * RATE), 1)
+    write = {"npz": _write_npz, "csv": _write_csv, "mcap": _write_mcap}[form]
+    return write(folder / f"long_{num}.{form}", num, with_velocity)
+
+
+def measured(command: Sequence[str]) -> Spent:
+    """Run a command and wait for it."""
+    start = time.perf_counter()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    kilobytes = usage.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
+    return Spent(seconds=time.perf_counter() - start, megabytes=kilobytes / 1024, code=process.returncode)
+
+
+def replay_command(log: Path, scene: Sequence[str], out: Path, *more: str) -> list[str]:
+    """The command that replays a log of `write_log`; scene: --field or --scene with its path."""
+    robot = ["--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml")]
+    call = [sys.executable, "-m", "splatctrl_cli", "replay", str(log), *robot, *scene]
+    return [*call, "-o", str(out), "--force", "-q", "--max-unknown", "1", *more]
+
+
+def _write_npz(path: Path, num: int, with_velocity: bool) -> Path:
+    import zipfile
+
+    members = {"t": 0, "q": 1, **({"dq": 2} if with_velocity else {})}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, part in members.items():
+            shape = (num,) if part == 0 else (num, len(NAMES))
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+                for block in blocks(num):
+                    stream.write(np.ascontiguousarray(block[part]).tobytes())
+    table = [f'file = "{path.name}"', f"joints = {list(NAMES)}", 'time = "t"', 'position = ["q"]']
+    table += ['velocity = ["dq"]'] if with_velocity else []
+    described = path.with_suffix(".toml")
+    described.write_text("\n".join(["[states]", *table]) + "\n", encoding="utf-8")
+    return described
+
+
+def _write_csv(path: Path, num: int, with_velocity: bool) -> Path:
+    columns = ["time", *(f"state.q[{i}]" for i in range(7)), *(f"state.dq[{i}]" for i in range(7) if with_velocity)]
+    with path.open("w", encoding="utf-8") as stream:
+        stream.write(",".join(columns) + "\n")
+        for t, q, dq in blocks(num):
+            table = np.column_stack([np.round(t * 1000), q, *([dq] if with_velocity else [])])
+            np.savetxt(stream, table, fmt=["%d", *["%.9g"] * (table.shape[1] - 1)], delimiter=",")
+    return path
+
+
+def _write_mcap(path: Path, num: int, with_velocity: bool) -> Path:
+    store: Any = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "sensor_msgs/msg/JointState"
+    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="benchmarks")
+        text, _ = store.generate_msgdef(kind, ros_version=2)
+        schema = writer.register_schema(name=kind, encoding="ros2msg", data=text.encode())
+        channel = writer.register_channel(topic="/joint_states", message_encoding="cdr", schema_id=schema)
+        for t, q, dq in blocks(num):
+            for index in range(len(t)):
+                at_ns = START_NS + round(t[index] * 1e9)
+                when = stamp(sec=at_ns // 10**9, nanosec=at_ns % 10**9)
+                velocity = dq[index] if with_velocity else np.zeros(0)
+                content = store.types[kind](
+                    header=header(stamp=when, frame_id=""),
+                    name=list(NAMES),
+                    position=q[index],
+                    velocity=velocity,
+                    effort=np.zeros(0),
+                )
+                data = bytes(store.serialize_cdr(content, kind))
+                writer.add_message(channel, log_time=at_ns, publish_time=at_ns, data=data)
+        writer.finish()
+    return path
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write the log, replay it, and print time, states per second and memory."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.long_log", description=__doc__, allow_abbrev=False)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("seconds", type=float)
+    parser.add_argument("--form", choices=FORMS, default="npz")
+    parser.add_argument("--without-velocity", action="store_true")
+    parser.add_argument("--field", type=Path, help="a baked field; without it the log is written and no more")
+    parser.add_argument("--mode", default="audit")
+    args, more = parser.parse_known_args(argv)
+    log = write_log(args.folder, args.seconds, args.form, with_velocity=not args.without_velocity)
+    if args.field is None:
+        print(log)
+        return 0
+    command = replay_command(log, ("--field", str(args.field)), args.folder / "out", "--mode", args.mode, *more)
+    spent, num = measured(command), round(args.seconds * RATE)
+    print(
+        f"{args.form} {args.mode}: {num} states in {spent.seconds:.1f} s ({num / spent.seconds:.0f} states/s), "
+        f"{spent.megabytes:.0f} MB, exit {spent.code}"
+    )
+    return spent.code
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,152 @@
+"""Rows of numbers that memory need not hold: in a file without a name, read a block at a time."""
+
+import os
+import tempfile
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.records import Float64
+
+IN_MEMORY = 4 * 2**20  # [bytes] up to which a file is memory
+BLOCK = 4096  # rows at once
+FEW = 4096  # rows that are read beside those that were asked for
+
+Index = NDArray[np.int64]
+
+
+def scratch_folder() -> Path:
+    """Where files without a name lie: TMPDIR, else /var/tmp, which unlike /tmp is no memory, else what there is."""
+    given, on_disk = os.environ.get("TMPDIR"), Path("/var/tmp")
+    return Path(tempfile.gettempdir()) if given or not os.access(on_disk, os.W_OK) else on_disk
+
+
+def ranges(num: int, size: int | None = None) -> Iterator[tuple[int, int]]:
+    """First and one past the last row of every block of `size` (default: BLOCK) of `num` rows."""
+    step = BLOCK if size is None else size
+    yield from ((first, min(first + step, num)) for first in range(0, num, step))
+
+
+class RowFile:
+    """Rows of one shape, added at the end; what is read is a copy, and nothing is mapped into memory."""
+
+    def __init__(self, shape: tuple[int, ...] = ()) -> None:
+        self.row_shape = shape
+        self._row_bytes = 8 * int(np.prod(shape, dtype=np.int64))
+        self._num = 0
+        self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
+
+    def __len__(self) -> int:
+        return self._num
+
+    def append(self, rows: Float64) -> None:
+        """Add rows (T, ...)."""
+        block = np.ascontiguousarray(rows, dtype=np.float64)
+        if block.shape[1:] != self.row_shape:
+            raise ValueError(f"rows: expected {self.row_shape}, got {block.shape[1:]}")
+        self._file.seek(self._num * self._row_bytes)
+        self._file.write(block.tobytes())
+        self._num += len(block)
+
+    def read(self, first: int, last: int) -> Float64:
+        """Rows (last - first, ...)."""
+        num = max(min(last, self._num) - first, 0)
+        self._file.seek(first * self._row_bytes)
+        content = bytearray(self._file.read(num * self._row_bytes))
+        return np.frombuffer(content, dtype=np.float64).reshape(num, *self.row_shape)
+
+    def take(self, index: Index) -> Float64:
+        """The rows of an index (T,), in its order."""
+        if not len(index):
+            return self.read(0, 0)
+        first, last = int(index.min()), int(index.max()) + 1
+        if last - first <= 2 * len(index) + FEW:
+            return self.read(first, last)[index - first]
+        return np.concatenate([self.read(i, i + 1) for i in index.tolist()])
+
+
+class Rows:
+    """Rows (T, ...) of a file: all, or those of an index (T,); of each row all numbers, or those of `columns`.
+
+    ``rows[first:last]``, ``rows[index]`` and ``rows[number]`` read them, as those of an array.
+    """
+
+    def __init__(self, file: RowFile, index: Index | None = None, columns: Index | None = None) -> None:
+        self._file, self._index, self._columns = file, index, columns
+
+    def __len__(self) -> int:
+        return len(self._file) if self._index is None else len(self._index)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As of an array."""
+        row = self._file.row_shape if self._columns is None else (len(self._columns),)
+        return (len(self), *row)
+
+    def __getitem__(self, which: int | slice | NDArray[np.integer]) -> Float64:
+        if isinstance(which, slice):
+            first, last, _ = which.indices(len(self))
+            return self._read(first, last)
+        if isinstance(which, int | np.integer):
+            number = int(which) + (len(self) if which < 0 else 0)
+            return cast("Float64", self._read(number, number + 1)[0])
+        index = which.astype(np.int64)
+        return self._narrowed(self._file.take(index if self._index is None else self._index[index]))
+
+    def select(self, index: Index) -> "Rows":
+        """The rows of an index (K,), in its order."""
+        return Rows(self._file, index if self._index is None else self._index[index], self._columns)
+
+    def of_columns(self, order: Index) -> "Rows":
+        """These columns of each row, in that order."""
+        return Rows(self._file, self._index, order if self._columns is None else self._columns[order])
+
+    def _read(self, first: int, last: int) -> Float64:
+        if self._index is None:
+            return self._narrowed(self._file.read(first, last))
+        return self._narrowed(self._file.take(self._index[first:last]))
+
+    def _narrowed(self, rows: Float64) -> Float64:
+        return rows if self._columns is None else np.ascontiguousarray(rows[:, self._columns])
+
+
+Table = Float64 | Rows
+"""Rows (T, ...) by number, slice or index: in memory, or in a file."""
+
+
+def selected(table: Table, index: Index) -> Table:
+    """The rows of an index (K,), in its order; of a file without reading them."""
+    return table.select(index) if isinstance(table, Rows) else table[index]
+
+
+def of_columns(table: Table, order: Index) -> Table:
+    """These columns of each row, in that order."""
+    return table.of_columns(order) if isinstance(table, Rows) else table[:, order]
+
+
+def blocks_of(table: Table) -> Iterator[Float64]:
+    """The rows, a block at a time."""
+    yield from (table[first:last] for first, last in ranges(len(table)))
+
+
+def absent(num: int, width: int) -> Rows:
+    """(num, width) NaN."""
+    file = RowFile((width,))
+    for first, last in ranges(num):
+        file.append(np.full((last - first, width), np.nan))
+    return Rows(file)
+
+
+def scaled(rows: Rows, factor: float) -> Rows:
+    """The rows times a factor."""
+    if factor == 1.0:
+        return rows
+    file = RowFile(rows.shape[1:])
+    for block in blocks_of(rows):
+        file.append(block * factor)
+    return Rows(file)
