@@ -149,6 +149,7 @@ class ControlConfig:
     max_angular_speed: float = 1.0  # [rad/s]
     twist_timeout: float = 0.5  # [s] a logged twist holds; then the arm is asked to stand still
     max_acceleration: float | tuple[float, ...] = 0.0  # [rad/s^2] of every joint, or one for each; 0: no limit
+    velocity_limits: str = "urdf"  # or fr3: also those published for the Franka Research 3, by position
     distance_rate: str = "snapshots"  # dd/dt of the rows: what distances lost between the two newest scenes; or none
     max_distance_rate: float = 1.6  # [m/s] that a scene is taken to approach with at most: a walking person
     max_residual: float = 1e-5  # a solution whose relative KKT residual exceeds this is not used
@@ -269,6 +270,7 @@ _CHOICES = {
     "control.preset": ("reduced", "paper"),
     "control.coverage": ("report", "margin"),
     "control.solver": ("clarabel", "daqp"),
+    "control.velocity_limits": ("urdf", "fr3"),
     "control.distance_rate": ("none", "snapshots"),
 }
 _AT_MOST_ONE = (

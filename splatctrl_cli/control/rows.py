@@ -9,10 +9,14 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import barriers
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.barriers import Barrier
+from splatctrl_cli.control.braking import braking_speed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 MARGIN = "margin"
+BRAKING_SHARE = (
+    0.5  # of the deceleration that a row could have alone; 1 lost up to 6 mm where several rows brake at once
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +56,12 @@ class Rows:
 class RowBuilder:
     """Builds the rows of an arm in a distance field; names (M,) say which sphere or pair a row guards."""
 
-    def __init__(self, model: ArmModel, config: ControlConfig, field: DistanceField) -> None:
+    def __init__(
+        self, model: ArmModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None = None
+    ) -> None:
+        """acceleration (J,) [rad/s^2]: what joints can brake with; None: they stop at once."""
         self._model, self._config, self._field = model, config, field
+        self._acceleration = acceleration
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
@@ -78,18 +86,19 @@ class RowBuilder:
         centers, jacobians = self._model.spheres_at(q)
         distance, gradient = self._queried(centers)
         between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
+        G = -barriers.external_gradient(gradient, jacobians[self._moving])
         external = Barrier(
             index=self._moving,
-            G=-barriers.external_gradient(gradient, jacobians[self._moving]),
-            h=self._external_bound(distance, distance_rate),
+            G=G,
+            h=self._bound(distance, self._margin[: self.num_external], G, distance_rate),
             distance=distance,
             slack_cost=config.slack_cost,
             slack_weight=config.weight_slack,
         )
-        own_h = self._own_bound(between)
+        own_G, own_h = self._pair_rows(between, direction, jacobians, box)
         own = Barrier(
             index=np.arange(len(self._pairs)),
-            G=-self._pair_gradient(direction, jacobians, own_h, box),
+            G=own_G,
             h=own_h,
             distance=between,
             slack_cost=config.self_slack_cost,
@@ -102,16 +111,21 @@ class RowBuilder:
 
     def room(self, q: Float64, velocity: Float64, distance_rate: float | Float64) -> Float64:
         """``h - G v`` (M,) [m/s] of every row at q for a velocity (J,)."""
+        if self._acceleration is not None:
+            rows = self.at(q, (velocity, velocity), distance_rate)
+            return np.asarray(rows.h - np.concatenate([rows.external.G, rows.own.G]) @ velocity)
         centers, jacobians = self._model.spheres_at(q)
         distance, gradient = self._queried(centers)
         between, direction = barriers.pair_distance(centers, self._radii, self._pairs)
         motion = jacobians @ velocity
         apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
-        scene = self._external_bound(distance, distance_rate)
-        own = self._own_bound(between)
-        return np.concatenate(
-            [scene + np.sum(gradient * motion[self._moving], axis=1), own + np.sum(direction * apart, axis=1)]
+        approach = [np.sum(gradient * motion[self._moving], axis=1), np.sum(direction * apart, axis=1)]
+        rate = np.zeros(len(self.names))
+        rate[: self.num_external] = distance_rate
+        h = barriers.barrier_bound(
+            np.concatenate([distance, between]), margin=self._margin, gain=self._config.barrier_gain, rate=rate
         )
+        return np.asarray(h + np.concatenate(approach))
 
     def distances(self, q: Float64) -> Float64:
         """Every row's distance (M,) [m] at q; NaN where the field has none, which keeps no promise."""
@@ -119,24 +133,34 @@ class RowBuilder:
         distance = self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii[self._moving]
         return np.concatenate([distance, barriers.pair_distance(centers, self._radii, self._pairs)[0]])
 
-    def _external_bound(self, distance: Float64, distance_rate: float | Float64) -> Float64:
-        margin = self._margin[: self.num_external]
-        return barriers.barrier_bound(distance, margin=margin, gain=self._config.barrier_gain, rate=distance_rate)
+    def _bound(self, distance: Float64, margin: Float64, G: Float64, distance_rate: float | Float64 = 0.0) -> Float64:
+        """h (M,) of rows G (M, J); where joints cannot stop at once, with the way that braking takes.
 
-    def _own_bound(self, distance: Float64) -> Float64:
-        return barriers.barrier_bound(distance, margin=self._config.self_margin, gain=self._config.barrier_gain)
-
-    def _pair_gradient(
-        self, direction: Float64, jacobians: Float64, h: Float64, box: tuple[Float64, Float64]
-    ) -> Float64:
-        """``dd/dq`` (P, J) of the pairs whose spheres are fast enough to use up h; zero for the others, which no
-        velocity of the box brings to bind.
+        A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it is counted on, for it changes on
+        the way and other rows want their part.
         """
+        gain = self._config.barrier_gain
+        if self._acceleration is None:
+            return barriers.barrier_bound(distance, margin=margin, gain=gain, rate=distance_rate)
+        deceleration = BRAKING_SHARE * (np.abs(G) @ self._acceleration)
+        return braking_speed(distance - margin, gain, deceleration, self._config.period) + distance_rate
+
+    def _pair_rows(
+        self, distance: Float64, direction: Float64, jacobians: Float64, box: tuple[Float64, Float64]
+    ) -> tuple[Float64, Float64]:
+        """G (P, J) and h (P,) of the pairs. Without a limit to braking G is zero for those whose spheres are too slow
+        to use up h, which no velocity of the box brings to bind.
+        """
+        margin = self._margin[self.num_external :]
+        if self._acceleration is not None:
+            G = -barriers.pair_gradient(direction, jacobians, self._pairs)
+            return G, self._bound(distance, margin, G)
+        G = np.zeros((len(distance), jacobians.shape[2]))
+        h = self._bound(distance, margin, G)
         speed = barriers.fastest_spheres(jacobians, *box)
         near = np.flatnonzero(h <= speed[self._pairs[:, 0]] + speed[self._pairs[:, 1]])
-        gradient = np.zeros((len(h), jacobians.shape[2]))
-        gradient[near] = barriers.pair_gradient(direction[near], jacobians, self._pairs[near])
-        return gradient
+        G[near] = -barriers.pair_gradient(direction[near], jacobians, self._pairs[near])
+        return G, h
 
     def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
         """Distance (M,) of the moving spheres' surfaces and the field's gradient (M, 3) at their centres."""

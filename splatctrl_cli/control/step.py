@@ -10,7 +10,7 @@ from splatctrl_cli.control import tasks
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.checks import check_config, check_coverage, check_model, checked_posture
 from splatctrl_cli.control.ladder import Choice, Rung, descend
-from splatctrl_cli.control.limits import velocity_box
+from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.presets import PAPER, PrintedTask, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named
 from splatctrl_cli.control.rows import RowBuilder, Rows
@@ -113,7 +113,8 @@ class QpIkController:
         self._model, self._config, self._frame = model, config, frame
         self._solver: QpSolver = solver_named(config.solver) if solver is None else solver
         self._home = np.asarray(model.middle if home is None else home, dtype=np.float64)
-        self._builder = RowBuilder(model, config, field)
+        self._limits = JointLimits.of(model, config)
+        self._builder = RowBuilder(model, config, field, self._limits.acceleration)
         self._limit_names = tuple(f"{joint} {side}" for side in ("highest", "lowest") for joint in model.joint_names)
         self._row_names = self._builder.names
         weight = np.repeat([config.weight_linear, config.weight_angular], 3)
@@ -132,34 +133,42 @@ class QpIkController:
         *,
         distance_rate: float | Float64 = 0.0,
         guide: Guide | None = None,
+        last_velocity: Float64 | None = None,
     ) -> ControlStep:
         """The joint velocity at q (J,) [rad] towards a goal pose (4, 4) of the controlled frame.
 
         distance_rate is dd/dt [m/s] of the moving spheres' distances, (M,) or one number, for a field that changes
-        with time; guide says how the goal moves, None that it stands still. Raises InputError for a q that is not
-        finite, NotEvaluableError where the field has no distance.
+        with time; guide says how the goal moves, None that it stands still; last_velocity (J,) [rad/s] is the one
+        held until now, from which accelerations and smoothness count (None: they do not). Raises InputError for a q
+        that is not finite, NotEvaluableError where the field has no distance.
         """
         q = checked_posture(self._model, q)
-        model, config = self._model, self._config
-        error = pose_error(model.frame_pose(q, self._frame), T_world_goal)
-        box = velocity_box(q, model.lower, model.upper, model.velocity_limit, config.barrier_gain)
+        config = self._config
+        error = pose_error(self._model.frame_pose(q, self._frame), T_world_goal)
+        box, rest = self._limits.box(q, last_velocity), self._limits.rest(last_velocity)
         rows = self._builder.at(q, box, distance_rate)
-        aim = self._aim(q, error, guide)
+        bias = self._bias(q, guide, last_velocity)
+        reference = self._reference(error, guide)
         if config.preset == PAPER:
-            printed = self._printed(q, aim, box, rows)
-            return self._reported(error, rows, printed, float(printed.rung is not Rung.HOLD))
-        choice = descend(self._solver, self._costs(q, *aim), box, rows.for_qp, config)
-        return self._reported(error, rows, choice, self._kept_scale(q, choice, rows))
+            printed = self._printed(q, reference, bias, box, rows)
+            return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
+        task = tasks.velocity_task(self._model.frame_jacobian(q, self._frame), reference, self._weight)
+        choice = descend(self._solver, [task, bias], box, rows.for_qp, config)
+        return self._reported(error, rows, choice, rest, self._kept_scale(q, choice, rows, rest))
 
-    def margin_of(self, q: Float64, velocity: Float64, *, distance_rate: float | Float64 = 0.0) -> VelocityMargin:
-        """The room that any joint velocity (J,) [rad/s] leaves at q (J,), this controller's or not.
-
-        Raises as `step`.
+    def margin_of(
+        self,
+        q: Float64,
+        velocity: Float64,
+        *,
+        distance_rate: float | Float64 = 0.0,
+    ) -> VelocityMargin:
+        """The room that any joint velocity (J,) [rad/s] leaves at q (J,), this controller's or not; no acceleration
+        counts. Raises as `step`.
         """
-        q, model = checked_posture(self._model, q), self._model
+        q = checked_posture(self._model, q)
         room = self._builder.room(q, velocity, distance_rate)
-        gain = self._config.barrier_gain
-        lowest, highest = velocity_box(q, model.lower, model.upper, model.velocity_limit, gain)
+        lowest, highest = self._limits.box(q)
         limits = np.concatenate([highest - velocity, velocity - lowest])
         row, limit = int(np.argmin(room)), int(np.argmin(limits))
         return VelocityMargin(
@@ -169,37 +178,42 @@ class QpIkController:
             limit_row=self._limit_names[limit],
         )
 
-    def _aim(self, q: Float64, error: Float64, guide: Guide | None) -> tuple[Float64, Float64]:
-        """The velocity (6,) to reach for and that (J,) of the posture, on top of the goal's own motion."""
+    def _reference(self, error: Float64, guide: Guide | None) -> Float64:
+        """The velocity (6,) to reach for, on top of the goal's own motion."""
         config = self._config
         reference = reference_velocity(
             error, gain=config.pose_gain, max_linear=config.max_linear_speed, max_angular=config.max_angular_speed
         )
+        return reference if guide is None else reference + guide.twist
+
+    def _bias(self, q: Float64, guide: Guide | None, last_velocity: Float64 | None) -> tasks.Cost:
+        """The optional terms of III-E: lean to a posture (on top of its own motion), and change little."""
+        config = self._config
         lean = config.posture_gain * ((self._home if guide is None else guide.posture) - q)
-        return (reference, lean) if guide is None else (reference + guide.twist, lean + guide.velocity)
+        lean = lean if guide is None else lean + guide.velocity
+        H, c = tasks.posture_task(lean, config.posture_weight)
+        if config.smoothness_weight == 0 or last_velocity is None:
+            return H, c
+        H_change, c_change = tasks.posture_task(last_velocity, config.smoothness_weight)
+        return H + H_change, c + c_change
 
-    def _costs(self, q: Float64, reference: Float64, lean: Float64) -> list[tasks.Cost]:
-        """The terms of III-E's objective: reach for the goal, lean home."""
-        return [
-            tasks.velocity_task(self._model.frame_jacobian(q, self._frame), reference, self._weight),
-            tasks.posture_task(lean, self._config.posture_weight),
-        ]
-
-    def _printed(self, q: Float64, aim: tuple[Float64, Float64], box: tuple[Float64, Float64], rows: Rows) -> Choice:
+    def _printed(
+        self, q: Float64, reference: Float64, bias: tasks.Cost, box: tuple[Float64, Float64], rows: Rows
+    ) -> Choice:
         """The answer of the program as the paper prints it."""
         config = self._config
         weight = np.repeat([config.weight_linear, config.weight_angular], 3)
         task = PrintedTask(
-            reference=aim[0],
+            reference=reference,
             jacobian=self._model.frame_jacobian(q, self._frame),
             weight_task=weight,
             weight_kinematics=config.weight_kinematics * weight,
         )
-        posture = tasks.posture_task(aim[1], config.posture_weight)
-        return solve_printed(self._solver, task, posture, box, rows.for_qp, config)
+        return solve_printed(self._solver, task, bias, box, rows.for_qp, config)
 
-    def _kept_scale(self, q: Float64, choice: Choice, rows: Rows) -> float:
-        """The largest of SCALES whose next distances are no worse than the rows promised, else 0.
+    def _kept_scale(self, q: Float64, choice: Choice, rows: Rows, rest: Float64) -> float:
+        """The largest of SCALES whose next distances are no worse than the rows promised, else 0: how much of the
+        chosen velocity there is, the remainder being `rest` (J,).
 
         A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
         """
@@ -209,15 +223,15 @@ class QpIkController:
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
         floor = np.minimum(promised, rows.distance) - config.promise_tolerance
         for scale in SCALES:
-            if np.all(self._builder.distances(q + scale * config.period * choice.velocity) >= floor):
+            if np.all(self._builder.distances(q + config.period * _blend(choice.velocity, rest, scale)) >= floor):
                 return scale
         return 0.0
 
-    def _reported(self, error: Float64, rows: Rows, choice: Choice, scale: float) -> ControlStep:
+    def _reported(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
         """The step, with its rows by name."""
         slack = rows.spread(choice.slack)
         return ControlStep(
-            velocity=choice.velocity * scale,
+            velocity=_blend(choice.velocity, rest, scale),
             rung=choice.rung if scale > 0 else Rung.HOLD,
             scale=scale,
             pose_error=error,
@@ -252,3 +266,8 @@ class QpIkController:
 
     def _named(self, rows: Bool) -> tuple[str, ...]:
         return tuple(self._row_names[i] for i in np.flatnonzero(rows))
+
+
+def _blend(velocity: Float64, rest: Float64, scale: float) -> Float64:
+    """`scale` of a velocity (J,), the remainder at rest (J,), exact at either end."""
+    return velocity if scale == 1.0 else rest + scale * (velocity - rest)

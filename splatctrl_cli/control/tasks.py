@@ -25,8 +25,9 @@ def velocity_task(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost
 
 
 def posture_task(velocity: Float64, weight: float) -> Cost:
-    """The cost ``weight |v - velocity|^2`` of straying from a posture velocity (J,) [rad/s].
+    """The cost ``weight |v - velocity|^2`` of straying from a joint velocity (J,) [rad/s].
 
-    The home bias of III-E; it also makes the QP of a redundant arm strictly convex.
+    Towards home it is the home bias of III-E, which also makes the QP of a redundant arm strictly convex; from the
+    last velocity it is the smoothness.
     """
     return 2.0 * weight * np.eye(len(velocity)), -2.0 * weight * velocity

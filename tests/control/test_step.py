@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control import rows
 from splatctrl_cli.control.checks import static_violations
 from splatctrl_cli.control.ladder import Rung, is_usable
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
@@ -244,3 +245,73 @@ def test_the_margin_of_a_velocity_is_the_room_that_its_tightest_row_has_left() -
     step = steered.step(q, goal(np.zeros(2)))
     assert steered.margin_of(q, step.velocity).barrier >= -1e-6
     assert steered.margin_of(q, np.array([0.0, 2.0])).limit_row == "elbow highest"
+
+
+def test_a_step_changes_the_velocity_by_no_more_than_the_acceleration_allows() -> None:
+    limited = controller(far_away(), replace(CONFIG, max_acceleration=3.0))
+    last, q = np.zeros(2), Q
+    for _ in range(40):
+        step = limited.step(q, goal(np.array([-0.9, 1.4])), last_velocity=last)
+        assert np.all(np.abs(step.velocity - last) <= 0.03 + 1e-7)
+        q, last = q + CONFIG.period * step.velocity, step.velocity
+    assert np.abs(last).max() > 0.2
+    free = controller(far_away()).step(Q, goal(np.array([-0.9, 1.4])), last_velocity=np.zeros(2))
+    assert np.abs(free.velocity).max() > 0.1
+
+
+def test_holding_still_is_braking_where_the_arm_cannot_stop_at_once() -> None:
+    config, last = replace(CONFIG, max_acceleration=4.0), np.array([0.5, -0.02])
+    step = controller(far_away(), config, solver=Scripted(3)).step(Q, goal(np.zeros(2)), last_velocity=last)
+    assert step.rung is Rung.HOLD and step.scale == 0.0
+    np.testing.assert_allclose(step.velocity, [0.46, 0.0], atol=1e-12)
+    at_once = controller(far_away(), solver=Scripted(3)).step(Q, goal(np.zeros(2)), last_velocity=last)
+    assert at_once.rung is Rung.HOLD and not at_once.velocity.any()
+    printed = replace(config, preset="paper", barrier_gain=1.0)
+    step = controller(far_away(), printed, solver=Scripted(1)).step(Q, goal(np.zeros(2)), last_velocity=last)
+    assert step.rung is Rung.HOLD
+    np.testing.assert_allclose(step.velocity, [0.46, 0.0], atol=1e-12)
+
+
+def test_a_step_that_is_scaled_back_still_brakes_no_harder_than_it_can() -> None:
+    q, last = np.array([0.5, -0.5]), np.array([-0.3, 0.4])
+    tip = PlanarArm().sphere_centers(q)[4, 0]
+    config = replace(CONFIG, max_acceleration=2.0)
+    for wall in (1e-9, 4e-4, 8e-4):
+        step = controller(Cliff(tip + wall), config).step(q, goal(np.zeros(2)), last_velocity=last)
+        assert np.all(np.abs(step.velocity - last) <= 0.02 + 1e-7)
+
+
+@pytest.mark.parametrize("acceleration", [2.0, 10.0])
+def test_an_arm_that_cannot_stop_at_once_keeps_its_margin_by_looking_ahead(
+    acceleration: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall = Plane([0.0, -1.0, 0.0], -0.6)
+    config = replace(CONFIG, max_acceleration=acceleration, max_linear_speed=1.5, max_angular_speed=9.0)
+
+    def least() -> float:
+        steered, q, last, clearance = (
+            controller(wall, replace(config, barrier_gain=50.0)),
+            np.array([-0.9, 0.3]),
+            np.zeros(2),
+            [],
+        )
+        for _ in range(300):
+            step = steered.step(q, goal(np.array([1.3, 0.3])), last_velocity=last)
+            clearance.append(step.clearance)
+            q, last = q + CONFIG.period * step.velocity, step.velocity
+        return min(clearance)
+
+    assert CONFIG.margin - 1e-4 < least() < CONFIG.margin + 1e-3
+    monkeypatch.setattr(rows, "braking_speed", lambda room, gain, *_: gain * room)
+    assert least() < CONFIG.margin - 5e-3
+
+
+def test_smoothness_pulls_the_velocity_towards_the_last_one() -> None:
+    target, last = goal(np.array([-0.9, 1.4])), np.array([0.2, 0.2])
+    free = controller(far_away()).step(Q, target, last_velocity=last).velocity
+    apart = []
+    for weight in (0.1, 1.0, 100.0):
+        smooth = controller(far_away(), replace(CONFIG, smoothness_weight=weight))
+        apart.append(np.linalg.norm(smooth.step(Q, target, last_velocity=last).velocity - last))
+        np.testing.assert_allclose(smooth.step(Q, target).velocity, free, atol=1e-9)
+    assert np.linalg.norm(free - last) > apart[0] > apart[1] > apart[2]

@@ -1,0 +1,156 @@
+"""Joint limits: what braking needs, accelerations, and velocities by position, in a box that is never empty."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig, load_config
+from splatctrl_cli.control.braking import braking_speed, brought_to_rest
+from splatctrl_cli.control.limits import JointLimits
+from splatctrl_cli.control.velocity_limits import fr3_limits
+from splatctrl_cli.errors import UsageError
+from tests.control.fakes import PlanarArm
+from tests.reference.control import braking_room, fr3_velocity_range
+
+NAMES = tuple(f"fr3_joint{number}" for number in range(1, 8))
+CONFIG = ControlConfig()
+
+
+@pytest.mark.parametrize(("gain", "acceleration"), [(10.0, 2.0), (10.0, 10.0), (50.0, 5.0), (100.0, 3.0), (1.0, 7.0)])
+def test_the_braking_speed_is_the_one_whose_room_there_is(gain: float, acceleration: float) -> None:
+    room = np.geomspace(1e-5, 3.0, 400)
+    speed = braking_speed(room, gain, np.full(400, acceleration), 0.01)
+    needed = [braking_room(v, gain, acceleration, 0.01) for v in speed]
+    np.testing.assert_allclose(needed, room, rtol=1e-9)
+    assert np.all(np.diff(speed) > 0) and np.all(speed <= gain * room + 1e-12)
+
+
+@pytest.mark.parametrize(("gain", "acceleration"), [(10.0, 2.0), (50.0, 5.0), (100.0, 3.0), (1.0, 7.0)])
+def test_after_a_step_at_the_braking_speed_braking_is_enough(gain: float, acceleration: float) -> None:
+    dt, decelerations = 0.01, np.full(500, acceleration)
+    room = np.geomspace(1e-6, 4.0, 500)
+    speed = braking_speed(room, gain, decelerations, dt)
+    later = braking_speed(room - dt * speed, gain, decelerations, dt)
+    assert np.all(later >= speed - acceleration * dt - 1e-12)
+    assert np.all(room - dt * speed >= -1e-15)
+
+
+def test_without_a_limit_to_braking_or_outside_the_bound_is_the_linear_one() -> None:
+    room = np.array([-0.3, 0.0, 0.2, 5.0])
+    np.testing.assert_array_equal(braking_speed(room, 10.0, np.full(4, np.inf), 0.01), 10.0 * room)
+    np.testing.assert_array_equal(braking_speed(room[:2], 10.0, np.ones(2), 0.01), 10.0 * room[:2])
+
+
+def test_coming_to_rest_takes_what_the_change_allows() -> None:
+    np.testing.assert_allclose(brought_to_rest(np.array([0.5, -0.5, 0.01]), np.full(3, 0.05)), [0.45, -0.45, 0.0])
+
+
+def limits(acceleration: float, **changes: float) -> JointLimits:
+    return JointLimits.of(PlanarArm(), replace(CONFIG, max_acceleration=acceleration, **changes))
+
+
+@pytest.mark.parametrize("acceleration", [0.3, 2.0, 20.0])
+def test_the_merged_box_is_never_empty_wherever_the_arm_is_and_however_it_moved(acceleration: float) -> None:
+    box, random = limits(acceleration), np.random.default_rng(0)
+    free = limits(0.0)
+    for _ in range(500):
+        q, last = random.uniform(-4.0, 4.0, 2), random.uniform(-9.0, 9.0, 2)
+        lowest, highest = box.box(q, last)
+        assert np.all(lowest <= highest)
+        allowed = box.box(q)
+        assert np.all(lowest >= allowed[0]) and np.all(highest <= allowed[1])  # velocity and position come first
+        assert np.all(allowed[0] <= allowed[1]) and np.all(np.abs(np.concatenate(allowed)) <= 1.5)
+        change = 0.01 * acceleration
+        can = np.minimum(allowed[1], last + change) >= np.maximum(allowed[0], last - change)
+        assert np.all(np.abs(np.where(can, lowest - last, 0.0)) <= change + 1e-12)
+        assert np.all(np.abs(np.where(can, highest - last, 0.0)) <= change + 1e-12)
+        is_inside = (q > box.lower) & (q < box.upper)
+        assert np.all(np.where(is_inside, allowed[1] <= free.box(q)[1], True))
+
+
+@pytest.mark.parametrize(("acceleration", "gain"), [(0.5, 10.0), (5.0, 10.0), (2.0, 100.0)])
+def test_from_a_state_that_the_box_led_to_the_acceleration_never_gives_way(acceleration: float, gain: float) -> None:
+    box, random = limits(acceleration, barrier_gain=gain), np.random.default_rng(1)
+    q, last = np.zeros(2), np.zeros(2)
+    for step in range(3000):
+        lowest, highest = box.box(q, last)
+        is_up = random.random(2) < 0.5 if step > 1500 else np.array([True, False])
+        wish = np.where(is_up, highest, lowest)
+        assert np.all(np.abs(wish - last) <= 0.01 * acceleration + 1e-9)
+        q, last = q + 0.01 * wish, wish
+        assert np.all(q <= box.upper + 1e-9) and np.all(q >= box.lower - 1e-9)
+        if step == 1500:
+            np.testing.assert_allclose(q, [box.upper[0], box.lower[1]], atol=1e-3)
+
+
+def test_no_last_velocity_means_that_no_acceleration_counts() -> None:
+    lowest, highest = limits(2.0).box(np.zeros(2))
+    np.testing.assert_array_equal(highest, [1.5, 1.5])
+    np.testing.assert_array_equal(lowest, [-1.5, -1.5])
+    np.testing.assert_array_equal(limits(2.0).rest(None), [0.0, 0.0])
+    np.testing.assert_array_equal(limits(0.0).rest(np.ones(2)), [0.0, 0.0])
+    np.testing.assert_allclose(limits(2.0).rest(np.array([1.0, -0.01])), [0.98, 0.0])
+
+
+def test_accelerations_come_for_all_joints_or_one_by_one(tmp_path: pytest.TempPathFactory) -> None:
+    path = tmp_path / "config.toml"  # type: ignore[operator]
+    path.write_text("[control]\nmax_acceleration = [1.0, 2]\n")
+    config = load_config(path, []).control
+    assert config.max_acceleration == (1.0, 2.0)
+    np.testing.assert_array_equal(JointLimits.of(PlanarArm(), config).acceleration, [1.0, 2.0])
+    assert limits(0.0).acceleration is None
+    for value, words in ((-1.0, "above 0"), ((1.0, 0.0), "above 0"), ((1.0, 2.0, 3.0), "one for each joint, got 3")):
+        with pytest.raises(UsageError, match=words):
+            limits(value)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=r"max_acceleration\[1\]: expected float, got 'x'"):
+        load_config(None, ["control.max_acceleration=[1, 'x']"])
+
+
+def test_the_fr3_limits_are_those_that_are_published() -> None:
+    limit, random = fr3_limits(NAMES), np.random.default_rng(2)
+    for _ in range(300):
+        q = random.uniform(limit.lower - 0.1, limit.upper + 0.1)
+        for found, published in zip(limit.at(q), fr3_velocity_range(q), strict=True):
+            np.testing.assert_allclose(found, published, atol=1e-12)
+    order = [3, 0]
+    np.testing.assert_allclose(fr3_limits([NAMES[j] for j in order]).at(q[order])[1], limit.at(q)[1][order])
+
+
+def test_the_fr3_limits_are_continuous_and_zero_lies_between_them() -> None:
+    limit = fr3_limits(NAMES)
+    for share in np.linspace(-0.05, 1.05, 2001):
+        q = limit.lower + share * (limit.upper - limit.lower)
+        lowest, highest = limit.at(q)
+        assert np.all(lowest <= 0) and np.all(highest >= 0) and np.all(highest <= limit.most)
+        ahead = limit.at(q + 1e-6)[1]
+        assert np.all(np.abs(ahead - highest) <= 1e-6 * limit.slope / (2 * limit.offset) + 1e-12)
+
+
+def test_the_fr3_limits_are_merged_with_those_of_the_urdf() -> None:
+    lower, upper = np.array([-2.7, -1.0]), np.array([2.7, 1.0])
+    merged = JointLimits(
+        lower=lower,
+        upper=upper,
+        velocity=np.array([1.0, 9.0]),
+        gain=100.0,
+        period=0.01,
+        by_position=fr3_limits(NAMES[:2]),
+    )
+    lowest, highest = merged.box(np.zeros(2))
+    np.testing.assert_allclose(highest, [1.0, 2.62])
+    np.testing.assert_allclose(
+        merged.box(np.array([2.68, 0.9]))[1],
+        np.minimum(fr3_limits(NAMES[:2]).at(np.array([2.68, 0.9]))[1], [1.0, 9.0]),
+    )
+    for q in (np.array([3.0, 2.0]), np.array([-3.0, -2.0])):
+        lowest, highest = merged.box(q)
+        assert np.all(lowest <= highest) and np.all(np.sign(highest + lowest) == -np.sign(q))
+
+
+def test_joints_that_the_fr3_does_not_have_are_named() -> None:
+    with pytest.raises(UsageError, match="got elbow"):
+        fr3_limits(["fr3_joint1", "elbow"])
+    with pytest.raises(UsageError, match="got fr3_joint1, fr3_finger_joint1"):
+        fr3_limits(["fr3_joint1", "fr3_finger_joint1"])
+    assert load_config(None, ["control.velocity_limits=fr3"]).control.velocity_limits == "fr3"
