@@ -48,6 +48,24 @@ def check_edges(
     [rad] before a collision is left unproved. Where `only_whole`, an edge is dropped at its first collision, and its
     free_share is 0.
     """
+    if clearance.compiled is None:
+        return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)
+    share, num_checks = clearance.compiled.advance(
+        start,
+        end,
+        contact=contact,
+        give_up=max(give_up, SHORTEST),
+        rounding=ROUNDING,
+        still=STILL,
+        only_whole=only_whole,
+    )
+    return EdgeCheck(free_share=share, num_checks=int(num_checks.sum()))
+
+
+def check_sampled_edges(
+    clearance: Clearance, start: Float64, end: Float64, *, contact: float, give_up: float, only_whole: bool
+) -> EdgeCheck:
+    """`check_edges` by the clearance's own postures, of any scene: what the kernel is held to."""
     motion = end - start
     speeds = np.maximum(clearance.speeds(motion), STILL)
     length = np.linalg.norm(motion, axis=1)

@@ -10,12 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.solids import Solids
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.kernels.chain import Chain
+from splatctrl_cli.kernels.edges import EdgeRoom
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 
 class PlanningArm(ArmModel, Protocol):
-    """An arm whose spheres' travel per radian (or metre) of every joint is bounded; `RobotModel` is one."""
+    """An arm whose spheres' travel per radian (or metre) of every joint is bounded; `RobotModel` is one.
+
+    chain: its bodies and spheres as the kernels walk them, None where only its methods know.
+    """
+
+    @property
+    def chain(self) -> Chain | None: ...
 
     def lever_arms(self) -> Float64:
         """(S, J)."""
@@ -48,7 +57,8 @@ class Clearance:
     taken (R,) [m] radii and margins that come off the distances between centres; moving (M,) the spheres that a joint
     moves; pairs (P, 2) of all spheres; levers (R, J): no
     row loses more than `levers @ |dq|` [m] on the way of dq, given that the scene's distance is 1-Lipschitz (exact
-    distances are; for another field `lipschitz` scales its rows). names (R,) of the rows. num_checks counts postures.
+    distances are; for another field `lipschitz` scales its rows). names (R,) of the rows. compiled: the same for the
+    kernel that checks edges, None where the scene is not of solids or the arm has no chain.
     """
 
     model: PlanningArm
@@ -58,6 +68,7 @@ class Clearance:
     pairs: NDArray[np.integer]
     levers: Float64
     names: tuple[str, ...]
+    compiled: EdgeRoom | None = None
 
     @classmethod
     def of(
@@ -79,7 +90,7 @@ class Clearance:
             raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
         levers, pairs = model.lever_arms(), np.asarray(model.self_pairs()).reshape(-1, 2)
         names, radii = sphere_names(model.sphere_set), np.asarray(model.sphere_set.radii, dtype=np.float64)
-        return cls(
+        room = cls(
             model=model,
             scene=scene,
             taken=np.concatenate([(radii + margin)[moving], radii[pairs].sum(axis=1) + self_margin]),
@@ -88,10 +99,24 @@ class Clearance:
             levers=np.concatenate([lipschitz * levers[moving], _between(levers, pairs)]),
             names=tuple(names[s] for s in moving) + tuple(f"{names[a]}~{names[b]}" for a, b in pairs),
         )
+        return room.in_scene(scene)
 
     def in_scene(self, scene: HasDistance) -> "Clearance":
         """The same arm and margins in another scene."""
-        return replace(self, scene=scene)
+        chain, compiled = self.model.chain, None
+        if chain is not None and isinstance(scene, Solids):
+            balls, boxes, rods = scene.rows()
+            compiled = EdgeRoom(
+                chain=chain,
+                moving=self.moving.astype(np.int64),
+                pairs=np.ascontiguousarray(self.pairs, dtype=np.int64),
+                taken=self.taken,
+                levers=np.ascontiguousarray(self.levers.T),
+                balls=balls,
+                boxes=boxes,
+                rods=rods,
+            )
+        return replace(self, scene=scene, compiled=compiled)
 
     def rows(self, q: Float64) -> Float64:
         """Every row's distance less its margin (B, R) [m] at postures q (B, J).

@@ -1,6 +1,7 @@
 """A path planned for a replay's task: from its start to a pose, in the scene known at that time. J joints."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.advancement import check_edges
 from splatctrl_cli.control.clearance import Clearance, HasDistance, PlanningArm
+from splatctrl_cli.control.detour import Detour, PlanDetour
 from splatctrl_cli.control.goal_postures import goal_postures
 from splatctrl_cli.control.path import TimedPath, effector_rates, timed
 from splatctrl_cli.control.planner import PlanOutcome, plan
@@ -69,7 +71,7 @@ def planned_path(
                 model, way, frame, max_linear=control.max_linear_speed, max_angular=control.max_angular_speed
             )
             path = timed(way, model.velocity_limit, planner.max_acceleration, max_rate=rates)
-            check = check_edges(room, way[:-1], way[1:], contact=0.0)
+            check = check_edges(room, way[:-1], way[1:], contact=planner.contact / 2)
             num_edges, num_proved = len(check.free_share), int(np.sum(check.is_free))
     return PlannedPath(
         outcome=outcome,
@@ -98,3 +100,22 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
     keeps = (scene[1:] >= margin) & (own[1:] >= self_margin)
     is_free = (scene[1:] > 0) & (own[1:] > 0)
     return margin, self_margin, goals[keeps & is_free]
+
+
+def planned_detours(
+    model: PlanningArm,
+    scene_at: Callable[[int], HasDistance],
+    frame: str,
+    planner: PlannerConfig,
+    control: ControlConfig,
+    *,
+    home: Float64 | None = None,
+) -> PlanDetour:
+    """Ways out of local minima by `planned_path`, in the scene that `scene_at` gives at the stamp of the stall."""
+
+    def detour(stamp_ns: int, q: Float64, T_world_goal: Float64) -> Detour | None:
+        task = ReplayTask(start=q, T_world_goal=T_world_goal, frame=frame, stamp_ns=stamp_ns, home=home)
+        path = planned_path(model, scene_at(stamp_ns), task, planner, control).path
+        return None if path is None else Detour(path=path, wait_distance=planner.wait_distance)
+
+    return detour

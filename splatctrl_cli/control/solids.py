@@ -72,6 +72,11 @@ class Solids:
         shape = np.array([_core(s) for s in rods], dtype=np.float64)
         object.__setattr__(self, "_rods", (*_into([s.T_world_shape for s in rods]), shape.reshape(-1, 3).T))
 
+    def rows(self) -> tuple[Float64, Float64, Float64]:
+        """Balls (., 4), boxes (., 15) and rods (., 15), as `kernels.edges.EdgeRoom` takes them."""
+        centers, radii = self._balls
+        return np.column_stack([centers, radii]), _placed_rows(*self._boxes), _placed_rows(*self._rods)
+
     def distance(self, points: Float64) -> Float64:
         """points (Q, 3) -> signed distance (Q,) to the nearest solid, inf without any."""
         least = np.full(len(points), np.inf)
@@ -121,6 +126,12 @@ def _into(placements: Sequence[Float64]) -> tuple[Float64, Float64]:
     """Rotation rows (3 P, 3) and shifts (3, P) of the maps from world into P frames, axis by axis."""
     maps = np.array([invert_transform(T) for T in placements]).reshape(-1, 4, 4)
     return np.ascontiguousarray(np.swapaxes(maps[:, :3, :3], 0, 1)).reshape(-1, 3), maps[:, :3, 3].T
+
+
+def _placed_rows(turn: Float64, shift: Float64, shape: Float64) -> Float64:
+    """(P, 15): rotation (9) and shift (3) from world, and three numbers of the shape."""
+    rotations = np.swapaxes(turn.reshape(3, -1, 3), 0, 1).reshape(-1, 9)
+    return np.ascontiguousarray(np.column_stack([rotations, shift.T, shape.T]))
 
 
 def _core(rod: Rod) -> tuple[float, float, float]:

@@ -181,6 +181,11 @@ class RobotModel:
         in_body = np.ascontiguousarray(there.placement.homogeneous[:3])
         return self._chain.frame(self._checked(q), there.parentJoint, in_body)
 
+    @property
+    def chain(self) -> Chain:
+        """The bodies and spheres as the kernels walk them."""
+        return self._chain
+
     def lever_arms(self) -> Float64:
         """(S, J) upper bounds, over every posture, of how far a centre moves per radian (or metre) of a joint."""
         return lever_arms(self._chain, self.lower, self.upper)

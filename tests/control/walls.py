@@ -4,12 +4,15 @@ import numpy as np
 
 from splatctrl_cli.control.clearance import Clearance
 from splatctrl_cli.control.solids import Ball, Cuboid, Solids
+from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
 
 
 class LeveredArm(PlanarArm):
     """`PlanarArm` with exact lever arms: each sphere's greatest distance to the joint."""
+
+    chain: Chain | None = None
 
     def lever_arms(self) -> Float64:
         x = self.sphere_set.centers[:, 0]

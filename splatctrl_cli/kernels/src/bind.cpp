@@ -20,5 +20,6 @@ NB_MODULE(SPLATCTRL_MODULE, m) {
   splatctrl::bind_gaussians(m);
   splatctrl::bind_field(m);
   splatctrl::bind_chain(m);
+  splatctrl::bind_edges(m);
   splatctrl::bind_occupancy(m);
 }

@@ -41,5 +41,6 @@ void bind_gaussians(nb::module_& m);
 void bind_field(nb::module_& m);
 void bind_occupancy(nb::module_& m);
 void bind_chain(nb::module_& m);
+void bind_edges(nb::module_& m);
 
 }  // namespace splatctrl

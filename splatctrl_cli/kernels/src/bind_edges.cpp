@@ -1,0 +1,67 @@
+#include <cstring>
+#include <vector>
+
+#include "bind_chain.h"
+#include "edges.h"
+
+namespace splatctrl {
+namespace {
+
+// Rows of doubles as the solids that they are.
+template <typename Solid, typename Rows>
+std::vector<Solid> solids_from(const Rows& rows) {
+  static_assert(sizeof(Solid) % sizeof(double) == 0);
+  expect(rows.shape(1) * sizeof(double) == sizeof(Solid), "solids: expected a row of numbers for each");
+  std::vector<Solid> solids(rows.shape(0));
+  if (!solids.empty()) std::memcpy(static_cast<void*>(solids.data()), rows.data(), solids.size() * sizeof(Solid));
+  return solids;
+}
+
+void edges(const Integers& parent, const Integers& kind, const Placements& placement, const Triples& axis,
+           const Integers& sphere_body, const Triples& offset, const Integers& moving, const Array<const long, nb::shape<-1, 2>>& pairs, const Doubles& taken, const Postures& levers,
+           const Postures& balls, const Postures& boxes, const Postures& rods, const Postures& start, const Postures& end, double contact, double give_up,
+           double rounding, double still, bool only_whole, int threads, const Array<double, nb::shape<-1>>& free_share,
+           const Array<long, nb::shape<-1>>& num_checks) {
+  const Chain chain = view_chain(parent, kind, placement, axis, sphere_body, offset);
+  const size_t joints = parent.shape(0) - 1, rows = moving.shape(0) + pairs.shape(0), num = start.shape(0);
+  expect(taken.shape(0) == rows && levers.shape(0) == joints && levers.shape(1) == rows, "rows: expected taken (R,), levers (J, R)");
+  expect(start.shape(1) == joints && end.shape(0) == num && end.shape(1) == joints, "edges: expected start and end (E, J)");
+  expect(free_share.shape(0) == num && num_checks.shape(0) == num, "edges: expected a share and a count for each");
+  expect(contact > 0.0 && still > 0.0, "edges: expected contact and still above 0");
+  for (size_t k = 0; k < moving.shape(0); ++k)
+    expect(moving.data()[k] >= 0 && moving.data()[k] < chain.num_spheres, "moving: expected spheres that are there");
+  for (size_t k = 0; k < 2 * pairs.shape(0); ++k)
+    expect(pairs.data()[k] >= 0 && pairs.data()[k] < chain.num_spheres, "pairs: expected spheres that are there");
+  const std::vector<Ball> all_balls = solids_from<Ball>(balls);
+  const std::vector<Cuboid> all_boxes = solids_from<Cuboid>(boxes);
+  const std::vector<Rod> all_rods = solids_from<Rod>(rods);
+  const Room room{chain,
+                  static_cast<int>(moving.shape(0)),
+                  static_cast<int>(pairs.shape(0)),
+                  moving.data(),
+                  pairs.data(),
+                  taken.data(),
+                  levers.data(),
+                  static_cast<int>(all_balls.size()),
+                  static_cast<int>(all_boxes.size()),
+                  static_cast<int>(all_rods.size()),
+                  all_balls.data(),
+                  all_boxes.data(),
+                  all_rods.data()};
+  const Advance advance{contact, give_up, rounding, still, only_whole};
+  const nb::gil_scoped_release release;
+  advance_edges(room, advance, start.data(), end.data(), static_cast<int>(num), threads, free_share.data(), num_checks.data());
+}
+
+}  // namespace
+
+void bind_edges(nb::module_& m) {
+  m.def("advance_edges", &edges, nb::arg("parent").noconvert(), nb::arg("kind").noconvert(), nb::arg("placement").noconvert(),
+        nb::arg("axis").noconvert(), nb::arg("sphere_body").noconvert(), nb::arg("offset").noconvert(), nb::arg("moving").noconvert(),
+        nb::arg("pairs").noconvert(), nb::arg("taken").noconvert(), nb::arg("levers").noconvert(), nb::arg("balls").noconvert(),
+        nb::arg("boxes").noconvert(), nb::arg("rods").noconvert(), nb::arg("start").noconvert(), nb::arg("end").noconvert(),
+        nb::arg("contact"), nb::arg("give_up"), nb::arg("rounding"), nb::arg("still"), nb::arg("only_whole"), nb::arg("threads"),
+        nb::arg("free_share").noconvert(), nb::arg("num_checks").noconvert());
+}
+
+}  // namespace splatctrl
