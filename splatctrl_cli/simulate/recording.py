@@ -1,6 +1,6 @@
 """A simulated recording: the records of a log in time order, and what is true while it runs."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,15 +96,17 @@ class Recording:
         for index in range(int(np.ceil(self.options.duration_s * self.options.fps - 1e-9))):
             yield from self.frames_at(index, self._motion.at(self._offset_ns(index) / 1e9)[0])
 
-    def frames_at(self, index: int, q: Float64) -> Iterator[RgbdFrame]:
-        """The images of every camera at the time of the frame `index`, with the arm at q (J,)."""
+    def frames_at(self, index: int, q: Float64, cameras: Collection[str] | None = None) -> Iterator[RgbdFrame]:
+        """The images of the cameras (None: of every one) at the time of the frame `index`, with the arm at q (J,)."""
         stamp_ns = self.start_ns + self._offset_ns(index)
         arm = tabletop.arm_solids(self.robot.urdf.shapes, self.link_poses(q))
         passing = [p.at(stamp_ns) for p in self._temporary if p.is_present(stamp_ns)]
         noise, has_masks = NOISES[self.options.noise], self.options.with_person or self.options.human_arm is not None
         for number, renderer in enumerate(self._renderers):
+            if cameras is not None and renderer.camera.name not in cameras:
+                continue
             color, depth = renderer.image([*arm, *passing])
-            human = _shown(depth, renderer.image(arm)[1]) if has_masks else None
+            human = _shown(depth, renderer.depth(arm)) if has_masks else None
             if noise is not None:
                 depth = noise.applied(depth, np.random.default_rng([self.options.seed, number, index]))
             yield RgbdFrame(

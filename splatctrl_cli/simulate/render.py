@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
@@ -50,21 +51,34 @@ class Renderer:
         at_center = np.where(np.isfinite(depth[0]), depth[0], 0)
         return np.rint(mean * 255).astype(np.uint8), at_center.astype(np.float32)
 
+    def depth(self, moving: Sequence[Primitive]) -> Float32:
+        """The same depth alone, without the work for colours."""
+        depth = self._depth[:1].copy()
+        self._nearest(moving, depth)
+        return np.where(np.isfinite(depth[0]), depth[0], 0).astype(np.float32)
+
     def _cast(self, primitives: Sequence[Primitive], depth: Float64, color: Float64) -> None:
         """Lower `depth` (5, H, W) and set `color` (5, H, W, 3) wherever a primitive is the nearest."""
         origin = self.camera.T_world_camera[:3, 3]
-        owner = np.full(depth.shape, -1)
-        for index, primitive in enumerate(primitives):
-            window = self._window(primitive)
-            t = hit(primitive, origin, self._directions[window].reshape(-1, 3)).reshape(depth[window].shape)
-            is_nearer = t < depth[window]
-            depth[window][is_nearer] = t[is_nearer]
-            owner[window][is_nearer] = index
+        owner = self._nearest(primitives, depth)
         for index, primitive in enumerate(primitives):
             mine = owner == index
             if mine.any():
                 points_world = origin + depth[mine][:, None] * self._directions[mine]
                 color[mine] = shaded(primitive, points_world)
+
+    def _nearest(self, primitives: Sequence[Primitive], depth: Float64) -> NDArray[np.int64]:
+        """Lower `depth` (K, H, W) of the first K rays of each pixel; which primitive did so last, -1 for none."""
+        origin = self.camera.T_world_camera[:3, 3]
+        owner = np.full(depth.shape, -1)
+        for index, primitive in enumerate(primitives):
+            window = self._window(primitive)
+            directions = self._directions[: len(depth)][window]
+            t = hit(primitive, origin, directions.reshape(-1, 3)).reshape(directions.shape[:3])
+            is_nearer = t < depth[window]
+            depth[window][is_nearer] = t[is_nearer]
+            owner[window][is_nearer] = index
+        return owner
 
     def _window(self, primitive: Primitive) -> tuple[slice, slice, slice]:
         """The rays that could meet the primitive's bounding ball: a conservative rectangle of pixels."""

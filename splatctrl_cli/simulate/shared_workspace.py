@@ -28,9 +28,9 @@ LEG_S, PAUSE_S = 3.0, 0.3  # [s] of each leg of the logged motion, and the rest 
 DURATION_S = 24.0  # [s] in which every visit and every logged motion ends
 
 UPPER_ARM, FOREARM, HAND = (0.050, 0.33), (0.042, 0.28), (0.038, 0.09)  # radius, length [m]
-SHOULDER = (1.14, 0.42)  # [m] x, z: over the table's edge at x = 1.15, a sitting person's height above it
+SHOULDER = (1.05, 0.42)  # [m] x, z: of a sitting person who leans in over the table's edge at x = 1.15
 KNOT_S = 0.05  # [s] between the poses of a track
-CUBE = 0.05  # [m]
+CUBE = 0.04  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +62,10 @@ def visit_of(place: str, seed: int) -> Visit:
     rng = np.random.default_rng([seed, PLACES.index(place)])
     left = 1.0 if place == "near-pickup" else -1.0
     side = int(rng.choice([-1, 1]))
-    pile = np.array([0.70, 0.32 * left]) + rng.uniform(-0.03, 0.03, 2)
-    built = pile + np.array([0.02, -0.14 * left]) + rng.uniform(-0.02, 0.02, 2)
+    pile = np.array([0.62, 0.33 * left]) + rng.uniform(-0.03, 0.03, 2)
+    built = pile + np.array([-0.05, -0.17 * left]) + rng.uniform(-0.02, 0.02, 2)
     shoulder = np.array([SHOULDER[0], (pile[1] + built[1]) / 2 + side * rng.uniform(0.03, 0.15), SHOULDER[1]])
-    rest = np.array([SHOULDER[0] + 0.08, shoulder[1] - 0.1 * side, 0.24])
+    rest = np.array([SHOULDER[0] + 0.15, shoulder[1] - 0.1 * side, 0.24])
     wrist, dwell = [rest, _over(pile, 0.30)], [0.0, 0.1]
     for level in range(int(rng.integers(2, 5))):
         wrist += [_over(pile, 0.27), _over(built, 0.17 + 0.04 * level)]
