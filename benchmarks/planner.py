@@ -10,6 +10,7 @@ from time import process_time
 import numpy as np
 
 from benchmarks.measure import Limit, Options, Result
+from benchmarks.ompl_planner import notes_beside_ompl
 from benchmarks.planning_problems import Problem, panda, read_problems
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.advancement import check_edges
@@ -62,7 +63,8 @@ def run(options: Options) -> Result:
         solved.append(_solved(problem, answer, process_time() - start, room))
     runs = [_followed(s, clearance.in_scene(s.problem.scene)) for s in solved[::EVERY_TRACKED]]
     edges = _edge_checks(clearance, problems[::10])
-    return _result(solved, failed, invalid, edges, runs)
+    notes = notes_beside_ompl(clearance, problems if options.is_quick else problems[::10])
+    return _result(solved, failed, invalid, edges, runs, notes)
 
 
 def _solved(problem: Problem, answer: Plan, cpu: float, room: Clearance) -> Solved:
@@ -146,6 +148,7 @@ def _result(
     invalid: Sequence[str],
     edges: dict[str, float],
     runs: Sequence[tuple[TrackingRun, TrackingRun]],
+    notes: Sequence[str],
 ) -> Result:
     families = sorted({s.problem.family for s in solved})
     groups = {name: [s for s in solved if s.problem.family == name] for name in families} | {"all": list(solved)}
@@ -176,7 +179,8 @@ def _result(
             Limit(figure="plan_ms", bound=50.0),
         ],
         notes=[
-            *_edge_notes(edges), *_tracking_notes(runs), *_named("not solved", failed), *_named("not valid", invalid),
+            *_edge_notes(edges), *notes, *_tracking_notes(runs),
+            *_named("not solved", failed), *_named("not valid", invalid),
         ],
     )  # fmt: skip
 
