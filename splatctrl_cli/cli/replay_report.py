@@ -21,11 +21,6 @@ UNITS = {
     **dict.fromkeys(("below-margin", "in-collision", "hold", "cannot-act"), "m"),
     **{"outside-limits": "rad", "stale-map": "s", "relaxed": "m/s"},
 }
-TITLES = {
-    "audit": "Clearance of the logged motion",
-    "open-loop": "Clearance of the logged motion",
-    "closed-loop": "Clearance in closed loop",
-}
 
 
 def write_replay(
@@ -39,6 +34,7 @@ def write_replay(
 ) -> None:
     """Write steps.csv, events.json, summary.json, pictures and run.json."""
     from splatctrl_cli.cli.replay_columns import chunks_of
+    from splatctrl_cli.cli.replay_draw import draw_replay
     from splatctrl_cli.cli.replay_robot import coverage_words
     from splatctrl_cli.io.output import write_json, write_run
     from splatctrl_cli.io.replay_output import write_steps
@@ -49,34 +45,8 @@ def write_replay(
         write_json(folder / "methods.json", replay_compare.document_of(replay.comparison))
     write_json(folder / "summary.json", summary_of(replay, metrics, coverage_words(replay.model, config.control)))
     with stopwatch.stage("picture"):
-        _draw(folder, replay)
+        draw_replay(folder, replay, seconds_of(replay))
     write_run(folder, command="replay", config=config.as_dict(), inputs=inputs, metrics=metrics, stopwatch=stopwatch)
-
-
-def _draw(folder: Path, replay: "Replay") -> None:
-    import numpy as np
-
-    from splatctrl_cli.evaluate.pictures import clearance_picture
-    from splatctrl_cli.evaluate.replay_pictures import divergence_picture, open_loop_picture
-
-    seconds = seconds_of(replay)
-    curves = {name: clearance.distance for name, clearance in replay.audit.clearance.items()}
-    if replay.true_clearance is not None:
-        curves["truth"] = replay.true_clearance
-    clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, TITLES[replay.mode])
-    if replay.open_loop is not None:
-        shaped = [(event.start_s, event.end_s) for event in replay.events if event.kind in ("scene", "self", "limit")]
-        open_loop_picture(
-            folder / "open_loop.png",
-            seconds,
-            replay.open_loop.difference,
-            replay.model.joint_names,
-            np.array([np.nan if margin is None else margin.barrier for margin in replay.open_loop.margins]),
-            shaped,
-        )
-    if replay.divergence is not None and np.isfinite(replay.divergence.joints).any():
-        of = replay.divergence
-        divergence_picture(folder / "divergence.png", seconds, of.joints, of.position, of.rotation)
 
 
 def summary_of(replay: "Replay", metrics: "Metrics", coverage: str) -> dict[str, Any]:

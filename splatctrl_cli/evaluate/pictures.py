@@ -4,10 +4,9 @@ Matplotlib is imported when a picture is drawn, and drawn through its Figure (Ag
 are those of Okabe and Ito or maps that stay readable without red and green.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,69 +111,6 @@ def field_slice_picture(
         _explain(axes, has_spheres=spheres is not None, has_observed="observed" in grid.channels)
         axes.set(xlabel=f"{'xyz'[first]} [m]", ylabel=f"{'xyz'[second]} [m]", aspect="equal")
         axes.set_title(f"{title or 'Distance field'}   {'xyz'[axis]} = {plane:.2f} m", pad=12)
-        save_figure(figure, path)
-
-
-def clearance_picture(
-    path: Path,
-    seconds: Float64,
-    curves: Mapping[str, NDArray[np.floating]],
-    margin: float,
-    title: str = "Clearance",
-    *,
-    events: Mapping[str, float] | None = None,
-) -> None:
-    """Write clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] as a line.
-
-    Gaps (nan) stay gaps; below the margin is shaded, and each curve's smallest value is marked. `events` are named
-    moments [s], drawn as thin vertical lines.
-    """
-    with drawn_figure(5.2) as figure:
-        axes = figure.subplots()
-        lowest = 0.0
-        for color, (name, values) in zip(cycle(CURVE_COLORS), curves.items(), strict=False):
-            centimetres = 100.0 * np.asarray(values, dtype=np.float64)
-            if not np.isfinite(centimetres).any():
-                axes.plot([], [], color=color, label=f"{name}  no value")
-                continue
-            at = int(np.nanargmin(centimetres))
-            lowest = min(lowest, float(centimetres[at]))
-            axes.plot(seconds, centimetres, color=color, linewidth=1.8, label=f"{name}  min {centimetres[at]:.1f} cm")
-            axes.plot(
-                seconds[at], centimetres[at], "o", color=color, markersize=7, markeredgecolor="white", clip_on=False
-            )
-        bottom = lowest * 1.15 - 0.2 if lowest < 0 else 0.0
-        axes.axhspan(bottom, 100 * margin, color="#000000", alpha=0.06, linewidth=0)
-        axes.axhline(100 * margin, color=INK, linewidth=1.2, linestyle=(0, (6, 3)))
-        axes.annotate(
-            f"margin {100 * margin:g} cm",
-            (1.0, 100 * margin),
-            xycoords=("axes fraction", "data"),
-            xytext=(6, 0),
-            textcoords="offset points",
-            va="center",
-            color=INK,
-            annotation_clip=False,
-        )
-        for name, moment in (events or {}).items():
-            axes.axvline(moment, color="#888888", linewidth=0.8)
-            axes.annotate(
-                name,
-                (moment, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(4, -4),
-                textcoords="offset points",
-                va="top",
-                color="#555555",
-                fontsize=10,
-            )
-        axes.set(xlabel="time [s]", ylabel="clearance [cm]", xlim=span_of(seconds))
-        axes.set_ylim(bottom=bottom)
-        axes.set_title(title, pad=12)
-        axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(len(curves), 3))
         save_figure(figure, path)
 
 

@@ -11,7 +11,6 @@ import pytest
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.pictures import (
     ComparisonRow,
-    clearance_picture,
     comparison_picture,
     field_slice_picture,
 )
@@ -47,13 +46,7 @@ def draw_slice(path: Path) -> None:
     field_slice_picture(path, grid(), 2, 0.5, spheres, "A ball")
 
 
-def draw_clearance(path: Path) -> None:
-    seconds = np.linspace(0, 5, 50)
-    curves = {"exact": 0.05 * np.cos(seconds), "truth": np.full(50, np.nan)}
-    clearance_picture(path, seconds, curves, 0.02, events={"appears": 2.0})
-
-
-@pytest.mark.parametrize("draw", [draw_comparison, draw_slice, draw_clearance])
+@pytest.mark.parametrize("draw", [draw_comparison, draw_slice])
 def test_a_picture_is_1200_pixels_wide_and_the_same_each_time(tmp_path: Path, draw: Callable[[Path], None]) -> None:
     before = dict(mpl.rcParams)
     draw(tmp_path / "a.png")

@@ -1,0 +1,75 @@
+"""The plots of a replay's output folder."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from splatctrl_cli.cli.replay_modes import Replay
+    from splatctrl_cli.control.explain import Event
+    from splatctrl_cli.records import Float64
+
+TITLES = {
+    "audit": "Clearance of the logged motion",
+    "open-loop": "Clearance of the logged motion",
+    "closed-loop": "Clearance in closed loop",
+}
+ROWS = ("scene", "self", "limit")  # kinds of rows that shape a command
+
+
+def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
+    """Write clearance.png; of a controller commands.png, in open loop open_loop.png, in closed loop divergence.png.
+
+    seconds: (T,) since the first state.
+    """
+    import numpy as np
+
+    from splatctrl_cli.control.explain import INTERVENTIONS
+    from splatctrl_cli.evaluate.replay_pictures import (
+        clearance_picture,
+        commands_picture,
+        divergence_picture,
+        open_loop_picture,
+    )
+
+    curves = {name: clearance.distance for name, clearance in replay.audit.clearance.items()}
+    if replay.true_clearance is not None:
+        curves["truth"] = replay.true_clearance
+    happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in ("", "exact"))
+    clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, TITLES[replay.mode], happened)
+    if replay.steps:
+        num_joints = len(replay.model.joint_names)
+        blank = np.full(num_joints, np.nan)
+        commands_picture(
+            folder / "commands.png",
+            seconds,
+            np.array([blank if step is None else step.velocity for step in replay.steps]),
+            replay.model.joint_names,
+            replay.model.velocity_limit,
+            _intervals(replay, lambda event: event.kind in INTERVENTIONS, at_least=ROWS),
+            None if replay.open_loop is None else replay.open_loop.logged,
+        )
+    if replay.open_loop is not None:
+        shaped = [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS]
+        open_loop_picture(
+            folder / "open_loop.png",
+            seconds,
+            replay.open_loop.difference,
+            replay.model.joint_names,
+            np.array([np.nan if margin is None else margin.barrier for margin in replay.open_loop.margins]),
+            shaped,
+        )
+    if replay.divergence is not None and np.isfinite(replay.divergence.joints).any():
+        of = replay.divergence
+        divergence_picture(folder / "divergence.png", seconds, of.joints, of.position, of.rotation)
+
+
+def _intervals(
+    replay: "Replay", is_shown: "Callable[[Event], bool]", *, at_least: Sequence[str] = ()
+) -> dict[str, list[tuple[float, float]]]:
+    """First and last time [s] of the events that are shown, by kind; `at_least` these kinds, if empty."""
+    found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
+    for event in replay.events:
+        if is_shown(event):
+            found.setdefault(str(event.kind), []).append((event.start_s, event.end_s))
+    return found
