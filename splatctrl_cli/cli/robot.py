@@ -15,7 +15,7 @@ from splatctrl_cli.cli.common import (
     check_gates,
 )
 from splatctrl_cli.cli.robot_options import add_lock, add_robot, locked_joints
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.records import SphereSet
@@ -141,7 +141,7 @@ def run_check(args: argparse.Namespace) -> int:
     from splatctrl_cli.robot.coverage import coverage_of_solids
     from splatctrl_cli.robot.solids import read_solids
     from splatctrl_cli.robot.sphere_files import read_sphere_file
-    from splatctrl_cli.robot.spheres import matched_links
+    from splatctrl_cli.robot.spheres import RENAMED, are_links_renamed, matched_links
     from splatctrl_cli.robot.urdf import read_urdf
 
     console = Console(args)
@@ -159,6 +159,8 @@ def run_check(args: argparse.Namespace) -> int:
     lines = coverage_lines(report)
     if file.num_off:
         lines.append(f"{file.num_off} spheres are switched off (radius 0 or less) and cover nothing")
+    if are_links_renamed(file.spheres, urdf):
+        lines.append(RENAMED)
     if left_out:
         lines.append(f"spheres of {', '.join(left_out)} are left out: {args.urdf.name} has no such link")
     console.result({**facts, **notes, **coverage_json(report)}, lines)
@@ -186,7 +188,7 @@ def run_pairs(args: argparse.Namespace) -> int:
     if foreign:
         lines.append(f"{len(foreign)} pairs of {args.srdf.name} name links that {args.urdf.name} does not have")
     result = {"urdf": str(args.urdf), "seed": args.seed, "num_foreign_pairs": len(foreign), **pairs_json(found)}
-    console.result(result, lines)
+    console.result({**result, "doubts": list(model.doubts)}, [*lines, *model.doubts])
     return 0
 
 
@@ -194,19 +196,33 @@ def run_info(args: argparse.Namespace) -> int:
     """Show the robot and return the exit code."""
     from splatctrl_cli.cli.robot_report import info_json, info_lines
     from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.robot.solids import mesh_path
     from splatctrl_cli.robot.urdf import read_urdf
 
     console = Console(args)
     urdf = read_urdf(args.urdf)
-    for mesh in urdf.meshes:
-        mesh_path(args.urdf, mesh, args.packages)
     has_own = bool(urdf.shapes) and all(shape.kind == "sphere" for shape in urdf.shapes) and not urdf.meshes
     spheres = args.spheres if args.spheres is not None or has_own else _no_spheres()
     locked = urdf.with_followers(locked_joints(args.lock))
     model = RobotModel.from_urdf(args.urdf, spheres, locked=locked)
-    console.result(info_json(model, locked), info_lines(model, locked))
+    lost = _lost_meshes(urdf, args.packages)
+    lines = info_lines(model, locked)
+    if lost:
+        lines.append(f"{len(lost)} of {len(urdf.meshes)} meshes are not found: {lost[0]}")
+    console.result({**info_json(model, locked), "meshes_not_found": lost}, lines)
     return 0
+
+
+def _lost_meshes(urdf: "UrdfFile", packages: list[Path]) -> list[str]:
+    """What is wrong with each mesh of a URDF that is not there."""
+    from splatctrl_cli.robot.solids import mesh_path
+
+    lost = []
+    for mesh in urdf.meshes:
+        try:
+            mesh_path(urdf.path, mesh, packages)
+        except InputError as error:
+            lost.append(str(error))
+    return lost
 
 
 def _no_spheres() -> "SphereSet":

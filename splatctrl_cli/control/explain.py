@@ -31,7 +31,7 @@ class EventKind(StrEnum):
     MINIMUM_VIOLATION = "minimum-violation"  # largest residual
     HOLD = "hold"  # least barrier clearance [m]
     SCALED_BACK = "scaled-back"  # least scale
-    CANNOT_ACT = "cannot-act"  # least barrier clearance [m] where a violated row has no joint to turn
+    CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that has no joint to turn
 
 
 INTERVENTIONS = frozenset(
@@ -159,6 +159,7 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     is_hold = _of(steps, lambda step: float(step.rung is Rung.HOLD)) > 0
     scale = _of(steps, lambda step: step.scale, otherwise=1.0)
     cannot = _of(steps, lambda step: float(len(step.violated_fixed))) > 0
+    fixed = _of(steps, lambda step: step.fixed_distance)
 
     def nearest(i: int) -> Sequence[str]:
         return [_asked(steps, i).nearest]
@@ -167,7 +168,7 @@ def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
         Signal(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=residual, names_at=nearest),
         _low(EventKind.HOLD, is_hold, clearance, nearest),
         _low(EventKind.SCALED_BACK, (scale < 1) & ~is_hold, scale, nearest),
-        _low(EventKind.CANNOT_ACT, cannot, clearance, lambda i: _asked(steps, i).violated_fixed),
+        _low(EventKind.CANNOT_ACT, cannot, fixed, lambda i: _asked(steps, i).violated_fixed),
     ]
     return signals
 

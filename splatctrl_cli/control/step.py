@@ -18,6 +18,7 @@ from splatctrl_cli.control.target import Guide, pose_error, reference_velocity
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none
+WITHIN_SHARE = 0.01  # of `promise_tolerance`, for a sphere that is within its margin
 MULTIPLIER = 1e-4  # above which a row counts as intervening; an idle row's multiplier ends below 1e-6
 
 
@@ -65,7 +66,8 @@ class ControlStep:
     velocity (J,) [rad/s], already scaled by `scale` (1 unless the next distance broke a row's promise);
     pose_error (6,) [m, rad]; clearance [m] of the nearest moving sphere by the controller's own field;
     self_clearance [m] (inf without pairs); interventions are the rows that shape the solution, `intervening` their
-    names; violated_fixed the violated rows that no joint velocity changes here; num_rows went into the QP; residual
+    names; violated_fixed the violated rows that no joint velocity changes here, and fixed_distance [m] the least
+    distance of theirs (inf without any); num_rows went into the QP; residual
     is the worst KKT residual of the last solution and status the solver's word for it; num_refused solutions did not
     check.
     """
@@ -84,6 +86,7 @@ class ControlStep:
     residual: float
     status: str
     num_refused: int
+    fixed_distance: float = np.inf
 
     @property
     def intervening(self) -> tuple[str, ...]:
@@ -153,7 +156,7 @@ class QpIkController:
             printed = self._printed(q, reference, bias, box, rows)
             return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
         task = tasks.velocity_task(self._model.frame_jacobian(q, self._frame), reference, self._weight)
-        choice = descend(self._solver, [task, bias], box, rows.for_qp, config)
+        rows, choice = self._descended(q, [task, bias], box, rows, distance_rate)
         return self._reported(error, rows, choice, rest, self._kept_scale(q, choice, rows, rest))
 
     def margin_of(
@@ -211,25 +214,62 @@ class QpIkController:
         )
         return solve_printed(self._solver, task, bias, box, rows.for_qp, config)
 
+    def _descended(
+        self,
+        q: Float64,
+        costs: Sequence[tasks.Cost],
+        box: tuple[Float64, Float64],
+        rows: Rows,
+        distance_rate: float | Float64,
+    ) -> tuple[Rows, Choice]:
+        """The ladder's answer, and the rows that it answers to.
+
+        Where it would bring a sphere to something else than what its row is against (a corner, a second splat), that
+        becomes a row too, and the ladder is asked again: cutting planes, `config.max_cuts` rounds at most.
+        """
+        choice = descend(self._solver, costs, box, rows.for_qp, self._config)
+        for _ in range(self._config.max_cuts):
+            if choice.rung is Rung.HOLD:
+                break
+            later = self._builder.distances(q + self._config.period * choice.velocity)
+            broken = ~(later >= self._floor(choice, rows))
+            broken[self._builder.num_external :] = False
+            if not np.any(broken) or not np.all(np.isfinite(later)):
+                break
+            rows = self._builder.cut(rows, q, choice.velocity, broken, distance_rate)
+            choice = descend(self._solver, costs, box, rows.for_qp, self._config)
+        return rows, choice
+
+    def _floor(self, choice: Choice, rows: Rows) -> Float64:
+        """The distances (M,) after a period that the rows promise.
+
+        A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
+        Beyond the margin the promise may be missed by `promise_tolerance`, within it, where that would add up from
+        step to step, by a hundredth of it.
+        """
+        config = self._config
+        promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
+        is_within = rows.distance < rows.margin
+        tolerance = np.where(is_within, WITHIN_SHARE, 1.0) * config.promise_tolerance
+        return np.asarray(np.minimum(promised, rows.distance) - tolerance)
+
     def _kept_scale(self, q: Float64, choice: Choice, rows: Rows, rest: Float64) -> float:
         """The largest of SCALES whose next distances are no worse than the rows promised, else 0: how much of the
         chosen velocity there is, the remainder being `rest` (J,).
-
-        A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
         """
         if choice.rung is Rung.HOLD:
             return 0.0
-        config = self._config
-        promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
-        floor = np.minimum(promised, rows.distance) - config.promise_tolerance
+        floor = self._floor(choice, rows)
         for scale in SCALES:
-            if np.all(self._builder.distances(q + config.period * _blend(choice.velocity, rest, scale)) >= floor):
+            later = q + self._config.period * _blend(choice.velocity, rest, scale)
+            if np.all(self._builder.distances(later) >= floor):
                 return scale
         return 0.0
 
     def _reported(self, error: Float64, rows: Rows, choice: Choice, rest: Float64, scale: float) -> ControlStep:
         """The step, with its rows by name."""
         slack = rows.spread(choice.slack)
+        violated_fixed = rows.is_fixed & (rows.distance < rows.margin)
         return ControlStep(
             velocity=_blend(choice.velocity, rest, scale),
             rung=choice.rung if scale > 0 else Rung.HOLD,
@@ -243,7 +283,8 @@ class QpIkController:
                 for i in np.flatnonzero(slack > self._config.slack_tolerance)
             ),
             interventions=self._interventions(choice, rows),
-            violated_fixed=self._named(rows.is_fixed & (rows.distance < rows.margin)),
+            violated_fixed=self._named(violated_fixed),
+            fixed_distance=float(np.min(rows.distance[violated_fixed], initial=np.inf)),
             num_rows=int(rows.in_qp.sum()),
             residual=choice.solution.residuals.worst,
             status=choice.solution.status,

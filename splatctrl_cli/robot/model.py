@@ -16,7 +16,7 @@ from splatctrl_cli.records import Bool, Float64, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.levers import lever_arms
 from splatctrl_cli.robot.sphere_files import read_spheres
-from splatctrl_cli.robot.spheres import matched_links, spheres_of
+from splatctrl_cli.robot.spheres import RENAMED, are_links_renamed, matched_links, spheres_of
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 Index = NDArray[np.int64]
@@ -97,7 +97,7 @@ class RobotModel:
             return cls(file, model, spheres_of(file), T, (), are_links_renamed=False)
         asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
         sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
-        is_renamed = not set(asked.links) & set(file.links)
+        is_renamed = are_links_renamed(asked, file)
         return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed)
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
@@ -130,7 +130,7 @@ class RobotModel:
                 f"spheres of {', '.join(self.left_out)} are left out: {self.urdf.path.name} has no such link"
             )
         if self.are_links_renamed:
-            sentences.append("sphere links were matched without the first part of their names; is it the same robot?")
+            sentences.append(RENAMED)
         return tuple(sentences)
 
     @property
@@ -221,7 +221,8 @@ class RobotModel:
         if missing:
             raise InputError(
                 f"{self.urdf.path}: joints not in the log: {', '.join(missing)}",
-                remedy=f"the log has: {', '.join(log_joint_names) or 'no joints'}",
+                remedy=f"the log has: {', '.join(log_joint_names) or 'no joints'}; "
+                f"hold still what it does not move: --lock {missing[0]}=VALUE",
             )
         return np.array([list(log_joint_names).index(name) for name in self.joint_names], dtype=np.int64)
 

@@ -6,6 +6,11 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot.urdf import UrdfFile
 
+RENAMED = (
+    "sphere links were matched without the first part of their names; is it the same robot? "
+    "Spheres are taken in frames of the same name, which may be turned: see what `splatctrl robot check` says"
+)
+
 
 def spheres_of(urdf: UrdfFile) -> SphereSet:
     """The spheres of a URDF whose collision geometry is spheres and nothing else.
@@ -34,7 +39,7 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
     """
     names = {link: link for link in urdf.links}
     asked = spheres.links
-    if not any(link in names for link in asked):
+    if are_links_renamed(spheres, urdf):
         names = {_without_prefix(link): link for link in urdf.links}
         asked = tuple(_without_prefix(link) for link in asked)
     kept = [index for index, link in enumerate(asked) if link in names]
@@ -47,6 +52,11 @@ def matched_links(spheres: SphereSet, urdf: UrdfFile, name: str) -> tuple[Sphere
     )
     left_out = {spheres.links[index] for index, link in enumerate(asked) if link not in names}
     return matched, tuple(sorted(left_out))
+
+
+def are_links_renamed(spheres: SphereSet, urdf: UrdfFile) -> bool:
+    """Whether `matched_links` compares names without their first part: the two have no name in common."""
+    return not set(spheres.links) & set(urdf.links)
 
 
 def _without_prefix(link: str) -> str:

@@ -140,3 +140,35 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert (got, out, len(lines)) == (code, "", 1), err
     assert words in lines[0]
     assert list(urdf.parent.iterdir()) == [urdf]
+
+
+def test_spheres_of_another_robots_names_are_matched_and_doubted(
+    capsys: pytest.CaptureFixture[str], urdf: Path
+) -> None:
+    text = urdf.read_text().replace('"base"', '"fr3_base"').replace('"tip"', '"fr3_tip"')
+    renamed = written(urdf.parent, text, "fr3.urdf")
+    spheres = written(
+        urdf.parent,
+        "collision_spheres: {panda_tip: [{center: [0, 0, 0], radius: 0.07}], "
+        "panda_base: [{center: [0, 0, 0], radius: 0.2}]}",
+        "s.yaml",
+    )
+    doubt = "matched without the first part of their names; is it the same robot?"
+    for action in ("check", "pairs", "info"):
+        code, out, _ = run(capsys, action, "--urdf", renamed, "--spheres", spheres)
+        assert code == 0 and doubt in out, action
+    own = written(urdf.parent, spheres.read_text().replace("panda_", "fr3_"), "own.yaml")
+    for action in ("check", "pairs", "info"):
+        code, out, _ = run(capsys, action, "--urdf", renamed, "--spheres", own)
+        assert code == 0 and doubt not in out, action
+
+
+def test_a_robot_whose_meshes_are_not_there_is_shown_all_the_same(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    urdf = written(tmp_path, arm_of('<mesh filename="package://arm/base.stl"/>', BALL))
+    shown = result(capsys, "info", "--urdf", urdf)
+    (lost,) = shown["meshes_not_found"]  # type: ignore[misc]
+    assert "package://arm/base.stl was not found" in lost and "--packages" in lost
+    code, out, _ = run(capsys, "info", "--urdf", urdf)
+    assert code == 0 and "1 of 1 meshes are not found: " in out

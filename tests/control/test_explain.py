@@ -138,3 +138,10 @@ def test_an_obstacle_says_what_and_where() -> None:
         "human splat 7 at (1.000, 0.000, 0.500)"
     )
     assert str(Obstacle(distance=0.1, position=(1, 0, 0.5), cell=(1, 2, 3))).startswith("cell (1, 2, 3) at")
+
+
+def test_a_row_that_no_joint_changes_is_an_event_of_its_own_distance() -> None:
+    held = step(violated_fixed=("upper[0]",), fixed_distance=-0.02, clearance=0.4)
+    (event,) = [event for event in events_of(STAMPS[:2], step_signals([step(), held])) if event.kind == "cannot-act"]
+    assert event.kind is EventKind.CANNOT_ACT and event.worst == -0.02
+    assert (event.state, event.names) == (1, ("upper[0]",))

@@ -116,6 +116,8 @@ def test_a_flat_field_cannot_be_acted_on_and_is_named() -> None:
     flat = Plane([0.0, 0.0, 1.0], 0.0, scale=1.0)  # the arm moves within the plane: no row can help
     step = controller(flat).step(Q, goal(Q))
     assert set(step.violated_fixed) == {"upper[0]", "upper[1]", "fore[0]", "fore[1]"}
+    assert step.fixed_distance == pytest.approx(-0.04)
+    assert controller(far_away()).step(Q, goal(Q)).fixed_distance == np.inf
 
 
 @pytest.mark.parametrize(("status", "residual"), [("AlmostSolved", 0.0), ("Solved", 1e-3), ("MaxIterations", 0.0)])
