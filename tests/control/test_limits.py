@@ -7,10 +7,13 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig, load_config
 from splatctrl_cli.control.braking import braking_speed, brought_to_rest
+from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.limits import JointLimits
+from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
+from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.control.velocity_limits import fr3_limits
 from splatctrl_cli.errors import UsageError
-from tests.control.fakes import PlanarArm
+from tests.control.fakes import PlanarArm, far_away
 from tests.reference.control import braking_room, fr3_velocity_range
 
 NAMES = tuple(f"fr3_joint{number}" for number in range(1, 8))
@@ -154,3 +157,41 @@ def test_joints_that_the_fr3_does_not_have_are_named() -> None:
     with pytest.raises(UsageError, match="got fr3_joint1, fr3_finger_joint1"):
         fr3_limits(["fr3_joint1", "fr3_finger_joint1"])
     assert load_config(None, ["control.velocity_limits=fr3"]).control.velocity_limits == "fr3"
+
+
+def test_a_closed_loop_starts_at_rest_and_an_anchor_at_the_logged_velocity() -> None:
+    arm, config = PlanarArm(), replace(CONFIG, max_acceleration=2.0, solver="daqp", max_time=1.0)
+    stamps = np.arange(0, 2_000_000_000, 100_000_000, dtype=np.int64)
+    seconds = stamps[:, None] * 1e-9
+    moving = np.array([0.4, -0.3])
+    motion = LoggedMotion(
+        stamp_ns=stamps, position=0.3 + seconds * moving, velocity=np.tile(moving, (len(stamps), 1))
+    )
+    task = ReplayTask(
+        start=motion.position[0],
+        T_world_goal=arm.frame_pose(np.array([1.2, 0.9]), "tip"),
+        frame="tip",
+        anchors=motion,
+        anchor_period=0.5,
+    )
+    trace = closed_loop(arm, config, task, lambda stamp: far_away())
+    velocity = np.array([step.velocity for step in trace.steps])
+    assert np.abs(velocity[0]).max() <= 0.02 + 1e-9
+    (anchor,) = trace.anchored
+    assert np.abs(velocity[anchor] - moving).max() <= 0.02 + 1e-9 < np.abs(velocity[anchor - 1] - moving).max()
+    change = np.abs(np.diff(velocity, axis=0)).max(axis=1)
+    assert np.all(np.delete(change, anchor - 1) <= 0.02 + 1e-9)
+
+
+def test_open_loop_counts_accelerations_from_the_logged_velocity() -> None:
+    arm, config = PlanarArm(), replace(CONFIG, max_acceleration=2.0, solver="daqp")
+    moving = np.array([0.4, -0.3])
+    motion = LoggedMotion(
+        stamp_ns=np.array([0, 10_000_000], dtype=np.int64),
+        position=np.array([[0.3, 0.6], [0.304, 0.597]]),
+        velocity=np.tile(moving, (2, 1)),
+    )
+    task = OpenLoopTask(frame="tip", T_world_goal=arm.frame_pose(np.array([-0.9, 1.4]), "tip"))
+    has_distance = np.ones(2, dtype=np.bool_)
+    trace = open_loop(arm, config, motion, task, lambda stamp: far_away(), has_distance=has_distance)
+    np.testing.assert_allclose(np.abs(trace.difference).max(axis=1), 0.02, atol=1e-9)
