@@ -19,7 +19,7 @@ from splatctrl_cli.cli.lockstep import add_lockstep, check_lockstep
 from splatctrl_cli.cli.replay_baseline import add_baseline, read_baselines, read_zone
 from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose, seconds
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
-from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, read_robot
+from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, doubts_of, read_robot
 from splatctrl_cli.cli.replay_twists import check_twists
 from splatctrl_cli.cli.replay_worst import add_worst_frames, draw_worst_frames
 from splatctrl_cli.cli.source_options import add_source
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     with output_path(out, force=args.force, is_folder=True) as folder:
         with stopwatch.stage("read"):
             inputs, logged = _read(args, config, folder, console)
-        for doubt in inputs.model.doubts:
+        for doubt in doubts_of(args, inputs.model, config.control):
             console.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
             replay = replayed(args, inputs, config, console)

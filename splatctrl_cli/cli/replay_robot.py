@@ -51,6 +51,22 @@ def read_robot(args: argparse.Namespace, config: "ControlConfig") -> "RobotModel
     return model
 
 
+def doubts_of(args: argparse.Namespace, model: "RobotModel", config: "ControlConfig") -> list[str]:
+    """What a person should know of the robot before trusting this replay; a sentence each."""
+    from splatctrl_cli.robot.self_collision import never_apart
+
+    found = () if args.mode == "audit" else never_apart(model, config.self_margin)
+    return [
+        *model.doubts,
+        *(
+            f"{' and '.join(pair.links)}: some of their spheres are no farther than {1e3 * pair.largest_gap:.1f} mm "
+            f"apart in any posture sampled, so control.self_margin = {1e3 * config.self_margin:g} mm cannot be kept; "
+            "lower it, or leave the pair out (--srdf)"
+            for pair in found
+        ),
+    ]
+
+
 def coverage_words(model: "RobotModel", config: "ControlConfig") -> str:
     """What the spheres leave uncovered, or why that is not known, and the margin that then holds for the surface."""
     report = model.coverage

@@ -100,6 +100,34 @@ def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Int
     return np.asarray(pairs[np.array(keep, dtype=np.bool_)])
 
 
+@dataclass(frozen=True, kw_only=True)
+class NeverApart:
+    """Two links some of whose spheres were never farther apart than largest_gap [m] in a sample of postures."""
+
+    links: tuple[str, str]
+    largest_gap: float
+
+
+def never_apart(
+    model: RobotModel, margin: float, *, num_postures: int = 200, seed: int = 0
+) -> tuple[NeverApart, ...]:
+    """Links with a pair of spheres to check that keeps no `margin` [m] in any of a sample of postures.
+
+    No controller can keep it there: the spheres stick out of the links, or the links are that near each other.
+    """
+    pairs = model.self_pairs()
+    if not len(pairs):
+        return ()
+    centers, radii = model.sphere_centers_batch(_postures(model, num_postures, seed)), model.sphere_set.radii
+    a, b = pairs.T
+    largest = np.max(np.linalg.norm(centers[:, a] - centers[:, b], axis=2), axis=0) - radii[a] - radii[b]
+    links, found = model.sphere_set.links, dict[tuple[str, str], float]()
+    for pair in np.flatnonzero(largest < margin):
+        key = (links[a[pair]], links[b[pair]])
+        found[key] = min(found.get(key, np.inf), float(largest[pair]))
+    return tuple(NeverApart(links=key, largest_gap=gap) for key, gap in found.items())
+
+
 def _joined(model: RobotModel) -> dict[frozenset[str], str]:
     """Pairs of links that no posture tells anything about: of one rigid body, or of two bodies with one joint."""
     bodies = model.urdf.rigid_bodies(model.joint_names)
@@ -125,11 +153,16 @@ def _sampled_reason(gaps: Float64, drop_never: bool) -> str | None:
     return None
 
 
-def _gaps(model: RobotModel, owner: Int64, pairs: Int64, num_postures: int, seed: int) -> Float64:
-    """Smallest gap (T, P) between the spheres of each pair of links in each posture."""
+def _postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
+    """Postures (T, J) even within the limits; a joint without limits turns once."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     lower, upper = np.where(limited, model.lower, -np.pi), np.where(limited, model.upper, np.pi)
-    postures = np.random.default_rng(seed).uniform(lower, upper, (num_postures, model.num_joints))
+    return np.random.default_rng(seed).uniform(lower, upper, (num_postures, model.num_joints))
+
+
+def _gaps(model: RobotModel, owner: Int64, pairs: Int64, num_postures: int, seed: int) -> Float64:
+    """Smallest gap (T, P) between the spheres of each pair of links in each posture."""
+    postures = _postures(model, num_postures, seed)
     radii = model.sphere_set.radii
     members = [np.flatnonzero(owner == link) for link in range(int(owner.max(initial=-1)) + 1)]
     gaps = np.empty((num_postures, len(pairs)))

@@ -127,3 +127,20 @@ def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) ->
     assert desk.replay("--scene", str(scene), "-q", "--force", "--srdf", str(srdf)) == 0
     assert gone > 0 and desk.metrics()["num_self_pairs"] == every - gone
     assert srdf.name in json.loads((desk.folder / "out" / "run.json").read_text())["inputs"]
+
+
+def test_a_margin_that_no_posture_keeps_between_two_links_is_said(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    drive = ("--scene", str(scene), "--force", "--set", "control.solver=daqp", "--set", "control.max_time=0.1")
+    assert desk.replay(*drive, "--mode", "closed-loop") == 0
+    assert "cannot be kept" not in capsys.readouterr().err
+    wide = ("--set", "control.self_margin=0.3")
+    assert desk.replay(*drive, "--mode", "closed-loop", *wide) == 0
+    assert (
+        "so control.self_margin = 300 mm cannot be kept; lower it, or leave the pair out (--srdf)"
+        in capsys.readouterr().err
+    )
+    assert desk.replay(*drive, *wide) == 0
+    assert "cannot be kept" not in capsys.readouterr().err
