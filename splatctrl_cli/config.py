@@ -131,6 +131,7 @@ class ControlConfig:
     preset: str = "reduced"  # or paper: III-E as printed, with barrier_gain = 1 and without a second look
     solver: str = "clarabel"  # of the QP; or daqp: an active-set method, several times as fast
     margin: float = 0.02  # [m] epsilon, IV-C
+    human_margin: float = 0.0  # [m] the same to people (label human), where it is larger
     coverage: str = "report"  # of the spheres: say what they leave uncovered; or margin: keep that much more, too
     period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
     barrier_gain: float = 10.0  # [1/s] alpha of every limit and barrier row; 1 (as printed) takes 1.4 times as long
@@ -161,6 +162,8 @@ class ControlConfig:
     max_time: float = 30.0  # [s] of a closed-loop replay
     stall_time: float = 2.0  # [s] a local minimum: over this long ...
     stall_speed: float = 2e-3  # [rad/s] ... the joints moved on average slower than this
+    max_cuts: int = 3  # rounds of further rows against what a solution would have met beside its rows
+    max_detours: int = 0  # planned ways out of a local minimum that a closed loop may take ([planner])
     stop_acceleration: float = 7.5  # [rad/s^2] a monitored standstill brakes and starts with, the Panda's; 0: at once
 
 
@@ -252,6 +255,9 @@ _AT_LEAST_ZERO = (
         "field.padding",
         "scene.noise",
         "control.stop_acceleration",
+        "control.human_margin",
+        "control.max_cuts",
+        "control.max_detours",
     ),
     *("planner.seed", "planner.max_iterations", "planner.max_time", "planner.shortcut_rounds"),
     *("planner.follow_gain", "planner.limit_tolerance"),

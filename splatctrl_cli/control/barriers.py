@@ -35,6 +35,16 @@ class Barrier:
         """The rows where `rows` (M,) is true, in order."""
         return replace(self, index=self.index[rows], G=self.G[rows], h=self.h[rows], distance=self.distance[rows])
 
+    def joined(self, other: "Barrier") -> "Barrier":
+        """These rows and then those of `other`, at the same cost of slack."""
+        return replace(
+            self,
+            index=np.concatenate([self.index, other.index]),
+            G=np.concatenate([self.G, other.G]),
+            h=np.concatenate([self.h, other.h]),
+            distance=np.concatenate([self.distance, other.distance]),
+        )
+
 
 def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
     """``dd/dq`` (M, J) of field distances: gradient (M, 3), not normalised, times sphere Jacobians (M, 3, J)."""

@@ -1,6 +1,6 @@
 """Every barrier row of III-E at a configuration: one for each moving sphere, then one for each pair of spheres."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,8 @@ class Rows:
     """The rows at one configuration (M, external then self), and which of them the QP needs.
 
     margin (M,) [m]; is_fixed: no joint velocity changes it; in_qp: not fixed, and some velocity of the box violates
-    it.
+    it. cuts: further rows of the program, against what a solution would have met (`RowBuilder.cut`); their index is
+    the place of the row that they belong to.
     """
 
     external: Barrier
@@ -32,6 +33,7 @@ class Rows:
     margin: Float64
     is_fixed: Bool
     in_qp: Bool
+    cuts: Barrier | None = None
 
     @property
     def distance(self) -> Float64:
@@ -42,14 +44,17 @@ class Rows:
         return np.concatenate([self.external.h, self.own.h])
 
     @property
-    def for_qp(self) -> tuple[Barrier, Barrier]:
+    def for_qp(self) -> tuple[Barrier, ...]:
         num_external = len(self.external)
-        return self.external.select(self.in_qp[:num_external]), self.own.select(self.in_qp[num_external:])
+        rows = self.external.select(self.in_qp[:num_external]), self.own.select(self.in_qp[num_external:])
+        return rows if self.cuts is None else (*rows, self.cuts)
 
     def spread(self, values: Float64) -> Float64:
-        """Values of the QP's rows as values of all rows, zero elsewhere."""
-        everywhere = np.zeros(len(self.in_qp))
-        everywhere[self.in_qp] = values
+        """Values of the QP's rows as values (M,) of all rows, zero elsewhere; a row's is the largest of its cuts'."""
+        everywhere, num_rows = np.zeros(len(self.in_qp)), int(self.in_qp.sum())
+        everywhere[self.in_qp] = values[:num_rows]
+        if self.cuts is not None:
+            np.maximum.at(everywhere, self.cuts.index, values[num_rows:])
         return everywhere
 
 
@@ -108,6 +113,38 @@ class RowBuilder:
         is_fixed = np.concatenate([barriers.is_immovable(b.G, self._model.velocity_limit) for b in both])
         can_bind = np.concatenate([barriers.can_bind(b.G, b.h, *box) for b in both])
         return Rows(external=external, own=own, margin=self._margin, is_fixed=is_fixed, in_qp=can_bind & ~is_fixed)
+
+    def cut(
+        self,
+        rows: Rows,
+        q: Float64,
+        velocity: Float64,
+        chosen: NDArray[np.integer],
+        distance_rate: float | Float64,
+    ) -> Rows:
+        """The rows at q with one more for each of the `chosen` rows of moving spheres: against what it is nearest to
+        after a period of `velocity` (J,), which need not be what it is nearest to now.
+
+        That surface's distance is taken as linear about the place where it was met. Where it is convex seen from
+        there, as a ball is, it is farther than that in truth; and now it is no nearer than what is nearest now.
+        """
+        period = self._config.period
+        later = q + period * velocity
+        centers, jacobians = self._model.spheres_at(later)
+        spheres = self._moving[chosen]
+        distance, gradient = self._field.query(np.ascontiguousarray(centers[spheres]))
+        G = -barriers.external_gradient(gradient, jacobians[spheres])
+        now = np.maximum(distance - self._radii[spheres] + period * (G @ velocity), rows.external.distance[chosen])
+        rate = np.broadcast_to(distance_rate, self.num_external)[chosen]
+        cut = Barrier(
+            index=chosen,
+            G=G,
+            h=self._bound(now, self._margin[chosen], G) + rate,
+            distance=now,
+            slack_cost=rows.external.slack_cost,
+            slack_weight=rows.external.slack_weight,
+        )
+        return replace(rows, cuts=cut if rows.cuts is None else rows.cuts.joined(cut))
 
     def room(self, q: Float64, velocity: Float64, distance_rate: float | Float64) -> Float64:
         """``h - G v`` (M,) [m/s] of every row at q for a velocity (J,)."""

@@ -1,5 +1,6 @@
 """One step of the QP-IK controller of III-E: query the field, build the rows, solve, look at the field again."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,7 +18,7 @@ from splatctrl_cli.control.rows import RowBuilder, Rows
 from splatctrl_cli.control.target import Guide, pose_error, reference_velocity
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
-SCALES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none
+SCALES = (0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none
 WITHIN_SHARE = 0.01  # of `promise_tolerance`, for a sphere that is within its margin
 MULTIPLIER = 1e-4  # above which a row counts as intervening; an idle row's multiplier ends below 1e-6
 
@@ -156,8 +157,9 @@ class QpIkController:
             printed = self._printed(q, reference, bias, box, rows)
             return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
         task = tasks.velocity_task(self._model.frame_jacobian(q, self._frame), reference, self._weight)
-        rows, choice = self._descended(q, [task, bias], box, rows, distance_rate)
-        return self._reported(error, rows, choice, rest, self._kept_scale(q, choice, rows, rest))
+        rows, choice, is_kept = self._descended(q, [task, bias], box, rows, distance_rate)
+        scale = 1.0 if is_kept else self._kept_scale(q, choice, rows, rest)
+        return self._reported(error, rows, choice, rest, scale)
 
     def margin_of(
         self,
@@ -221,24 +223,26 @@ class QpIkController:
         box: tuple[Float64, Float64],
         rows: Rows,
         distance_rate: float | Float64,
-    ) -> tuple[Rows, Choice]:
-        """The ladder's answer, and the rows that it answers to.
+    ) -> tuple[Rows, Choice, bool]:
+        """The ladder's answer, the rows that it answers to, and whether the distances after it are as promised.
 
         Where it would bring a sphere to something else than what its row is against (a corner, a second splat), that
         becomes a row too, and the ladder is asked again: cutting planes, `config.max_cuts` rounds at most.
         """
-        choice = descend(self._solver, costs, box, rows.for_qp, self._config)
-        for _ in range(self._config.max_cuts):
+        num_external, max_cuts = self._builder.num_external, self._config.max_cuts
+        for num_cuts in range(max_cuts + 1):
+            choice = descend(self._solver, costs, box, rows.for_qp, self._config)
             if choice.rung is Rung.HOLD:
                 break
             later = self._builder.distances(q + self._config.period * choice.velocity)
             broken = ~(later >= self._floor(choice, rows))
-            broken[self._builder.num_external :] = False
-            if not np.any(broken) or not np.all(np.isfinite(later)):
+            if not np.any(broken):
+                return rows, choice, True
+            can_be_cut = broken[:num_external] & np.isfinite(later[:num_external])
+            if num_cuts == max_cuts or not np.any(can_be_cut):
                 break
-            rows = self._builder.cut(rows, q, choice.velocity, broken, distance_rate)
-            choice = descend(self._solver, costs, box, rows.for_qp, self._config)
-        return rows, choice
+            rows = self._builder.cut(rows, q, choice.velocity, np.flatnonzero(can_be_cut), distance_rate)
+        return rows, choice, False
 
     def _floor(self, choice: Choice, rows: Rows) -> Float64:
         """The distances (M,) after a period that the rows promise.
@@ -254,8 +258,8 @@ class QpIkController:
         return np.asarray(np.minimum(promised, rows.distance) - tolerance)
 
     def _kept_scale(self, q: Float64, choice: Choice, rows: Rows, rest: Float64) -> float:
-        """The largest of SCALES whose next distances are no worse than the rows promised, else 0: how much of the
-        chosen velocity there is, the remainder being `rest` (J,).
+        """The largest of SCALES whose next distances are no worse than the rows promised, else 0: how much of a
+        velocity that breaks a promise there is, the remainder being `rest` (J,).
         """
         if choice.rung is Rung.HOLD:
             return 0.0

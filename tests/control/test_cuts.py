@@ -1,0 +1,96 @@
+"""Rows against what a step would meet beside its own rows: corners and shells, where the nearest surface changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.replay import ReplayTask, closed_loop
+from splatctrl_cli.control.rows import RowBuilder
+from splatctrl_cli.control.step import QpIkController
+from tests.control.fakes import Balls, PlanarArm, far_away
+
+ARM = PlanarArm()
+CONFIG = ControlConfig(solver="daqp")
+BOX = (-ARM.velocity_limit, ARM.velocity_limit)
+TIP = 4  # the last sphere
+BEAM = Balls([[r * np.cos(1.15), r * np.sin(1.15), 0.0] for r in (0.64, 0.72, 0.8, 0.88, 0.96)], [0.04] * 5)
+TASK = ReplayTask(
+    start=np.array([0.2, 0.3]),
+    T_world_goal=ARM.frame_pose(np.array([1.6, 0.3]), "tip"),
+    frame="tip",
+    home=np.array([1.6, 0.3]),
+)
+
+
+def test_an_arm_pressed_against_a_row_of_balls_keeps_its_margin() -> None:
+    trace = closed_loop(ARM, CONFIG, TASK, lambda _: BEAM)
+    assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
+    assert all(step.scale == 1.0 and step.rung is Rung.SOLVED for step in trace.steps)
+
+
+def test_without_cuts_the_same_steps_have_to_be_scaled_back() -> None:
+    trace = closed_loop(ARM, replace(CONFIG, max_cuts=0), TASK, lambda _: BEAM)
+    assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
+    assert any(step.scale < 1.0 for step in trace.steps)
+
+
+def test_a_cut_is_the_row_of_what_is_met_after_a_period() -> None:
+    q, velocity = np.array([0.7, 0.5]), np.array([0.9, -0.4])
+    later = q + CONFIG.period * velocity
+    builder = RowBuilder(ARM, CONFIG, BEAM)
+    rows = builder.cut(builder.at(q, BOX, 0.0), q, velocity, np.array([3]), 0.0)
+    assert rows.cuts is not None and list(rows.cuts.index) == [3]
+
+    def clearance(posture: np.ndarray) -> float:
+        return float(BEAM.query(ARM.sphere_centers(posture)[[TIP]])[0][0] - ARM.sphere_set.radii[TIP])
+
+    step = 1e-6 * np.eye(2)
+    slope = [(clearance(later + d) - clearance(later - d)) / 2e-6 for d in step]
+    np.testing.assert_allclose(rows.cuts.G[0], -np.array(slope), rtol=1e-6)
+    linear = clearance(later) - CONFIG.period * np.dot(slope, velocity)
+    now = max(linear, rows.external.distance[3])
+    np.testing.assert_allclose(rows.cuts.distance[0], now, rtol=1e-9)
+    np.testing.assert_allclose(rows.cuts.h[0], CONFIG.barrier_gain * (now - CONFIG.margin), rtol=1e-9)
+
+
+def test_a_cut_counts_the_rate_of_its_own_sphere() -> None:
+    builder, q, velocity = RowBuilder(ARM, CONFIG, BEAM), np.array([0.7, 0.5]), np.array([0.9, -0.4])
+    rate = np.array([0.0, -0.1, -0.2, -0.3])
+    still, moving = (
+        builder.cut(builder.at(q, BOX, r), q, velocity, np.array([1, 3]), r).cuts for r in (np.zeros(4), rate)
+    )
+    assert still is not None and moving is not None
+    np.testing.assert_allclose(moving.h - still.h, rate[[1, 3]])
+
+
+def test_cuts_add_up_and_give_their_slack_to_the_row_they_belong_to() -> None:
+    builder, q, velocity = RowBuilder(ARM, CONFIG, BEAM), np.array([0.7, 0.5]), np.array([0.9, -0.4])
+    rows = builder.at(q, BOX, 0.0)
+    num_rows = int(rows.in_qp.sum())
+    rows = builder.cut(builder.cut(rows, q, velocity, np.array([3]), 0.0), q, velocity, np.array([2, 3]), 0.0)
+    assert rows.cuts is not None and list(rows.cuts.index) == [3, 2, 3]
+    spread = rows.spread(np.concatenate([np.zeros(num_rows), [0.1, 0.2, 0.3]]))
+    assert spread[2] == 0.2 and spread[3] == 0.3 and np.count_nonzero(spread) == 2
+
+
+def test_far_from_everything_a_step_asks_the_field_twice() -> None:
+    field = far_away()
+    QpIkController(ARM, CONFIG, field, frame="tip").step(TASK.start, TASK.T_world_goal)
+    assert field.num_queries == 2
+
+
+@pytest.mark.parametrize("max_cuts", [1, 3])
+def test_a_corner_stops_an_arm_at_both_of_its_sides(max_cuts: int) -> None:
+    """The tip is driven into the gap between two balls, too narrow for it."""
+    q = np.array([0.6, 0.0])
+    tip = ARM.frame_pose(q, "tip")[:3, 3]
+    along, across = np.array([np.cos(0.6), np.sin(0.6), 0.0]), np.array([-np.sin(0.6), np.cos(0.6), 0.0])
+    gap = Balls([tip + 0.19 * across + 0.012 * s * along for s in (-6, 6)], [0.08, 0.08])
+    goal = ARM.frame_pose(np.array([1.2, 0.0]), "tip")
+    config = replace(CONFIG, max_cuts=max_cuts)
+    task = ReplayTask(start=q, T_world_goal=goal, frame="tip", home=np.array([1.2, 0.0]))
+    trace = closed_loop(ARM, config, task, lambda _: gap)
+    assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
