@@ -102,7 +102,7 @@ def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Int
 
 @dataclass(frozen=True, kw_only=True)
 class NeverApart:
-    """Two links some of whose spheres were never farther apart than largest_gap [m] in a sample of postures."""
+    """Two links whose spheres were never farther apart than largest_gap [m] in a sample of postures."""
 
     links: tuple[str, str]
     largest_gap: float
@@ -111,21 +111,23 @@ class NeverApart:
 def never_apart(
     model: RobotModel, margin: float, *, num_postures: int = 200, seed: int = 0
 ) -> tuple[NeverApart, ...]:
-    """Links with a pair of spheres to check that keeps no `margin` [m] in any of a sample of postures.
+    """Links whose spheres to check keep no `margin` [m] in any of a sample of postures.
 
     No controller can keep it there: the spheres stick out of the links, or the links are that near each other.
     """
-    pairs = model.self_pairs()
+    pairs, links = model.self_pairs(), model.sphere_set.links
     if not len(pairs):
         return ()
     centers, radii = model.sphere_centers_batch(_postures(model, num_postures, seed)), model.sphere_set.radii
     a, b = pairs.T
-    largest = np.max(np.linalg.norm(centers[:, a] - centers[:, b], axis=2), axis=0) - radii[a] - radii[b]
-    links, found = model.sphere_set.links, dict[tuple[str, str], float]()
-    for pair in np.flatnonzero(largest < margin):
-        key = (links[a[pair]], links[b[pair]])
-        found[key] = min(found.get(key, np.inf), float(largest[pair]))
-    return tuple(NeverApart(links=key, largest_gap=gap) for key, gap in found.items())
+    gaps = np.linalg.norm(centers[:, a] - centers[:, b], axis=2) - radii[a] - radii[b]
+    owners = [(links[i], links[j]) for i, j in pairs]
+    found = []
+    for owner in dict.fromkeys(owners):
+        largest = float(gaps[:, [pair == owner for pair in owners]].min(axis=1).max())
+        if largest < margin:
+            found.append(NeverApart(links=owner, largest_gap=largest))
+    return tuple(found)
 
 
 def _joined(model: RobotModel) -> dict[frozenset[str], str]:
