@@ -60,7 +60,7 @@ def doubts_of(args: argparse.Namespace, model: "RobotModel", config: "ControlCon
         *model.doubts,
         *(
             f"{' and '.join(pair.links)}: their spheres are no farther than {1e3 * pair.largest_gap:.1f} mm apart in "
-            f"any posture sampled, so control.self_margin = {1e3 * config.self_margin:g} mm cannot be kept; lower it, "
+            f"any posture sampled: control.self_margin = {1e3 * config.self_margin:g} mm cannot be kept; lower it, "
             "or leave the pair out (--srdf)"
             for pair in found
         ),

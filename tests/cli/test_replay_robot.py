@@ -139,7 +139,7 @@ def test_a_margin_that_no_posture_keeps_between_two_links_is_said(
     wide = ("--set", "control.self_margin=0.3")
     assert desk.replay(*drive, "--mode", "closed-loop", *wide) == 0
     assert (
-        "so control.self_margin = 300 mm cannot be kept; lower it, or leave the pair out (--srdf)"
+        "control.self_margin = 300 mm cannot be kept; lower it, or leave the pair out (--srdf)"
         in capsys.readouterr().err
     )
     assert desk.replay(*drive, *wide) == 0
