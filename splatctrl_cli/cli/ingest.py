@@ -19,9 +19,10 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.capture import write_capture
+    from splatctrl_cli.io.capture import CaptureSource, write_capture
     from splatctrl_cli.io.image_folder import HOLDOUT
     from splatctrl_cli.io.output import Stopwatch, output_path, write_run
+    from splatctrl_cli.io.ros_log import RosLogSource
     from splatctrl_cli.io.source import open_source
     from splatctrl_cli.io.state_watch import WatchedSource
 
@@ -29,7 +30,9 @@ def run(args: argparse.Namespace) -> int:
     options = source_options(args)
     out = args.out or Path(args.source.stem + ".capture")
     with stopwatch.stage("survey"):
-        source = WatchedSource(open_source(args.source, options))
+        opened = open_source(args.source, options)
+        source = WatchedSource(opened)
+        topics = opened.joint_topics if isinstance(opened, RosLogSource | CaptureSource) else None
     if set(source.cameras) == {HOLDOUT}:
         raise UsageError(
             f"--cameras {args.cameras}: leaves no camera to train with", remedy="name another, or leave it out"
@@ -42,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     with output_path(out, force=args.force, is_folder=True) as partial:
         with stopwatch.stage("write"):
-            summary = write_capture(partial, source, progress=progress)
+            summary = write_capture(partial, source, topics=topics, progress=progress)
         metrics = {
             "frames": summary.num_frames,
             "joint_states": summary.num_joint_states,

@@ -4,8 +4,7 @@ import csv
 import dataclasses
 import hashlib
 import json
-import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from io import BytesIO, StringIO
 from pathlib import Path
@@ -16,6 +15,15 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError, WriteError
 from splatctrl_cli.geometry import quat_from_rotation, transform_from
+from splatctrl_cli.io.capture_joints import joints_file, read_joints
+from splatctrl_cli.io.joint_topics import (
+    JointTopics,
+    joints_again,
+    read_topics,
+    with_joints,
+    without_joints,
+    write_topics,
+)
 from splatctrl_cli.io.masks import human_mask
 from splatctrl_cli.io.messages import decode_file, metres
 from splatctrl_cli.io.options import SourceOptions
@@ -31,8 +39,9 @@ FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
 FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
 _NOT_FOR_CAPTURES = (
     *("world_frame", "camera_topics", "camera_poses", "human_topics"),
-    *("depth_scale", "joint_topic", "root", "holdout"),
+    *("depth_scale", "root", "holdout"),
 )
+_AGAIN = "run `splatctrl ingest` again"
 PNG_LEVEL = 3  # zlib; 3 is half the time of OpenCV's default 6 and 5 % larger on apc_shelf depth
 
 
@@ -57,14 +66,23 @@ class _Sums:
         path.write_bytes(data)
         self.lines.append(f"{hashlib.sha256(data).hexdigest()}  {name}\n")
 
+    def add(self, folder: Path, name: str) -> None:
+        """Of a file that is there."""
+        self.lines.append(f"{sha256(folder / name)}  {name}\n")
+
 
 def write_capture(
-    folder: Path, source: ShotSource, *, progress: Callable[[int], None] | None = None
+    folder: Path,
+    source: ShotSource,
+    *,
+    topics: JointTopics | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> CaptureSummary:
     """Write all of `source` into the empty `folder`; the same input gives the same bytes.
 
     JPEG and PNG colour is kept byte for byte where its pixels are the frame's; depth becomes 16-bit PNG in the unit
-    it was recorded in, or .npy [m] where no unit holds it. Raises InputError when the source yields no frame.
+    it was recorded in, or .npy [m] where no unit holds it. topics: the joint states as they were recorded, beside
+    those of `source`, which are of one topic. Raises InputError when the source yields no frame.
     """
     sums, rows, joints = _Sums(), [], []
     cameras: dict[str, dict[str, Any]] = {}
@@ -77,7 +95,7 @@ def write_capture(
             progress(len(rows))
     if not rows:
         raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
-    _write_joints(folder, joints, len(source.joint_names), sums)
+    sums.write(folder, "joints.npz", joints_file(joints, len(source.joint_names)))
     _write_frames(folder, rows, sums)
     header = {
         "format": FORMAT,
@@ -93,8 +111,10 @@ def write_capture(
         "sources": source.digests(),
         "loss": asdict(source.loss),
     }
+    if topics is not None and topics.topics:
+        header["joint_topics"] = write_topics(folder, topics, lambda name: sums.add(folder, name))
     write_json(folder / "capture.json", header)
-    sums.lines.append(f"{sha256(folder / 'capture.json')}  capture.json\n")
+    sums.add(folder, "capture.json")
     (folder / "SHA256SUMS").write_text("".join(sorted(sums.lines, key=lambda line: line[66:])), encoding="ascii")
     return CaptureSummary(
         num_frames={name: camera["num_frames"] for name, camera in cameras.items()},
@@ -104,9 +124,13 @@ def write_capture(
 
 
 class CaptureSource:
-    """Records of a capture folder; a file whose checksum differs is counted as damage and left out."""
+    """Records of a capture folder; a file whose checksum differs is counted as damage and left out.
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
+    joints: a robot's, to be brought together from the topics that the capture kept, as from those of the log itself;
+    without them, or in a capture that kept none, the states are those of joints.npz.
+    """
+
+    def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
         options.refuse(_NOT_FOR_CAPTURES, "a capture", path)
         self._path = path
         self.name = path.name
@@ -121,9 +145,19 @@ class CaptureSource:
                 raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(self._cameras)}")
         self._sums = _read_sums(path)
         self._rows = [row for row in _read_frames(path) if row["camera"] in self.cameras]
-        self._joints = _read_joints(path) if self.joint_names else []
         self._damaged: list[str] = []
         self._loss = LossReport(**header["loss"])
+        described = header.get("joint_topics")
+        self.joint_topics = None if described is None else read_topics(path, described, self._checked)
+        self._joints: Sequence[JointState] = []
+        if joints is None or self.joint_topics is None:
+            options.refuse(("joint_topic",), "the states of one topic in a capture", path)
+            self._joints = read_joints(path) if self.joint_names else []
+        else:
+            kept = self.joint_topics
+            self.joint_names, self._joints, loss = joints_again(kept, options, joints)
+            others = without_joints(self._loss, kept.loss, kept.first_note)
+            self._loss = with_joints(others, loss, kept.first_note)
 
     @property
     def loss(self) -> LossReport:
@@ -193,6 +227,13 @@ class CaptureSource:
             self._damaged.append(f"{name}: its checksum differs from SHA256SUMS")
             return None
         return data
+
+    def _checked(self, name: str) -> Path:
+        """The path of a file that is as it was written. Raises InputError for another."""
+        file = self._path / name
+        if not file.is_file() or self._sums.get(name) != sha256(file):
+            raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=_AGAIN)
+        return file
 
 
 def _pose(row: dict[str, str]) -> Float64:
@@ -292,17 +333,6 @@ def _npy(depth: Float32) -> bytes:
     return stream.getvalue()
 
 
-def _write_joints(folder: Path, joints: list[JointState], num_joints: int, sums: _Sums) -> None:
-    stream = BytesIO()
-    np.savez(
-        stream,
-        stamp_ns=np.array([j.stamp_ns for j in joints], dtype=np.int64),
-        position=np.array([j.position for j in joints], dtype=np.float64).reshape(len(joints), num_joints),
-        velocity=np.array([j.velocity for j in joints], dtype=np.float64).reshape(len(joints), num_joints),
-    )
-    sums.write(folder, "joints.npz", stream.getvalue())
-
-
 def _write_frames(folder: Path, rows: list[dict[str, str]], sums: _Sums) -> None:
     stream = StringIO()
     columns = MASKED_COLUMNS if any("human" in row for row in rows) else COLUMNS
@@ -329,19 +359,6 @@ def _read_frames(path: Path) -> list[dict[str, str]]:
     except (ValueError, TypeError) as error:
         raise InputError(f"{file}: {error}", remedy="run `splatctrl ingest` again") from None
     return rows
-
-
-def _read_joints(path: Path) -> list[JointState]:
-    file = path / "joints.npz"
-    try:
-        with np.load(file, allow_pickle=False) as content:
-            columns = [content[name] for name in ("stamp_ns", "position", "velocity")]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
-    return [
-        JointState(stamp_ns=int(stamp), position=position, velocity=velocity)
-        for stamp, position, velocity in zip(*columns, strict=True)
-    ]
 
 
 def _read_sums(path: Path) -> dict[str, str]:

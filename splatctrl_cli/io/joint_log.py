@@ -1,7 +1,7 @@
 """The joint states of one topic as they are read: columns by which joints a message names."""
 
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from splatctrl_cli.io.state_messages import RawJoints
 from splatctrl_cli.records import Float64
 
 Stamps = NDArray[np.int64]
-_BLOCKS = ("position", "velocity", "commanded_velocity", "T_base_ee")
+COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
 
 
 class JointStream:
@@ -24,6 +24,23 @@ class JointStream:
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
         self._waiting: list[RawJoints] = []
         self._files: dict[str, RowFile] = {}
+
+    @classmethod
+    def of(
+        cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
+    ) -> "JointStream":
+        """The stream that had these columns, given as blocks of rows."""
+        stream = cls(names)
+        stream._stamps.extend(stamp_ns.tolist())
+        stream._log_times.extend(log_time_ns.tolist())
+        for name, blocks in columns.items():
+            shape = (4, 4) if name == "T_base_ee" else (len(names),)
+            stream._files[name] = RowFile(shape)
+            for block in blocks:
+                stream._files[name].append(block)
+        if {len(file) for file in stream._files.values()} - {len(stream)}:
+            raise ValueError(f"columns of other lengths than {len(stream)}")
+        return stream
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -56,7 +73,7 @@ class JointStream:
     def _flush(self) -> None:
         states, num = self._waiting, len(self._stamps) - len(self._waiting)
         self._waiting = []
-        for name in _BLOCKS if states else ():
+        for name in COLUMNS if states else ():
             values = [self._row(state, name) for state in states]
             if any(value is not None for value in values) or name in self._files:
                 shape = (4, 4) if name == "T_base_ee" else (len(self.names),)
@@ -80,6 +97,15 @@ class JointLog:
         self.first_names: tuple[str, ...] | None = None
         self._num = 0
         self._streams: dict[frozenset[str], JointStream] = {}
+
+    @classmethod
+    def of(cls, num: int, streams: Sequence[JointStream]) -> "JointLog":
+        """The log of `num` states that had these streams."""
+        log = cls()
+        log._num = num
+        log._streams = {frozenset(stream.names): stream for stream in streams}
+        log.first_names = streams[0].names if streams else None
+        return log
 
     def __len__(self) -> int:
         return self._num

@@ -10,6 +10,7 @@ from functools import cached_property
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.io.joint_topics import topics_of, with_joints
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.masks import human_mask, mask_by_color
 from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid, read_image
@@ -53,7 +54,10 @@ class RosLogSource:
         self._rig = build_cameras(log, found, options)
         self.cameras = tuple(camera.name for camera in self._rig)
         self.world_frame = self._rig[0].world_frame
-        self.joint_names, self._joints = joint_records(found, options, self._loss, joints)
+        loss, first_note = LossReport(), len(self._loss.notes)
+        self.joint_names, self._joints = joint_records(found, options, loss, joints)
+        self.joint_topics = topics_of(found, loss, first_note, options)
+        self._loss = with_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
         self._damage = Damage()
         self._num_invalid = 0

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.io.capture import CaptureSource, is_capture
 from splatctrl_cli.io.folder_description import has_table
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.options import SourceOptions
@@ -13,12 +14,13 @@ from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.ros_log import RosLogSource
 from splatctrl_cli.io.source import open_source
+from splatctrl_cli.io.state_columns import StateColumns
 from splatctrl_cli.io.state_csv import is_libfranka, libfranka_track, read_csv
 from splatctrl_cli.io.state_table import described_track
 from splatctrl_cli.io.state_topics import with_prefix
 from splatctrl_cli.io.state_track import RawTrack, cleaned
 from splatctrl_cli.io.survey import survey
-from splatctrl_cli.records import JointState, LossReport, Record, RecordSource
+from splatctrl_cli.records import LossReport, Record, RecordSource
 
 _FOR_CAMERAS = ("cameras", "camera_topics", "camera_poses", "human_topics", "depth_scale", "world_frame")
 _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
@@ -31,7 +33,7 @@ class StateSource:
     has_clock = True
 
     def __init__(
-        self, name: str, files: Sequence[Path], names: tuple[str, ...], states: Sequence[JointState], loss: LossReport
+        self, name: str, files: Sequence[Path], names: tuple[str, ...], states: StateColumns, loss: LossReport
     ) -> None:
         self.name = name
         self.joint_names = names
@@ -67,6 +69,8 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Re
         options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
         raw, file = described_track(path)
         return _of_table(path, (path, file), raw, LossReport())
+    if is_capture(path):
+        return CaptureSource(path, options, joints)
     if path.suffix == ".toml" or (path.is_dir() and not is_bag_folder(path)):
         return open_source(path, options)
     return _of_log(path, open_raw_log(path), options, joints)

@@ -1,0 +1,55 @@
+"""``joints.npz`` of a capture: the joint states of one topic, cleaned."""
+
+import zipfile
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import JointState
+
+NEEDED = ("stamp_ns", "position", "velocity")
+OPTIONAL = ("commanded_velocity", "T_base_ee", "T_world_ee")  # NaN where a state has none, absent where none has one
+
+
+def joints_file(joints: Sequence[JointState], num_joints: int) -> bytes:
+    """The file's content: stamp_ns (T,) int64; position, velocity, and where there are any commanded_velocity (T, J),
+    T_base_ee, T_world_ee (T, 4, 4) float64.
+    """
+    row, pose = (num_joints,), (4, 4)
+    arrays: dict[str, Any] = {
+        "stamp_ns": np.array([j.stamp_ns for j in joints], dtype=np.int64),
+        "position": np.array([j.position for j in joints], dtype=np.float64).reshape(len(joints), num_joints),
+        "velocity": np.array([j.velocity for j in joints], dtype=np.float64).reshape(len(joints), num_joints),
+    }
+    for name in OPTIONAL:
+        nothing = np.full(row if name == "commanded_velocity" else pose, np.nan)
+        values = [getattr(j, name) for j in joints]
+        if any(value is not None for value in values):
+            arrays[name] = np.array([nothing if value is None else value for value in values])
+    stream = BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def read_joints(path: Path) -> list[JointState]:
+    """The states of a capture folder's joints.npz. Raises InputError."""
+    file = path / "joints.npz"
+    try:
+        with np.load(file, allow_pickle=False) as content:
+            columns = [content[name] for name in NEEDED]
+            beside = {name: content[name] for name in OPTIONAL if name in content.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
+    return [
+        JointState(
+            stamp_ns=int(stamp),
+            position=position,
+            velocity=velocity,
+            **{name: values[i] for name, values in beside.items() if np.isfinite(values[i]).all()},
+        )
+        for i, (stamp, position, velocity) in enumerate(zip(*columns, strict=True))
+    ]
