@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from splatctrl_cli.robot.coverage import LinkCoverage
     from splatctrl_cli.robot.model import RobotModel
 
+FR3_LIMITS = (
+    "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to keep "
+    "the published ones"
+)
 COARSE = 0.02  # [m] of areas, which a replay does not report; the deficit is as exact as ever
 
 
@@ -55,9 +59,13 @@ def doubts_of(args: argparse.Namespace, model: "RobotModel", config: "ControlCon
     """What a person should know of the robot before trusting this replay; a sentence each."""
     from splatctrl_cli.robot.self_collision import never_apart
 
-    found = () if args.mode == "audit" else never_apart(model, config.self_margin)
+    if args.mode == "audit":
+        return list(model.doubts)
+    found = never_apart(model, config.self_margin)
+    is_fr3 = all(name.startswith("fr3_joint") for name in model.joint_names)
     return [
         *model.doubts,
+        *([FR3_LIMITS] if is_fr3 and config.velocity_limits == "urdf" else []),
         *(
             f"{' and '.join(pair.links)}: their spheres are no farther than {1e3 * pair.largest_gap:.1f} mm apart in "
             f"any posture sampled: control.self_margin = {1e3 * config.self_margin:g} mm cannot be kept; lower it, "

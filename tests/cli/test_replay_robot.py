@@ -1,11 +1,13 @@
 """What a replay says of the robot it was given: uncovered surface, and pairs that an SRDF takes out."""
 
 import json
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from splatctrl_cli.cli.replay_robot import doubts_of
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.geometry import transform_points
@@ -127,6 +129,20 @@ def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) ->
     assert desk.replay("--scene", str(scene), "-q", "--force", "--srdf", str(srdf)) == 0
     assert gone > 0 and desk.metrics()["num_self_pairs"] == every - gone
     assert srdf.name in json.loads((desk.folder / "out" / "run.json").read_text())["inputs"]
+
+
+def test_an_fr3_is_reminded_of_its_limits_by_position(sample_data: Path, tmp_path: Path) -> None:
+    tabletop, urdf = sample_data / "tabletop", tmp_path / "fr3.urdf"
+    urdf.write_text((tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint'))
+    model = RobotModel.from_urdf(urdf, tabletop / "robot_spheres.yaml")
+    drive, audit = Namespace(mode="closed-loop"), Namespace(mode="audit")
+    (doubt,) = doubts_of(drive, model, ControlConfig())
+    assert "control.velocity_limits = fr3" in doubt
+    assert (
+        doubts_of(drive, model, ControlConfig(velocity_limits="fr3"))
+        == doubts_of(audit, model, ControlConfig())
+        == []
+    )
 
 
 def test_a_margin_that_no_posture_keeps_between_two_links_is_said(
