@@ -111,11 +111,10 @@ def _measured(model: "RobotModel", packages: list[Path]) -> "RobotModel":
 
 def _check_bounded(model: "RobotModel") -> None:
     """Raise InputError where a link that moves has no sphere, or nothing was measured."""
-    wanted, name = "control.coverage = margin", model.urdf.path.name
+    wanted = "control.coverage = margin"
     if model.coverage is None:
         raise InputError(
-            f"{wanted}: expected the collision geometry of {name}: {model.coverage_unknown}",
-            remedy="give --packages, or a URDF with collision geometry, or set control.coverage = report",
+            f"{wanted}: {model.coverage_unknown}", remedy="or set control.coverage = report, which needs no meshes"
         )
     bodies = model.urdf.rigid_bodies()
     children = {child for _, child in model.urdf.parents}
@@ -123,7 +122,7 @@ def _check_bounded(model: "RobotModel") -> None:
     if bare:
         raise InputError(
             f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
-            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {name}",
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
         )
 
 

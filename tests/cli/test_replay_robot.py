@@ -95,7 +95,7 @@ def test_collision_geometry_that_cannot_be_read_is_said_and_refused_as_a_margin(
     assert "is not known" in about(desk) and "package://arm/m.stl" in about(desk)
     capsys.readouterr()
     assert desk.replay("--scene", str(scene), "-q", "--force", "--set", "control.coverage=margin") == 4
-    assert "give --packages" in capsys.readouterr().err
+    assert "with --packages DIR; or set control.coverage = report" in capsys.readouterr().err
 
 
 def test_with_the_deficit_in_the_rows_the_surface_keeps_the_margin(arm: RobotModel, sample_data: Path) -> None:
