@@ -178,9 +178,12 @@ def known_space(occupancy: "OccupancyGrid") -> "Observed":
 
 
 def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFields:
-    """Exact and barrier field of the splats, the robot's own left out."""
+    """Exact and barrier field of the splats, the robot's own left out; in the latter people count as much nearer as
+    `control.human_margin` asks.
+    """
     import numpy as np
 
+    from splatctrl_cli.control.people import guarded
     from splatctrl_cli.field.distance import SphereField, field_over
     from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats
     from splatctrl_cli.field.spheres import Spheres
@@ -189,14 +192,16 @@ def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFie
     chosen = field_splats(splats)
     index = np.flatnonzero(np.isin(splats.labels, [int(label) for label in DEFAULT_LABELS]))
     spheres = Spheres.of(chosen.centers, chosen.radii)
-    barrier, exact = field_over(spheres, config.field, threads=threads), SphereField.over(spheres, threads=threads)
     people = chosen.labels == Label.HUMAN
+    human = SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None
+    barrier = guarded(field_over(spheres, config.field, threads=threads), human, config.control)
+    exact = SphereField.over(spheres, threads=threads)
     return KnownFields(
         barrier=barrier,
         distances={"exact": _distance(exact), "barrier": _distance(barrier)},
         median_radius=float(np.median(chosen.radii)),
         obstacles=lambda points: _nearest_splats(splats, index[exact.nearest(points)], points),
-        human=SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None,
+        human=human,
     )
 
 

@@ -67,6 +67,10 @@ def opened_scene(
 ) -> KnownScene:
     """The scene that the options of a replay name; what --lockstep reconstructs goes into `folder`."""
     if args.field is not None:
+        if config.control.human_margin > config.control.margin:
+            raise UsageError(
+                "control.human_margin: a baked field does not tell people from things", remedy="give --scene"
+            )
         return from_grid(args.field)
     if args.scene is not None:
         return from_splats(args.scene, config, args.threads, latency_ns=_latency_ns(args))

@@ -31,6 +31,7 @@ class RecordingOptions:
 
     with_person: a person with masks walks by, instead of the visitor that stands still. human_arm: one of
     `shared_workspace.PLACES`, instead of both: the table shared with a person's arm, whose visit the seed draws.
+    color_rays: 0 to 4 rays for a pixel's colour beside the one for its depth.
     """
 
     duration_s: float = 7.0
@@ -41,6 +42,7 @@ class RecordingOptions:
     seed: int = 0
     with_person: bool = False
     human_arm: str | None = None
+    color_rays: int = 4
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.duration_s <= 600:
@@ -180,7 +182,8 @@ class Recording:
     @cached_property
     def _renderers(self) -> list[Renderer]:
         """One by camera, with what is always there cast."""
-        return [Renderer(camera, self.primitives[: -len(self._temporary)]) for camera in self.cameras]
+        static, rays = self.primitives[: -len(self._temporary)], self.options.color_rays
+        return [Renderer(camera, static, color_rays=rays) for camera in self.cameras]
 
 
 def _shown(depth: Float32, without: Float32) -> UInt8:

@@ -29,14 +29,18 @@ class Camera:
 class Renderer:
     """Renders one camera; what never moves is cast once.
 
-    A pixel's ray is scaled to one metre along the optical axis, so that its parameter is the depth.
+    A pixel's ray is scaled to one metre along the optical axis, so that its parameter is the depth. `color_rays` of
+    the four make a pixel's colour; with 0 it is that of the depth's ray.
     """
 
-    def __init__(self, camera: Camera, static: Sequence[Primitive]) -> None:
+    def __init__(self, camera: Camera, static: Sequence[Primitive], *, color_rays: int = 4) -> None:
         self.camera = camera
         k = camera.intrinsics
         v, u = np.mgrid[: k.height, : k.width].astype(np.float64)
-        rays = [np.stack([(u + du - k.cx) / k.fx, (v + dv - k.cy) / k.fy, np.ones_like(u)], -1) for du, dv in OFFSETS]
+        rays = [
+            np.stack([(u + du - k.cx) / k.fx, (v + dv - k.cy) / k.fy, np.ones_like(u)], -1)
+            for du, dv in OFFSETS[: 1 + color_rays]
+        ]
         self._directions = np.stack(rays) @ camera.T_world_camera[:3, :3].T  # (5, H, W, 3), world
         shape = self._directions.shape[:3]
         self._depth = np.full(shape, np.inf)
@@ -47,7 +51,7 @@ class Renderer:
         """color (H, W, 3) uint8 and depth (H, W) float32 [m], 0 = nothing there, with `moving` in the scene."""
         depth, color = self._depth.copy(), self._color.copy()
         self._cast(moving, depth, color)
-        mean = np.mean(color[1:], axis=0)
+        mean = np.mean(color[1:] if len(color) > 1 else color, axis=0)
         at_center = np.where(np.isfinite(depth[0]), depth[0], 0)
         return np.rint(mean * 255).astype(np.uint8), at_center.astype(np.float32)
 

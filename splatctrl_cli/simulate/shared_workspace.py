@@ -71,7 +71,7 @@ def visit_of(place: str, seed: int) -> Visit:
         wrist += [_over(pile, 0.27), _over(built, 0.17 + 0.04 * level)]
         dwell += [float(rng.uniform(0.2, 0.6)) for _ in range(2)]
     wrist, dwell = [*wrist, _over(built, 0.30), rest], [*dwell, 0.1, 0.0]
-    speed, clock = rng.uniform(0.3, 0.6), float(rng.uniform(0.8, 4.0))
+    speed, clock = rng.uniform(0.3, 0.6), float(rng.uniform(0.5, 6.5))
     arrival, departure = [clock], [clock]
     for (a, b), wait in zip(pairwise(wrist), dwell[1:], strict=True):
         arrival.append(departure[-1] + max(float(np.linalg.norm(b - a)) / speed, 0.25))

@@ -282,3 +282,11 @@ def test_a_person_walks_by_and_the_masks_show_where(robot: RobotModel) -> None:
 
 def test_nobody_looks_for_people_unless_asked(frames: list[RgbdFrame]) -> None:
     assert all(frame.human is None for frame in frames)
+
+
+def test_fewer_rays_change_colours_alone(exact: Recording) -> None:
+    few, many = (Renderer(exact.cameras[0], tabletop.things(), color_rays=num) for num in (0, 4))
+    moving = [tabletop.visitor(0, 1)]
+    np.testing.assert_array_equal(few.image(moving)[1], many.image(moving)[1])
+    np.testing.assert_array_equal(few.depth(moving), many.image(moving)[1])
+    assert 0 < np.abs(few.image(moving)[0].astype(float) - many.image(moving)[0]).mean() < 10

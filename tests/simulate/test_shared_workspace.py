@@ -87,7 +87,7 @@ def test_the_masks_show_the_moving_arm_where_the_truth_has_it(robot: RobotModel)
         RecordingOptions(human_arm="near-goal", seed=2, noise="none", width=80, height=60, fps=2.0), robot
     )
     people = [p for p in recording.primitives if p.name.startswith("human")]
-    for index in (2, 8, 12):
+    for index in (2, 14, 20):
         for frame in recording.frames_at(index, np.array(shared_workspace.PICKUP)):
             assert frame.human is not None
             points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth))
