@@ -159,9 +159,7 @@ class RowBuilder:
         approach = [np.sum(gradient * motion[self._moving], axis=1), np.sum(direction * apart, axis=1)]
         rate = np.zeros(len(self.names))
         rate[: self.num_external] = distance_rate
-        h = barriers.barrier_bound(
-            np.concatenate([distance, between]), margin=self._margin, gain=self._config.barrier_gain, rate=rate
-        )
+        h = self._bound(np.concatenate([distance, between]), self._margin, None) + rate
         return np.asarray(h + np.concatenate(approach))
 
     def distances(self, q: Float64) -> Float64:
@@ -170,17 +168,26 @@ class RowBuilder:
         distance = self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii[self._moving]
         return np.concatenate([distance, barriers.pair_distance(centers, self._radii, self._pairs)[0]])
 
-    def _bound(self, distance: Float64, margin: Float64, G: Float64, distance_rate: float | Float64 = 0.0) -> Float64:
-        """h (M,) of rows G (M, J); where joints cannot stop at once, with the way that braking takes.
+    def _bound(
+        self, distance: Float64, margin: Float64, G: Float64 | None, distance_rate: float | Float64 = 0.0
+    ) -> Float64:
+        """h (M,) of rows G (M, J), which counts only where joints cannot stop at once: then with the way that braking
+        takes.
 
         A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it is counted on, for it changes on
-        the way and other rows want their part.
+        the way and other rows want their part. A row within its margin asks to be left no faster than
+        `config.recovery_speed`: deep inside, ``alpha (d - epsilon)`` would ask for steps longer than what its
+        gradient holds for.
         """
-        gain = self._config.barrier_gain
-        if self._acceleration is None:
-            return barriers.barrier_bound(distance, margin=margin, gain=gain, rate=distance_rate)
-        deceleration = BRAKING_SHARE * (np.abs(G) @ self._acceleration)
-        return braking_speed(distance - margin, gain, deceleration, self._config.period) + distance_rate
+        config = self._config
+        if self._acceleration is None or G is None:
+            bound = barriers.barrier_bound(distance, margin=margin, gain=config.barrier_gain)
+        else:
+            deceleration = BRAKING_SHARE * (np.abs(G) @ self._acceleration)
+            bound = braking_speed(distance - margin, config.barrier_gain, deceleration, config.period)
+        if config.recovery_speed > 0:
+            bound = np.maximum(bound, -config.recovery_speed)
+        return np.asarray(bound + distance_rate)
 
     def _pair_rows(
         self, distance: Float64, direction: Float64, jacobians: Float64, box: tuple[Float64, Float64]

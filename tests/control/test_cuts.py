@@ -94,3 +94,17 @@ def test_a_corner_stops_an_arm_at_both_of_its_sides(max_cuts: int) -> None:
     task = ReplayTask(start=q, T_world_goal=goal, frame="tip", home=np.array([1.2, 0.0]))
     trace = closed_loop(ARM, config, task, lambda _: gap)
     assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
+
+
+@pytest.mark.parametrize("recovery_speed", [0.0, 0.05, 0.25])
+def test_a_row_deep_inside_asks_to_be_left_no_faster_than_the_recovery_speed(recovery_speed: float) -> None:
+    inside = Balls([ARM.sphere_centers(TASK.start)[TIP] + [0.0, 0.05, 0.0]], [0.06])
+    config = replace(CONFIG, recovery_speed=recovery_speed)
+    builder = RowBuilder(ARM, config, inside)
+    rows = builder.at(TASK.start, BOX, -0.3)
+    linear = config.barrier_gain * (rows.external.distance - config.margin)
+    assert linear[3] < -0.5
+    expected = np.maximum(linear, -recovery_speed) if recovery_speed else linear
+    np.testing.assert_allclose(rows.external.h, expected - 0.3)
+    room = builder.room(TASK.start, np.zeros(2), -0.3)
+    np.testing.assert_allclose(room[:4], expected - 0.3)
