@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.control.clearance import Clearance
+from splatctrl_cli.control.solids import Solids
 from splatctrl_cli.records import Bool, Float64
 
 ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
@@ -48,7 +49,7 @@ def check_edges(
     [rad] before a collision is left unproved. Where `only_whole`, an edge is dropped at its first collision, and its
     free_share is 0.
     """
-    if clearance.compiled is None:
+    if clearance.compiled is None or not isinstance(clearance.scene, Solids):
         return check_sampled_edges(clearance, start, end, contact=contact, give_up=give_up, only_whole=only_whole)
     share, num_checks = clearance.compiled.advance(
         start,

@@ -58,7 +58,7 @@ class Clearance:
     moves; pairs (P, 2) of all spheres; levers (R, J): no
     row loses more than `levers @ |dq|` [m] on the way of dq, given that the scene's distance is 1-Lipschitz (exact
     distances are; for another field `lipschitz` scales its rows). names (R,) of the rows. compiled: the same for the
-    kernel that checks edges, None where the scene is not of solids or the arm has no chain.
+    kernel that checks edges among `Solids`, None for an arm without a chain.
     """
 
     model: PlanningArm
@@ -90,33 +90,28 @@ class Clearance:
             raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
         levers, pairs = model.lever_arms(), np.asarray(model.self_pairs()).reshape(-1, 2)
         names, radii = sphere_names(model.sphere_set), np.asarray(model.sphere_set.radii, dtype=np.float64)
+        taken = np.concatenate([(radii + margin)[moving], radii[pairs].sum(axis=1) + self_margin])
+        rows = np.concatenate([lipschitz * levers[moving], _between(levers, pairs)])
+        chain, compiled = model.chain, None
+        if chain is not None:
+            compiled = EdgeRoom.of(chain, moving.astype(np.int64), pairs.astype(np.int64), taken, rows)
         room = cls(
             model=model,
             scene=scene,
-            taken=np.concatenate([(radii + margin)[moving], radii[pairs].sum(axis=1) + self_margin]),
+            taken=taken,
             moving=moving,
             pairs=pairs,
-            levers=np.concatenate([lipschitz * levers[moving], _between(levers, pairs)]),
+            levers=rows,
+            compiled=compiled,
             names=tuple(names[s] for s in moving) + tuple(f"{names[a]}~{names[b]}" for a, b in pairs),
         )
         return room.in_scene(scene)
 
     def in_scene(self, scene: HasDistance) -> "Clearance":
         """The same arm and margins in another scene."""
-        chain, compiled = self.model.chain, None
-        if chain is not None and isinstance(scene, Solids):
-            balls, boxes, rods = scene.rows()
-            compiled = EdgeRoom(
-                chain=chain,
-                moving=self.moving.astype(np.int64),
-                pairs=np.ascontiguousarray(self.pairs, dtype=np.int64),
-                taken=self.taken,
-                levers=np.ascontiguousarray(self.levers.T),
-                balls=balls,
-                boxes=boxes,
-                rods=rods,
-            )
-        return replace(self, scene=scene, compiled=compiled)
+        if self.compiled is None or not isinstance(scene, Solids):
+            return replace(self, scene=scene)
+        return replace(self, scene=scene, compiled=self.compiled.among(*scene.rows()))
 
     def rows(self, q: Float64) -> Float64:
         """Every row's distance less its margin (B, R) [m] at postures q (B, J).

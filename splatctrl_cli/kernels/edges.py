@@ -3,7 +3,7 @@
 Shapes: E edges, J joints, R rows (M moving spheres, then P pairs). All float64.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +13,19 @@ from splatctrl_cli.kernels.chain import Chain
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+PART = 10  # spheres that are passed over together, at most
 
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeRoom:
-    """An arm among solids.
+    """An arm among solids; made by `of`.
 
-    moving (M,), pairs (P, 2) spheres; taken (R,) [m] off each row; levers (J, R) [m/rad], C-contiguous. Solids are
-    rows: balls (., 4) center and radius; boxes (., 15) the rotation and shift from world into their own axes and
-    half sizes; rods (., 15) the same with radius, half length along z, and what is added to the surface all about.
+    chain: its last K spheres are middles of parts of the bodies, and a ball of radius (K,) [m] about one holds the
+    centres of that part. moving (M,), pairs (P, 2) spheres, ordered by part; taken (R,) [m] off each row; levers
+    (R, J) [m/rad]. groups (G, 4): first part, second part (-1: the solids), first row, one past the last; group_taken
+    (G,), group_levers (G, J): the largest of any of their rows. Solids are rows: balls (., 4) center and radius;
+    boxes (., 15) the rotation and shift from world into their own axes and half sizes; rods (., 15) the same with
+    radius, half length along z, and what is added to the surface all about.
     """
 
     chain: Chain
@@ -29,9 +33,48 @@ class EdgeRoom:
     pairs: Int64
     taken: Float64
     levers: Float64
+    radius: Float64
+    groups: Int64
+    group_taken: Float64
+    group_levers: Float64
     balls: Float64
     boxes: Float64
     rods: Float64
+
+    @classmethod
+    def of(cls, chain: Chain, moving: Int64, pairs: Int64, taken: Float64, levers: Float64) -> "EdgeRoom":
+        """The arm of a chain without solids; moving (M,), pairs (P, 2), taken (R,), levers (R, J) in any order."""
+        part, part_body, middles, radius = _parts(chain)
+        between = np.concatenate(
+            [np.stack([part[moving], np.full(len(moving), -1)], axis=1), part[pairs].reshape(-1, 2)]
+        )
+        is_pair = np.arange(len(between)) >= len(moving)
+        order = np.lexsort((between[:, 1], between[:, 0], is_pair))
+        between, taken, levers = between[order], taken[order], np.ascontiguousarray(levers[order])
+        is_first = np.r_[True, np.any(between[1:] != between[:-1], axis=1)][: len(between)]
+        first = np.flatnonzero(is_first)
+        return cls(
+            chain=replace(
+                chain,
+                sphere_body=np.concatenate([chain.sphere_body, part_body]),
+                offset=np.concatenate([chain.offset, middles]),
+            ),
+            moving=moving[order[: len(moving)]],
+            pairs=np.ascontiguousarray(pairs[order[len(moving) :] - len(moving)]),
+            taken=taken,
+            levers=levers,
+            radius=radius,
+            groups=np.column_stack([between[first], first, np.r_[first[1:], len(between)]]).astype(np.int64),
+            group_taken=np.maximum.reduceat(taken, first),
+            group_levers=np.maximum.reduceat(levers, first, axis=0),
+            balls=np.empty((0, 4)),
+            boxes=np.empty((0, 15)),
+            rods=np.empty((0, 15)),
+        )
+
+    def among(self, balls: Float64, boxes: Float64, rods: Float64) -> "EdgeRoom":
+        """The same arm among other solids."""
+        return replace(self, balls=balls, boxes=boxes, rods=rods)
 
     def advance(
         self,
@@ -64,6 +107,10 @@ class EdgeRoom:
             self.pairs,
             self.taken,
             self.levers,
+            self.radius,
+            self.groups,
+            self.group_taken,
+            self.group_levers,
             self.balls,
             self.boxes,
             self.rods,
@@ -79,3 +126,32 @@ class EdgeRoom:
             num_checks,
         )
         return share, num_checks
+
+
+def _parts(chain: Chain) -> tuple[Int64, Int64, Float64, Float64]:
+    """The part (S,) of every sphere; the body (K,) of every part, and the middle (K, 3) and radius (K,) [m] of a ball
+    in it that holds the part's centres.
+    """
+    part = np.empty(len(chain.sphere_body), np.int64)
+    bodies: list[int] = []
+    middles: list[Float64] = []
+    radii: list[float] = []
+    for body in np.unique(chain.sphere_body):
+        for own in _split(chain.offset, np.flatnonzero(chain.sphere_body == body)):
+            at = chain.offset[own]
+            middle = (at.min(axis=0) + at.max(axis=0)) / 2
+            part[own] = len(bodies)
+            bodies.append(int(body))
+            middles.append(middle)
+            radii.append(float(np.linalg.norm(at - middle, axis=1).max()))
+    return part, np.array(bodies, np.int64), np.array(middles).reshape(-1, 3), np.array(radii, np.float64)
+
+
+def _split(offset: Float64, spheres: Int64) -> list[Int64]:
+    """Spheres halved along their longest extent until there are at most `PART` of them."""
+    if len(spheres) <= PART:
+        return [spheres]
+    axis = int(np.argmax(np.ptp(offset[spheres], axis=0)))
+    order = spheres[np.argsort(offset[spheres, axis], kind="stable")]
+    half = len(order) // 2
+    return [*_split(offset, order[:half]), *_split(offset, order[half:])]

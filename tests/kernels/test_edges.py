@@ -123,3 +123,7 @@ def test_arrays_that_do_not_fit_are_refused(arm: RobotModel) -> None:
         advance(pairs=good.pairs + 1000)
     with pytest.raises(ValueError, match="solids: expected a row of numbers"):
         advance(boxes=good.boxes[:, :14].copy())
+    with pytest.raises(ValueError, match="groups: expected parts that are there"):
+        advance(groups=good.groups + 1000)
+    with pytest.raises(ValueError, match="groups: expected every row in one of them"):
+        advance(groups=good.groups[:-1], group_taken=good.group_taken[:-1], group_levers=good.group_levers[:-1])

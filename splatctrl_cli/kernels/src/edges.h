@@ -6,13 +6,23 @@
 
 namespace splatctrl {
 
+// Rows [begin, end) of one part's spheres against the solids (second is -1), or between those of two parts.
+struct RowGroup {
+  long first, second, begin, end;
+};
+
 // R rows: M moving spheres against the solids, then P pairs of spheres. A row is the distance of its centres, or of its
-// centre to the nearest solid, less `taken`; over a motion dq it loses at most levers |dq|.
+// centre to the nearest solid, less `taken`; over a motion dq it loses at most levers |dq|. The last K spheres of the chain
+// are middles of parts of its bodies: a ball of `radius` about one holds the centres of that part's spheres. Rows come in
+// groups, of which group_taken and group_levers are the largest of any row: of a group that is far enough no row is looked at.
 struct Room {
   Chain chain;
-  int num_moving, num_pairs;
-  const long *moving, *pairs;    // (M), (P, 2)
-  const double *taken, *levers;  // (R), (J, R)
+  int num_moving, num_pairs, num_parts, num_groups;
+  const long *moving, *pairs;                // (M), (P, 2)
+  const double *taken, *levers;              // (R), (R, J)
+  const double* radius;                      // (K)
+  const RowGroup* groups;                    // (G)
+  const double *group_taken, *group_levers;  // (G), (G, J)
   int num_balls, num_boxes, num_rods;
   const Ball* balls;
   const Cuboid* boxes;
