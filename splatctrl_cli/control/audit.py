@@ -1,6 +1,6 @@
 """The clearance of logged joint states: what each field says of every state, and how much of it is known space."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,12 +130,16 @@ def observed_lookup(seen: Channel, origin: Float64, voxel: float) -> Observed:
     return observed
 
 
-def _runs(stamps: Stamps, distances_at: DistancesAt) -> list[tuple[int, int]]:
-    """Ranges of at most CHUNK consecutive states that see the same scene."""
-    known = [distances_at(int(stamp)) for stamp in stamps]
-    starts = [i for i in range(len(stamps)) if i == 0 or known[i] is not known[i - 1]]
-    cuts = [c for a, b in zip(starts, [*starts[1:], len(stamps)], strict=True) for c in range(a, b, CHUNK)]
-    return list(zip(cuts, [*cuts[1:], len(stamps)], strict=True))
+def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
+    """Ranges of at most CHUNK consecutive states that see the same scene; of the scenes none but two is held."""
+    first, before = 0, distances_at(int(stamps[0]))
+    for index, stamp in enumerate(stamps):
+        known = distances_at(int(stamp))
+        if known is not before or index - first == CHUNK:
+            yield first, index
+            first = index
+        before = known
+    yield first, len(stamps)
 
 
 def _self_clearance(model: ArmModel, centers: Float64) -> Clearance:
