@@ -9,9 +9,12 @@ import pytest
 
 from splatctrl_cli.cli.replay_compare import certified_distance, figure_names
 from splatctrl_cli.cli.replay_metrics import metric_names
-from splatctrl_cli.config import Config
+from splatctrl_cli.config import Config, FieldConfig
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, grid_seen, splats_of, write_scene
 from tests.cli.test_replay_modes import MOVE, ball_ahead, moving, with_person
 
 CLOSED = ("-q", "--mode", "closed-loop", "--set", "control.max_time=4")
@@ -148,13 +151,25 @@ def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_fiel
     assert steepest > 1.2
 
 
-def test_a_path_is_clear_of_the_splats_between_its_waypoints(desk: Desk, arm: RobotModel) -> None:
+@pytest.mark.parametrize("is_grid", [False, True])
+def test_a_path_is_clear_of_the_splats_between_its_waypoints(desk: Desk, arm: RobotModel, is_grid: bool) -> None:
     moving(desk)
     tip = arm.sphere_centers(START + MOVE / 2)[-1]
     ball = ((float(tip[0]), float(tip[1]), float(tip[2])), 0.03)
-    assert desk.replay(*scene_of(desk, ball), *CLOSED, "--baseline", "birrt") == 0
+    if is_grid:
+        box = Box(lower=np.array([-0.4, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.2]))
+        (desk.folder / "field").mkdir()
+        grid = bake(splats_of(ball), box, FieldConfig(voxel=0.02), occupancy=grid_seen(), threads=1)
+        write_npz(desk.folder / "field" / "field.npz", grid)
+        where = ("--field", str(desk.folder / "field"))
+    else:
+        where = scene_of(desk, ball)
+    assert desk.replay(*where, *CLOSED, "--baseline", "birrt", "--max-unknown", "1") == 0
     document = json.loads((desk.folder / "out" / "methods.json").read_text())
-    waypoints = np.array(document["plans"]["birrt"]["waypoints"])
+    figures, waypoints = document["methods"]["birrt"], np.array(document["plans"]["birrt"]["waypoints"])
+    assert figures["num_edges_proved"] == figures["num_edges"] > 1
+    assert 0 < figures["planned_margin"] <= Config().control.margin
     for a, b in pairwise(waypoints):
         for share in np.linspace(0, 1, 200):
-            assert clearance(arm, a + share * (b - a), ball) > document["methods"]["birrt"]["planned_margin"]
+            assert clearance(arm, a + share * (b - a), ball) > figures["planned_margin"]
+    assert figures["min_clearance_proved"] < figures["min_clearance"]
