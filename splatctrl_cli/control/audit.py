@@ -133,7 +133,7 @@ def observed_lookup(seen: Channel, origin: Float64, voxel: float) -> Observed:
 def _runs(stamps: Stamps, distances_at: DistancesAt) -> Iterator[tuple[int, int]]:
     """Ranges of at most CHUNK consecutive states that see the same scene; of the scenes none but two is held."""
     first, before = 0, distances_at(int(stamps[0]))
-    for index, stamp in enumerate(stamps):
+    for index, stamp in enumerate(stamps[1:], start=1):
         known = distances_at(int(stamp))
         if known is not before or index - first == CHUNK:
             yield first, index
