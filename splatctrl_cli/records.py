@@ -6,7 +6,7 @@ Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixel
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,19 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
+
+
+class FloatRows(Protocol):
+    """Rows (T, ...) of float64 by number, slice or index (K,): an array, or what is read from a file as one."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, which: Any, /) -> Any: ...
+
+    def __iter__(self) -> Iterator[Any]: ...
 
 
 class Label(IntEnum):

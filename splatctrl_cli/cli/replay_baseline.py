@@ -107,7 +107,7 @@ def separations(
     driven = separation_of(
         inputs.model,
         trace.stamp_ns,
-        trace.position,
+        np.asarray(trace.position),
         np.array([step.velocity for step in trace.steps]),
         people,
         still=control.stall_speed,

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.cli.replay_report import seconds_of
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.step import ControlStep
 
@@ -25,25 +24,26 @@ def chunks_of(replay: "Replay") -> Iterator[Columns]:
 
 
 def columns_of(replay: "Replay", rows: slice = ALL) -> Columns:
-    """Every column of the chosen states, by name."""
-    audit, names = replay.audit, sphere_names(replay.model.sphere_set)
+    """Every column of a range of states, by name."""
+    first, last, _ = rows.indices(len(replay.audit.stamp_ns))
+    audit, names = replay.audit.block(first, last), sphere_names(replay.model.sphere_set)
     columns: Columns = {
-        "stamp_ns": audit.stamp_ns[rows].tolist(),
-        "time_s": seconds_of(replay)[rows].tolist(),
-        **{f"q_{joint}": audit.position[rows, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
+        "stamp_ns": audit.stamp_ns.tolist(),
+        "time_s": ((audit.stamp_ns - replay.audit.stamp_ns[0]) * 1e-9).tolist(),
+        **{f"q_{joint}": audit.position[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
     }
     for name, clearance in audit.clearance.items():
-        columns[f"clearance_{name}"] = clearance.distance[rows].tolist()
-        columns[f"nearest_{name}"] = [names[s] for s in clearance.sphere[rows]]
+        columns[f"clearance_{name}"] = clearance.distance.tolist()
+        columns[f"nearest_{name}"] = [names[s] for s in clearance.sphere.tolist()]
     if replay.true_clearance is not None:
         columns["clearance_true"] = replay.true_clearance[rows].tolist()
-    columns["obstacle"] = ["" if obstacle is None else str(obstacle) for obstacle in replay.obstacles[rows]]
-    columns["self_clearance"] = audit.self_clearance[rows].tolist()
-    columns["limit_margin"] = audit.limit_margin[rows].tolist()
-    columns["limit_joint"] = [replay.model.joint_names[j] for j in audit.limit_joint[rows]]
-    columns["unknown_share"] = audit.unknown_share[rows].tolist()
+    columns["obstacle"] = list(replay.obstacles[rows])
+    columns["self_clearance"] = audit.self_clearance.tolist()
+    columns["limit_margin"] = audit.limit_margin.tolist()
+    columns["limit_joint"] = [replay.model.joint_names[j] for j in audit.limit_joint.tolist()]
+    columns["unknown_share"] = audit.unknown_share.tolist()
     columns["map_age_s"] = replay.map_age_s[rows].tolist()
-    if replay.steps:
+    if len(replay.steps):
         columns |= _step_columns(replay, rows)
     if replay.open_loop is not None:
         columns |= _open_loop_columns(replay, rows)
@@ -55,8 +55,10 @@ def columns_of(replay: "Replay", rows: slice = ALL) -> Columns:
 
 
 def _step_columns(replay: "Replay", rows: slice) -> Columns:
+    steps = replay.steps[rows]
+
     def each(value: Callable[[ControlStep], object]) -> list[object]:
-        return ["" if step is None else value(step) for step in replay.steps[rows]]
+        return ["" if step is None else value(step) for step in steps]
 
     def velocity_of(joint: int) -> list[object]:
         return each(lambda step: float(step.velocity[joint]))
@@ -79,9 +81,9 @@ def _step_columns(replay: "Replay", rows: slice) -> Columns:
 
 
 def _open_loop_columns(replay: "Replay", rows: slice) -> Columns:
-    trace = replay.open_loop
-    assert trace is not None
-    difference, margins = trace.difference[rows], trace.margins[rows]
+    assert replay.open_loop is not None
+    trace = replay.open_loop.block(*rows.indices(len(replay.audit.stamp_ns))[:2])
+    difference, margins = trace.difference, trace.margins
     return {
         **{f"dv_{joint}": difference[:, j].tolist() for j, joint in enumerate(replay.model.joint_names)},
         "velocity_difference": np.linalg.norm(difference, axis=1).tolist(),

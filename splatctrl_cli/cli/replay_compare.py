@@ -141,7 +141,7 @@ def compared(
     num = max(math.ceil((log.last_ns - start_ns) * 1e-9 / control.period - 1e-6), 0) + 1
     stamps = _stamps(start_ns, num, control.period)
     motions = {
-        "closed_loop": Motion(stamp_ns=trace.stamp_ns, position=trace.position, is_intervened=shaped),
+        "closed_loop": Motion(stamp_ns=trace.stamp_ns, position=np.asarray(trace.position), is_intervened=shaped),
         "log": Motion(stamp_ns=stamps, position=np.array([log.at(int(stamp))[0] for stamp in stamps])),
     }
     if "standstill" in baselines:

@@ -37,17 +37,15 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
         curves["truth"] = replay.true_clearance
     happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in ("", "exact"))
     clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, TITLES[replay.mode], happened)
-    if replay.steps:
-        num_joints = len(replay.model.joint_names)
-        blank = np.full(num_joints, np.nan)
+    if replay.kept_steps is not None:
         commands_picture(
             folder / "commands.png",
             seconds,
-            np.array([blank if step is None else step.velocity for step in replay.steps]),
+            np.asarray(replay.kept_steps.velocity),
             replay.model.joint_names,
             replay.model.velocity_limit,
             _intervals(replay, lambda event: event.kind in INTERVENTIONS, at_least=ROWS),
-            None if replay.open_loop is None else replay.open_loop.logged,
+            None if replay.open_loop is None else np.asarray(replay.open_loop.logged),
         )
     if replay.open_loop is not None:
         shaped = [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS]
@@ -56,7 +54,7 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
             seconds,
             replay.open_loop.difference,
             replay.model.joint_names,
-            np.array([np.nan if margin is None else margin.barrier for margin in replay.open_loop.margins]),
+            replay.open_loop.figures["barrier"],
             shaped,
         )
     if replay.divergence is not None and np.isfinite(replay.divergence.joints).any():

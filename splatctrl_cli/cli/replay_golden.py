@@ -4,6 +4,7 @@ import argparse
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,7 +81,7 @@ def check_golden(golden: Golden, replay: "Replay", tolerance: float) -> None:
         raise InputError(f"{golden.path}: expected the joints {', '.join(joints)}, got {', '.join(golden.joints)}")
     order = [golden.joints.index(joint) for joint in joints]
     stamps = replay.audit.stamp_ns
-    for index, step in enumerate(replay.steps[: len(golden.velocity)]):
+    for index, step in enumerate(islice(replay.steps, len(golden.velocity))):
         when = f"step {index} at {float(stamps[index] - stamps[0]) * 1e-9:.3f} s"
         if int(stamps[index]) != golden.stamps_ns[index]:
             raise GateFailed(f"golden: {when}: expected stamp {golden.stamps_ns[index]} ns, got {stamps[index]} ns")

@@ -1,6 +1,6 @@
 """Every figure of a replay, by a name that is known before the work, and when a figure first broke a bound."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,7 @@ from splatctrl_cli.cli.replay_twists import FIGURES as TWIST_FIGURES
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_modes import Replay
-    from splatctrl_cli.control.step import ControlStep
+    from splatctrl_cli.cli.replay_store import Figures
     from splatctrl_cli.records import Bool, Float64
 
 Metrics = dict[str, float | None]
@@ -84,8 +84,8 @@ def metrics_of(replay: "Replay") -> Metrics:
         "num_static_violations": len(replay.static_violations),
         "max_map_age_s": _largest(replay.map_age_s),
     }
-    if replay.steps:
-        metrics |= _step_metrics(replay)
+    if replay.kept_steps is not None:
+        metrics |= _step_metrics(replay, replay.kept_steps.figures)
     if replay.open_loop is not None:
         metrics |= _open_loop_metrics(replay)
     if replay.closed_loop is not None:
@@ -116,16 +116,14 @@ def first_time(replay: "Replay", metric: str, holds: Callable[[float], bool]) ->
     empty, values = series
     if not holds(empty):
         return None
-    breaks = [not holds(float(value)) for value in values]
-    if not any(breaks):
-        return None
     stamps = replay.audit.stamp_ns
-    return float(stamps[breaks.index(True)] - stamps[0]) * 1e-9
+    first = next((index for index, value in enumerate(values) if not holds(float(value))), None)
+    return None if first is None else float(stamps[first] - stamps[0]) * 1e-9
 
 
 def _running(replay: "Replay", metric: str) -> "tuple[float, Float64] | None":
     """What a metric is before the first state, and over the states up to each (T,)."""
-    audit, steps = replay.audit, replay.steps
+    audit = replay.audit
     exact = audit.clearance["exact"].distance
     lows = {
         "min_clearance": exact,
@@ -133,12 +131,11 @@ def _running(replay: "Replay", metric: str) -> "tuple[float, Float64] | None":
         "min_clearance_true": replay.true_clearance,
         "min_self_clearance": audit.self_clearance,
         "min_limit_margin": audit.limit_margin,
-        "min_barrier_clearance": _each(steps, lambda step: step.clearance) if steps else None,
+        "min_barrier_clearance": None if replay.kept_steps is None else replay.kept_steps.figures["clearance"],
     }
     if replay.open_loop is not None:
-        margins = replay.open_loop.margins
-        lows["min_barrier_margin_logged"] = np.array([np.nan if m is None else m.barrier for m in margins])
-        lows["min_velocity_margin_logged"] = np.array([np.nan if m is None else m.limit for m in margins])
+        lows["min_barrier_margin_logged"] = replay.open_loop.figures["barrier"]
+        lows["min_velocity_margin_logged"] = replay.open_loop.figures["limit"]
     low = lows.get(metric)
     if low is not None:
         return np.inf, np.fmin.accumulate(low)
@@ -154,12 +151,13 @@ def _running(replay: "Replay", metric: str) -> "tuple[float, Float64] | None":
             "max_divergence_rotation_deg": np.degrees(of.rotation),
         }
     if replay.open_loop is not None:
-        highs["max_velocity_difference"] = np.max(np.abs(replay.open_loop.difference), axis=1)
+        highs["max_velocity_difference"] = replay.open_loop.figures["largest"]
     return (-np.inf, np.fmax.accumulate(highs[metric])) if metric in highs else None
 
 
 def _flags(replay: "Replay") -> "dict[str, Bool]":
     """The states (T,) that a count counts."""
+    from splatctrl_cli.cli.replay_store import RUNGS
     from splatctrl_cli.control.ladder import Rung
 
     exact = replay.audit.clearance["exact"].distance
@@ -168,54 +166,50 @@ def _flags(replay: "Replay") -> "dict[str, Bool]":
         "num_in_collision": exact < 0,
         "num_without_distance": _is_blank(replay),
     }
-    if replay.steps:
+    if replay.kept_steps is not None:
+        of_steps = replay.kept_steps.figures
         for rung in (Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD):
-            name = "num_" + rung.value.replace("-", "_")
-            flags[name] = np.array([step is not None and step.rung is rung for step in replay.steps])
-        flags["num_scaled_back"] = np.array([step is not None and step.scale < 1 for step in replay.steps])
+            flags["num_" + rung.value.replace("-", "_")] = of_steps["rung"] == RUNGS.index(rung)
+        flags["num_scaled_back"] = of_steps["scale"] < 1
     if replay.open_loop is not None:
-        flags["num_barrier_broken_logged"] = np.array(
-            [m is not None and m.barrier < 0 for m in replay.open_loop.margins]
-        )
+        flags["num_barrier_broken_logged"] = replay.open_loop.figures["barrier"] < 0
     return flags
 
 
-def _step_metrics(replay: "Replay") -> Metrics:
+def _step_metrics(replay: "Replay", figures: "Figures") -> Metrics:
+    from splatctrl_cli.cli.replay_store import RUNGS
     from splatctrl_cli.control.explain import first_intervention
-    from splatctrl_cli.control.open_loop import is_shaped
+    from splatctrl_cli.control.ladder import Rung
     from splatctrl_cli.control.step import RowKind
 
-    asked = [step for step in replay.steps if step is not None]
-    first, flags = first_intervention(replay.events), _flags(replay)
-    is_solved = [step.rung == "solved" for step in asked]
+    first, rung = first_intervention(replay.events), figures["rung"]
     return {
-        "intervention_share": _share(is_shaped(step) for step in asked),
-        **{f"intervention_share_{kind}": _share(is_shaped(step, kind) for step in asked) for kind in RowKind},
+        "intervention_share": _mean(figures["shaped"]),
+        **{f"intervention_share_{kind}": _mean(figures[f"shaped {kind}"]) for kind in RowKind},
         "first_intervention_s": None if first is None else first.start_s,
-        "min_barrier_clearance": min((step.clearance for step in asked), default=None),
-        "num_solved": sum(is_solved),
-        "num_relaxed": int(flags["num_relaxed"].sum()),
-        "num_minimum_violation": int(flags["num_minimum_violation"].sum()),
-        "num_hold": int(flags["num_hold"].sum()),
-        "num_refused": sum(step.num_refused for step in asked),
-        "num_scaled_back": int(flags["num_scaled_back"].sum()),
-        "max_residual": _largest(np.array([step.residual for step in asked])),
+        "min_barrier_clearance": _least(figures["clearance"]),
+        "num_solved": int(np.sum(rung == RUNGS.index(Rung.SOLVED))),
+        "num_relaxed": int(np.sum(rung == RUNGS.index(Rung.RELAXED))),
+        "num_minimum_violation": int(np.sum(rung == RUNGS.index(Rung.MINIMUM_VIOLATION))),
+        "num_hold": int(np.sum(rung == RUNGS.index(Rung.HOLD))),
+        "num_refused": int(np.nansum(figures["refused"])),
+        "num_scaled_back": int(np.sum(figures["scale"] < 1)),
+        "max_residual": _largest(figures["residual"]),
     }
 
 
 def _open_loop_metrics(replay: "Replay") -> Metrics:
-    trace = replay.open_loop
-    assert trace is not None
-    size = np.linalg.norm(trace.difference, axis=1)
+    assert replay.open_loop is not None
+    figures = replay.open_loop.figures
+    size = figures["size"]
     size = size[np.isfinite(size)]
-    margins = [margin for margin in trace.margins if margin is not None]
     return {
         "mean_velocity_difference": float(np.mean(size)) if len(size) else None,
         "p95_velocity_difference": float(np.percentile(size, 95)) if len(size) else None,
-        "max_velocity_difference": _largest(np.max(np.abs(trace.difference), axis=1)),
-        "min_barrier_margin_logged": min((margin.barrier for margin in margins), default=None),
-        "num_barrier_broken_logged": sum(margin.barrier < 0 for margin in margins),
-        "min_velocity_margin_logged": min((margin.limit for margin in margins), default=None),
+        "max_velocity_difference": _largest(figures["largest"]),
+        "min_barrier_margin_logged": _least(figures["barrier"]),
+        "num_barrier_broken_logged": int(np.sum(figures["barrier"] < 0)),
+        "min_velocity_margin_logged": _least(figures["limit"]),
     }
 
 
@@ -242,17 +236,23 @@ def _closed_loop_metrics(replay: "Replay") -> Metrics:
     }
 
 
-def _each(steps: "Sequence[ControlStep | None]", value: "Callable[[ControlStep], float]") -> "Float64":
-    return np.array([np.nan if step is None else value(step) for step in steps])
-
-
 def _is_blank(replay: "Replay") -> "Bool":
-    return np.asarray(np.any([np.isnan(of.distance) for of in replay.audit.clearance.values()], axis=0))
+    blank = np.zeros(len(replay.audit.stamp_ns), dtype=np.bool_)
+    for of in replay.audit.clearance.values():
+        blank |= np.isnan(of.distance)
+    return blank
 
 
-def _share(facts: Iterable[bool]) -> float | None:
-    listed = list(facts)
-    return float(np.mean(listed)) if listed else None
+def _mean(values: "Float64") -> float | None:
+    """Over the states that have a value."""
+    there = values[~np.isnan(values)]
+    return float(np.mean(there)) if len(there) else None
+
+
+def _least(values: "Float64") -> float | None:
+    """Over the states that have a value."""
+    there = values[~np.isnan(values)]
+    return float(np.min(there)) if len(there) else None
 
 
 def _largest(values: "Float64") -> float | None:

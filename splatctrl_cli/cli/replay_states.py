@@ -1,7 +1,7 @@
 """What ``splatctrl replay`` reads of a log: the robot's states, and whether they fit the robot and the cameras."""
 
 import argparse
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.source_options import source_options
@@ -10,13 +10,11 @@ from splatctrl_cli.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
-
     from splatctrl_cli.io.state_check import PoseAgreement
+    from splatctrl_cli.io.state_columns import StateColumns
     from splatctrl_cli.io.state_motion import ImageMotion
     from splatctrl_cli.io.state_offset import ClockOffset
-    from splatctrl_cli.records import JointState, RecordSource
+    from splatctrl_cli.records import RecordSource
     from splatctrl_cli.robot.model import RobotModel
 
 MAX_NOTES = 10  # printed
@@ -31,7 +29,7 @@ class LoggedStates:
     """
 
     source: "RecordSource"
-    states: "tuple[JointState, ...]"
+    states: "StateColumns"
     poses: "PoseAgreement | None"
     clock: "ClockOffset | None"
 
@@ -56,9 +54,10 @@ class LoggedStates:
 
 def read_states(args: argparse.Namespace, model: "RobotModel") -> LoggedStates:
     """The states of the robot's joints in a log. Raises InputError where there are none, or none that can be its."""
-    from splatctrl_cli.io.state_check import check_angles, pose_agreement
+    from splatctrl_cli.io.state_check import check_angles, check_states, pose_agreement
+    from splatctrl_cli.io.state_columns import StateCollector
     from splatctrl_cli.io.state_motion import ImageMotion
-    from splatctrl_cli.io.state_source import open_states
+    from splatctrl_cli.io.state_source import StateSource, open_states
     from splatctrl_cli.records import JointState, RgbdFrame
 
     source = open_states(args.log, source_options(args), model.joint_names)
@@ -67,34 +66,27 @@ def read_states(args: argparse.Namespace, model: "RobotModel") -> LoggedStates:
             f"{args.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
         )
     order = model.joint_order(source.joint_names)
-    states, motion = [], ImageMotion()
-    for record in source.records():
+    collector, motion = StateCollector(len(source.joint_names)), ImageMotion()
+    for record in () if isinstance(source, StateSource) else source.records():
         if isinstance(record, JointState):
-            states.append(_ordered(record, order))
+            collector.add(record)
         elif isinstance(record, RgbdFrame):
             motion.add(record)
+    logged = source.states if isinstance(source, StateSource) else collector.columns()
+    states = logged.of_joints(order)
+    check_states(states, model.joint_names)
     check_angles(model, states, source.name)
-    clock = _clock(model, states, motion) if motion.cameras and source.has_clock and states else None
-    return LoggedStates(source=source, states=tuple(states), poses=pose_agreement(model, states), clock=clock)
+    clock = _clock(model, states, motion) if motion.cameras and source.has_clock and len(states) else None
+    return LoggedStates(source=source, states=states, poses=pose_agreement(model, states), clock=clock)
 
 
-def _ordered(state: "JointState", order: "NDArray[np.int64]") -> "JointState":
-    commanded = state.commanded_velocity
-    return replace(
-        state,
-        position=state.position[order],
-        velocity=state.velocity[order],
-        commanded_velocity=None if commanded is None else commanded[order],
-    )
+def _clock(model: "RobotModel", states: "StateColumns", motion: "ImageMotion") -> "ClockOffset":
+    """Of the states that an offset can bring to a frame."""
+    from splatctrl_cli.io.state_offset import RobotPoints, estimate_clock_offset, near_frames
 
-
-def _clock(model: "RobotModel", states: "list[JointState]", motion: "ImageMotion") -> "ClockOffset":
-    import numpy as np
-
-    from splatctrl_cli.io.state_offset import RobotPoints, estimate_clock_offset
-
-    centers = model.sphere_centers_batch(np.array([state.position for state in states]))
+    near = near_frames(states.stamp_ns, motion)
+    centers = model.sphere_centers_batch(states.position[near])
     moving = model.moving_spheres
     return estimate_clock_offset(
-        states, motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
+        states[near], motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
     )

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.control.audit import Stamps
     from splatctrl_cli.control.step import ControlStep
     from splatctrl_cli.control.twists import TwistTrack
-    from splatctrl_cli.records import Float64
+    from splatctrl_cli.records import FloatRows
     from splatctrl_cli.robot.model import RobotModel
 
 WORLD = "world"
@@ -82,7 +82,7 @@ def twist_figures(
     frame: str,
     track: "TwistTrack | None",
     stamp_ns: "Stamps",
-    position: "Float64",
+    position: "FloatRows",
     steps: "Sequence[ControlStep | None]",
 ) -> Mapping[str, float | None]:
     """`FIGURES` of a controller's T steps: the share of states where a twist holds, the share of these where it was

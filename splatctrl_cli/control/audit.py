@@ -96,6 +96,21 @@ def audit(
 ) -> AuditTrace:
     """The clearances of every logged state, each by the distances that were known at its stamp."""
     stamps, positions = checked_states(model, states)
+    return audited(model, stamps, positions, distances_at, observed=observed)
+
+
+def audited(
+    model: ArmModel,
+    stamps: Stamps,
+    positions: Float64,
+    distances_at: DistancesAt,
+    *,
+    observed: Observed | None = None,
+) -> AuditTrace:
+    """`audit` of stamps (T,) [ns] that do not go back and finite positions (T, J); T >= 1.
+
+    Of states of the same scene, the audit of some is that part of the audit of all, to the bit.
+    """
     parts: dict[str, list[Clearance]] = {}
     self_parts, unknown_parts = [], []
     for first, last in _runs(stamps, distances_at):

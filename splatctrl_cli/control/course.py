@@ -7,16 +7,18 @@ import numpy as np
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.target import Guide
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, FloatRows
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoggedMotion:
-    """T logged states by time: stamp_ns (T,) that never go back, position and velocity (T, J) [rad, rad/s]."""
+    """T logged states by time: stamp_ns (T,) that never go back, position and velocity (T, J) [rad, rad/s], which may
+    be read from a file.
+    """
 
     stamp_ns: Stamps
-    position: Float64
-    velocity: Float64
+    position: FloatRows
+    velocity: FloatRows
 
     @property
     def last_ns(self) -> int:
@@ -28,10 +30,10 @@ class LoggedMotion:
         after all.
         """
         if stamp_ns > self.last_ns:
-            return self.position[-1], np.zeros(self.position.shape[1])
+            return np.asarray(self.position[-1]), np.zeros(self.position.shape[1])
         after = int(np.searchsorted(self.stamp_ns, stamp_ns, side="left"))
         if after == 0 or self.stamp_ns[after] == stamp_ns:
-            return self.position[after], self.velocity[after]
+            return np.asarray(self.position[after]), np.asarray(self.velocity[after])
         before_ns, after_ns = self.stamp_ns[after - 1 : after + 1]
         share = float(stamp_ns - before_ns) / float(after_ns - before_ns)
         position, velocity = (

@@ -98,6 +98,12 @@ class Signal:
     is_high_worse: bool = True
     source: str = ""
 
+    def names_over(self, first: int, end: int) -> Iterable[str]:
+        """The names at these states, in the order they come up."""
+        if isinstance(self.names_at, _OneEach):
+            return self.names_at.over(first, end)
+        return (name for i in range(first, end) for name in self.names_at(i))
+
 
 def runs_of(is_on: Bool) -> list[tuple[int, int]]:
     """First and one past the last index of every run of true values (T,)."""
@@ -107,8 +113,120 @@ def runs_of(is_on: Bool) -> list[tuple[int, int]]:
 
 def events_of(stamp_ns: Stamps, signals: Iterable[Signal]) -> tuple[Event, ...]:
     """The intervals of all signals (T,), by their start."""
-    events = [_event(stamp_ns, signal, first, end) for signal in signals for first, end in runs_of(signal.is_on)]
-    return tuple(sorted(events, key=lambda event: (event.first_ns, -event.last_ns)))
+    fold = EventFold()
+    fold.add(stamp_ns, signals)
+    return fold.events()
+
+
+Near = Callable[[EventKind, str, int], Obstacle | None]
+"""Kind of an event, name of its worst and at which of the states -> what is nearest there."""
+
+
+@dataclass(kw_only=True)
+class _Run:
+    """An interval as far as it is known; state: of the worst, counted from the first block on."""
+
+    order: int
+    kind: EventKind
+    source: str
+    first_ns: int
+    last_ns: int
+    num_states: int
+    worst: float
+    state: int
+    worst_ns: int
+    worst_name: str
+    names: dict[str, None]
+    obstacle: Obstacle | None
+
+
+class EventFold:
+    """The intervals of signals that come in blocks of states; one that crosses a border is one interval."""
+
+    def __init__(self) -> None:
+        self._num, self._start_ns = 0, 0
+        self._open: dict[int, _Run] = {}
+        self._closed: list[_Run] = []
+
+    def add(self, stamp_ns: Stamps, signals: Iterable[Signal], near: Near | None = None) -> None:
+        """The next block's stamps (T,) and signals (T,), the same kinds in the same order every time.
+
+        near: asked for the obstacle of every worst value in this block.
+        """
+        if not self._num:
+            self._start_ns = int(stamp_ns[0])
+        for order, signal in enumerate(signals):
+            before = self._open.pop(order, None)
+            runs = runs_of(signal.is_on)
+            if before is not None and not (runs and runs[0][0] == 0):
+                self._closed.append(before)
+                before = None
+            for first, end in runs:
+                run = before or _begun(order, signal, int(stamp_ns[first]))
+                before = None
+                self._grown(run, stamp_ns, signal, first, end, near)
+                if end == len(stamp_ns):
+                    self._open[order] = run
+                else:
+                    self._closed.append(run)
+        self._num += len(stamp_ns)
+
+    def events(self) -> tuple[Event, ...]:
+        """All intervals so far, by their start; one that is not over ends with the last state."""
+        runs = [*self._closed, *self._open.values()]
+        return tuple(self._event(run) for run in sorted(runs, key=lambda r: (r.first_ns, -r.last_ns, r.order)))
+
+    def _grown(self, run: _Run, stamp_ns: Stamps, signal: Signal, first: int, end: int, near: Near | None) -> None:
+        """The run, with states `first` up to `end` of a block."""
+        values = signal.value[first:end]
+        at = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
+        worst = float(signal.value[at])
+        run.last_ns = int(stamp_ns[end - 1])
+        run.num_states += end - first
+        run.names |= dict.fromkeys(signal.names_over(first, end))
+        if run.state < 0 or (worst > run.worst if signal.is_high_worse else worst < run.worst):
+            run.worst, run.state, run.worst_ns = worst, self._num + at, int(stamp_ns[at])
+            run.worst_name = next(iter(signal.names_at(at)), "")
+            run.obstacle = None if near is None else near(signal.kind, run.worst_name, at)
+
+    def _event(self, run: _Run) -> Event:
+        start_s, end_s, worst_s = (
+            float(stamp - self._start_ns) * 1e-9 for stamp in (run.first_ns, run.last_ns, run.worst_ns)
+        )
+        names = tuple(run.names)
+        return Event(
+            kind=run.kind,
+            source=run.source,
+            first_ns=run.first_ns,
+            last_ns=run.last_ns,
+            start_s=start_s,
+            end_s=end_s,
+            num_states=run.num_states,
+            worst=run.worst,
+            worst_s=worst_s,
+            state=run.state,
+            worst_name=run.worst_name,
+            names=names[:MAX_NAMES],
+            num_names=len(names),
+            obstacle=run.obstacle,
+        )
+
+
+def _begun(order: int, signal: Signal, first_ns: int) -> _Run:
+    return _Run(
+        order=order,
+        kind=signal.kind,
+        source=signal.source,
+        first_ns=first_ns,
+        last_ns=first_ns,
+        num_states=0,
+        worst=-np.inf if signal.is_high_worse else np.inf,
+        state=-1,
+        worst_ns=first_ns,
+        worst_name="",
+        names={},
+        obstacle=None,
+    )
 
 
 def audit_signals(audit: AuditTrace, margin: float, spheres: Sequence[str], joints: Sequence[str]) -> list[Signal]:
@@ -178,28 +296,6 @@ def first_intervention(events: Sequence[Event]) -> Event | None:
     return next((event for event in events if event.kind in INTERVENTIONS), None)
 
 
-def _event(stamp_ns: Stamps, signal: Signal, first: int, end: int) -> Event:
-    values = signal.value[first:end]
-    worst = first + int(np.argmax(values) if signal.is_high_worse else np.argmin(values))
-    names = tuple(dict.fromkeys(name for i in range(first, end) for name in signal.names_at(i)))
-    seconds = (stamp_ns - stamp_ns[0]) * 1e-9
-    return Event(
-        kind=signal.kind,
-        source=signal.source,
-        first_ns=int(stamp_ns[first]),
-        last_ns=int(stamp_ns[end - 1]),
-        start_s=float(seconds[first]),
-        end_s=float(seconds[end - 1]),
-        num_states=end - first,
-        worst=float(signal.value[worst]),
-        worst_s=float(seconds[worst]),
-        state=worst,
-        worst_name=next(iter(signal.names_at(worst)), ""),
-        names=names[:MAX_NAMES],
-        num_names=len(names),
-    )
-
-
 def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> Signal:
     def largest(step: ControlStep) -> float:
         return max((row.multiplier for row in step.interventions if row.kind is kind), default=0.0)
@@ -230,8 +326,24 @@ def _asked(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
     return step
 
 
+@dataclass(frozen=True, kw_only=True)
+class _OneEach:
+    """One of `names` at each state, by index (T,)."""
+
+    names: Sequence[str]
+    index: NDArray[np.int64]
+
+    def __call__(self, i: int) -> Sequence[str]:
+        return [self.names[int(self.index[i])]]
+
+    def over(self, first: int, end: int) -> Sequence[str]:
+        """Each name of these states once, in the order they come up."""
+        found, at = np.unique(self.index[first:end], return_index=True)
+        return [self.names[int(i)] for i in found[np.argsort(at)]]
+
+
 def _names_of(names: Sequence[str], index: NDArray[np.int64]) -> Callable[[int], Sequence[str]]:
-    return lambda i: [names[int(index[i])]]
+    return _OneEach(names=names, index=index)
 
 
 def _nobody(_: int) -> Sequence[str]:

@@ -90,7 +90,9 @@ def open_loop(
         commanded[index] = step.velocity
         steps.append(step)
         margins.append(controller.margin_of(q, v, distance_rate=rate))
-    return OpenLoopTrace(logged=motion.velocity, commanded=commanded, steps=tuple(steps), margins=tuple(margins))
+    return OpenLoopTrace(
+        logged=np.asarray(motion.velocity), commanded=commanded, steps=tuple(steps), margins=tuple(margins)
+    )
 
 
 def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:

@@ -1,8 +1,9 @@
 """Closed loop: the controller drives the arm from a logged start to a goal, in the scene as it was known."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.control.step import ControlStep, QpIkController
 from splatctrl_cli.control.target import Guide, pose_error
 from splatctrl_cli.control.twists import TwistTrack
-from splatctrl_cli.records import DistanceField, Float64
+from splatctrl_cli.records import DistanceField, Float64, FloatRows
 
 FieldAt = Callable[[int], DistanceField]
 
@@ -104,13 +105,55 @@ class ReplayTrace:
     """
 
     stamp_ns: Stamps
-    position: Float64
-    steps: tuple[ControlStep, ...]
+    position: FloatRows
+    steps: Sequence[ControlStep]
     outcome: Outcome
     static_violations: tuple[StaticViolation, ...]
     scene_changes: tuple[SceneChange, ...]
     anchored: tuple[int, ...] = ()
     num_reached: int = 0
+
+
+class StepRecord(Protocol):
+    """Where a closed loop leaves its T steps: stamps (T,), postures (T, J) and the steps."""
+
+    @property
+    def stamp_ns(self) -> Stamps: ...
+
+    @property
+    def position(self) -> FloatRows: ...
+
+    @property
+    def steps(self) -> Sequence[ControlStep]: ...
+
+    def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
+        """The next step."""
+        ...
+
+
+class InMemory:
+    """A `StepRecord` of lists."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._positions: list[Float64] = []
+        self.steps: list[ControlStep] = []
+
+    @property
+    def stamp_ns(self) -> Stamps:
+        """(T,) [ns]."""
+        return np.array(self._stamps, dtype=np.int64)
+
+    @property
+    def position(self) -> Float64:
+        """(T, J) [rad]."""
+        return np.array(self._positions)
+
+    def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
+        """The next step."""
+        self._stamps.append(stamp_ns)
+        self._positions.append(q)
+        self.steps.append(step)
 
 
 def closed_loop(
@@ -121,12 +164,13 @@ def closed_loop(
     *,
     scene_step_at: SceneStepAt | None = None,
     solver: QpSolver | None = None,
+    record: StepRecord | None = None,
 ) -> ReplayTrace:
     """Integrate the controller's velocities at `config.period` until the goal, a stall or `config.max_time`.
 
     field_at gives the field known at a stamp [ns], the same object for the same scene; scene_step_at the two newest
-    scenes, for `config.distance_rate`. Raises InputError for a start outside the limits or a goal out of reach,
-    NotEvaluableError for a start in collision or outside the field.
+    scenes, for `config.distance_rate`. record: where the steps are kept, None for memory. Raises InputError for a
+    start outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
     """
     check_config(config)
     q = checked_posture(model, task.start, what="start")
@@ -138,7 +182,8 @@ def closed_loop(
     check_free(model, field, q)
     statics = static_violations(model, field, q, scene_margin(model, config))
     course, last_velocity = _Course(model, config, task), np.zeros(len(q))
-    stamps, positions, steps, changes, anchored = [], [], [], [], []
+    kept: StepRecord = InMemory() if record is None else record
+    positions, changes, anchored = [], [], []
     outcome = Outcome.TIMEOUT if task.last_ns is None else Outcome.LOG_ENDED
     for index in range(course.num_steps):
         stamp = task.stamp_ns + round(index * config.period * 1e9)
@@ -152,9 +197,9 @@ def closed_loop(
         rate = rate_of(config, model, scene_step_at, stamp, q)
         goal, guide = course.goal(stamp, q)
         step = controller.step(q, goal, distance_rate=rate, guide=guide, last_velocity=last_velocity)
-        stamps.append(stamp)
-        positions.append(q)
-        steps.append(step)
+        kept.add(stamp, q, step)
+        if task.last_ns is None:
+            positions.append(q)
         if course.has_ended(stamp, index, step):
             outcome = Outcome.GOAL_REACHED
             break
@@ -163,9 +208,9 @@ def closed_loop(
             break
         q, last_velocity = q + config.period * step.velocity, step.velocity
     return ReplayTrace(
-        stamp_ns=np.array(stamps, dtype=np.int64),
-        position=np.array(positions),
-        steps=tuple(steps),
+        stamp_ns=kept.stamp_ns,
+        position=kept.position,
+        steps=kept.steps,
         outcome=outcome,
         static_violations=statics,
         scene_changes=tuple(changes),
@@ -228,7 +273,7 @@ class _Course:
 
 
 def divergence(
-    model: ArmModel, frame: str, stamp_ns: Stamps, position: Float64, motion: LoggedMotion
+    model: ArmModel, frame: str, stamp_ns: Stamps, position: FloatRows, motion: LoggedMotion
 ) -> tuple[Float64, Float64, Float64]:
     """How far T postures (T, J) are from those logged at the same stamps: joint norm [rad], and of the frame position
     [m] and rotation [rad], each (T,); NaN after the log's end.

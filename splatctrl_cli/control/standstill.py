@@ -164,7 +164,7 @@ def _fastest(motion: LoggedMotion, start_ns: int) -> float:
     """The fastest joint [rad/s] between any two states of the path from `start_ns` on."""
     seconds = np.diff(motion.stamp_ns) * 1e-9
     is_used = (seconds > 0) & (motion.stamp_ns[1:] > start_ns)
-    moved = np.abs(np.diff(motion.position, axis=0))[is_used]
+    moved = np.abs(np.diff(np.asarray(motion.position), axis=0))[is_used]
     return float(np.max(moved / seconds[is_used, None], initial=0.0))
 
 

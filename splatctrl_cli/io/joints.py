@@ -2,16 +2,21 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.state_columns import StateColumns
 from splatctrl_cli.io.state_topics import main_topic, state_topics, track_of_joints, track_of_topic
 from splatctrl_cli.io.state_track import cleaned
 from splatctrl_cli.io.survey import Survey
-from splatctrl_cli.records import JointState, LossReport
+from splatctrl_cli.records import LossReport
+
+_NOTHING = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0)), velocity=np.zeros((0, 0)))
 
 
 def joint_records(
     survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
-) -> tuple[tuple[str, ...], Sequence[JointState]]:
+) -> tuple[tuple[str, ...], StateColumns]:
     """Joint names and states by stamp; no names and no states where the log holds none.
 
     With `wanted` (a robot's joints), they are brought together from the topics that have them. Else the states are of
@@ -19,7 +24,7 @@ def joint_records(
     """
     topics = state_topics(survey, options, loss)
     if not topics:
-        return (), []
+        return (), _NOTHING
     raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
     states = cleaned(raw, loss)
-    return (raw.names, states) if states else ((), [])
+    return (raw.names, states) if len(states) else ((), _NOTHING)

@@ -5,7 +5,7 @@ import tempfile
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +97,14 @@ class Rows:
             return cast("Float64", self._read(number, number + 1)[0])
         index = which.astype(np.int64)
         return self._narrowed(self._file.take(index if self._index is None else self._index[index]))
+
+    def __iter__(self) -> Iterator[Float64]:
+        for first, last in ranges(len(self)):
+            yield from self[first:last]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Float64:
+        """All of them, for numpy's functions: in memory."""
+        return np.asarray(self[: len(self)], dtype=dtype)
 
     def select(self, index: Index) -> "Rows":
         """The rows of an index (K,), in its order."""

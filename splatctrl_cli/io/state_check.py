@@ -1,13 +1,16 @@
 """Whether logged joint states fit a robot: angles against its limits, end-effector poses against its kinematics."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.io.rows import blocks_of, ranges
+from splatctrl_cli.io.state_columns import StateColumns
 from splatctrl_cli.records import Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 
@@ -88,24 +91,50 @@ class PoseAgreement:
         )
 
 
+def check_states(states: StateColumns, joints: Sequence[str]) -> None:
+    """Raise InputError where there are no states (model order), a stamp goes back, or a position is not finite."""
+    stamps = states.stamp_ns
+    if not len(stamps):
+        raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
+    back = np.flatnonzero(np.diff(stamps) < 0)
+    if len(back):
+        index = int(back[0]) + 1
+        raise InputError(
+            f"joint state {index}: expected a stamp not before {stamps[index - 1]} ns, got {stamps[index]} ns",
+            remedy="sort the states by stamp",
+        )
+    for first, last in ranges(len(stamps)):
+        q = states.position[first:last]
+        if not np.isfinite(q).all():
+            index, joint = (int(i[0]) for i in np.nonzero(~np.isfinite(q)))
+            raise InputError(
+                f"joint state {first + index}: joint {joints[joint]} is {q[index, joint]}, expected a finite angle"
+            )
+
+
 def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> None:
     """Raise InputError where the positions (model order) are far beyond the limits and would fit as degrees."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
-    if not states or not limited.any():
+    if not len(states) or not limited.any():
         return
-    q = np.array([state.position for state in states])[:, limited]
     lower, upper = model.lower[limited], model.upper[limited]
-    beyond = np.abs(q) - np.maximum(np.maximum(np.abs(lower), np.abs(upper)), 2 * np.pi)
-    as_degrees = np.radians(q)
-    would_fit = ((as_degrees > lower - SLACK) & (as_degrees < upper + SLACK)).all(axis=1)
-    if (beyond.max(axis=1) > FAR).mean() < MANY or would_fit.mean() < 1 - (1 - MANY) / 5:
+    num_far = num_fit = 0
+    worst, at_worst = np.full(len(lower), -np.inf), np.zeros(len(lower))  # of each joint
+    for q in _positions(states):
+        beyond = np.abs(q[:, limited]) - np.maximum(np.maximum(np.abs(lower), np.abs(upper)), 2 * np.pi)
+        as_degrees = np.radians(q[:, limited])
+        num_far += int((beyond.max(axis=1) > FAR).sum())
+        num_fit += int(((as_degrees > lower - SLACK) & (as_degrees < upper + SLACK)).all(axis=1).sum())
+        for joint, row in enumerate(beyond.argmax(axis=0)):
+            if beyond[row, joint] > worst[joint]:
+                worst[joint], at_worst[joint] = beyond[row, joint], q[row, limited][joint]
+    if num_far / len(states) < MANY or num_fit / len(states) < 1 - (1 - MANY) / 5:
         return
-    joint = int(np.argmax(beyond.max(axis=0)))
+    joint = int(np.argmax(worst))
     names = [n for n, is_limited in zip(model.joint_names, limited, strict=True) if is_limited]
-    worst = float(q[np.argmax(beyond[:, joint]), joint])
     raise InputError(
         f"{name}: joint {names[joint]}: expected radians within [{lower[joint]:.3f}, {upper[joint]:.3f}], "
-        f"got {worst:.4g}, which would fit as degrees",
+        f"got {at_worst[joint]:.4g}, which would fit as degrees",
         remedy='convert them, or give the states as CSV or NPZ with unit = "deg" (docs/replay.md, Logs)',
     )
 
@@ -116,10 +145,10 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     Every link is tried. Poses that differ by a transform that does not change in a link's frame are a tool on it, by
     one that does not change in the world a wrong base; anything else grows with the motion, and is another robot.
     """
-    posed = [s for s in states if s.T_base_ee is not None or s.T_world_ee is not None]
-    if not posed:
+    posed = _posed(states)
+    if not len(posed):
         return None
-    chosen = [posed[i] for i in np.unique(np.linspace(0, len(posed) - 1, MAX_POSES).astype(int))]
+    chosen = [states[int(posed[i])] for i in np.unique(np.linspace(0, len(posed) - 1, MAX_POSES).astype(int))]
     logged = np.array([_world(model, state) for state in chosen])
     links = {
         link: np.array([model.frame_pose(state.position, link) for state in chosen]) for link in model.frame_names
@@ -141,6 +170,22 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
         moved = invert_transform(offset)
         return _agreement(PoseVerdict.BASE, base, len(chosen), _spread(links[base], logged), moved, rest)
     return _agreement(PoseVerdict.DISAGREE, tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+
+
+def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
+    """(T, J), a block at a time."""
+    if isinstance(states, StateColumns):
+        yield from blocks_of(states.position)
+    else:
+        yield np.array([state.position for state in states])
+
+
+def _posed(states: Sequence[JointState]) -> NDArray[np.int64]:
+    """The states that have an end-effector pose."""
+    if isinstance(states, StateColumns) and states.T_base_ee is None and states.T_world_ee is None:
+        return np.zeros(0, dtype=np.int64)
+    has_pose = (s.T_base_ee is not None or s.T_world_ee is not None for s in states)
+    return np.flatnonzero(np.fromiter(has_pose, dtype=np.bool_, count=len(states)))
 
 
 def _agreement(

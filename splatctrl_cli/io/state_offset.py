@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.io.state_motion import CameraMotion, ImageMotion, correlation, predicted_change, silhouettes
 from splatctrl_cli.records import Float64, JointState
@@ -20,6 +21,7 @@ MAX_CAMERAS = 2  # that are compared pixel by pixel, those in which most changes
 PIXEL_ERROR = 0.15  # of the time between frames: found on the simulated log, per camera (docs/replay.md)
 SUM_ERROR = 1.0  # likewise
 Score = Callable[[float], float]
+Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +94,14 @@ def estimate_clock_offset(
         return _peak(offsets, np.array(scores), num, MIN_PIXEL_CORRELATION, PIXEL_ERROR * interval)
     scores = [_sum_scores(seconds, position, camera, start, offsets) for camera in cameras]
     return _peak(offsets, np.array(scores), num, MIN_CORRELATION, SUM_ERROR * interval)
+
+
+def near_frames(stamp_ns: Stamps, motion: ImageMotion) -> slice:
+    """The states of stamps (T,) that rise which an offset within `MAX_OFFSET` can bring to a frame."""
+    seen = [camera for camera in motion.cameras.values() if camera.stamps_ns]
+    first = min(camera.stamps_ns[0] for camera in seen) - round(MAX_OFFSET * 1e9)
+    last = max(camera.stamps_ns[-1] for camera in seen) + round(MAX_OFFSET * 1e9)
+    return slice(int(np.searchsorted(stamp_ns, first)), int(np.searchsorted(stamp_ns, last, side="right")))
 
 
 def _near(
