@@ -4,6 +4,7 @@ import argparse
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import table
@@ -98,6 +99,15 @@ def document_of(comparison: Comparison) -> dict[str, Any]:
         for method, plan in comparison.plans.items()
     }
     return {"units": "m, rad, s, degrees where the name says so", "methods": by_method, "plans": plans}
+
+
+def draw_methods(folder: Path, comparison: Comparison, period: float, margin: float) -> None:
+    """Write methods.png, where there is more than the replay itself."""
+    from splatctrl_cli.evaluate.methods_picture import methods_picture
+
+    if comparison.figures:
+        barrier = {method: figures.barrier for method, figures in comparison.figures.items()}
+        methods_picture(folder / "methods.png", barrier, period, margin)
 
 
 def check_comparable(args: argparse.Namespace, baselines: Sequence[str]) -> None:

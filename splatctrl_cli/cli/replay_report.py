@@ -46,6 +46,7 @@ def write_replay(
     write_json(folder / "summary.json", summary_of(replay, metrics, coverage_words(replay.model, config.control)))
     with stopwatch.stage("picture"):
         draw_replay(folder, replay, seconds_of(replay))
+        replay_compare.draw_methods(folder, replay.comparison, replay.period, replay.margin)
     write_run(folder, command="replay", config=config.as_dict(), inputs=inputs, metrics=metrics, stopwatch=stopwatch)
 
 

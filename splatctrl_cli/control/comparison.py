@@ -39,7 +39,8 @@ class MotionFigures:
 
     has_arrived: at its end the frame is at the goal's pose; is_success: and no state is in collision by the
     controller's field, or where it has no distance. joint_path [rad], effector_path [m], effector_turn [degrees];
-    clearance [m]: the least of every distance over the states, by name; proved [m]: `proved_clearance`;
+    clearance [m]: the least of every distance over the states, by name; barrier (T,) [m]: the controller's at each;
+    proved [m]: `proved_clearance`;
     true_clearance [m] over the states, None without a truth; num_interventions: intervals, None where nothing could
     intervene. Distances that are missing are left out of the least ones, which are NaN where all are missing.
     """
@@ -51,6 +52,7 @@ class MotionFigures:
     effector_path: float
     effector_turn: float
     clearance: Mapping[str, float]
+    barrier: Float64
     proved: float
     true_clearance: float | None
     num_interventions: int | None
@@ -91,6 +93,7 @@ class Yardstick:
             effector_path=moved,
             effector_turn=turned,
             clearance={name: float(np.fmin.reduce(distance)) for name, distance in clearance.items()},
+            barrier=clearance["barrier"],
             proved=proved_clearance(self.model, motion, self.certified_at),
             true_clearance=None if self.truth is None else _true_clearance(self.model, motion, self.truth),
             num_interventions=None if motion.is_intervened is None else len(runs_of(motion.is_intervened)),

@@ -45,6 +45,7 @@ def test_every_method_has_every_figure_and_gates_can_name_them(
     assert metrics["log_num_interventions"] is None and metrics["closed_loop_num_interventions"] >= 0
     out = capsys.readouterr().out
     assert "Side by side, from the same state to the same goal:" in out
+    assert (desk.folder / "out" / "methods.png").is_file()
     document = json.loads((desk.folder / "out" / "methods.json").read_text())
     assert list(document["methods"]) == ["closed_loop", "log", "birrt", "birrt_ik"]
     waypoints = np.array(document["plans"]["birrt"]["waypoints"])
