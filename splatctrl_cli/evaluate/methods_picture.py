@@ -24,8 +24,8 @@ def methods_picture(path: Path, clearance: Mapping[str, Float64], period: float,
                 label = f"{name}, least {centimetres[at]:.1f} cm"
                 axes.plot(seconds[at], centimetres[at], "o", color=color, markersize=6, markeredgecolor="white")
                 axes.plot(seconds[-1], centimetres[-1], "|", color=color, markersize=14, markeredgewidth=2)
-            width = max(3.4 - 0.5 * number, 1.0)  # thinner on top, so that what is alike shows
-            axes.plot(seconds, centimetres, color=color, linewidth=width, label=label)
+            style = (0, (3, 2)) if number == len(clearance) - 1 else "-"  # what it covers shows between its dashes
+            axes.plot(seconds, centimetres, color=color, linewidth=2.0, linestyle=style, label=label)
         axes.axhline(
             100 * margin, color=INK, linewidth=1.0, linestyle=(0, (6, 3)), label=f"margin {100 * margin:g} cm"
         )
