@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
         with stopwatch.stage("truth"):
             replay = with_truth(inputs, replay)
         inputs.scene.finish()
-        metrics = metrics_of(replay)
+        metrics = metrics_of(replay) | logged.metrics()
         with stopwatch.stage("worst_frames"):
             unseen = draw_worst_frames(folder, inputs, replay, args.worst_frames)
         write_json(folder / "states.json", logged.as_dict())
@@ -174,10 +174,19 @@ def _verdict(
     if unknown is not None and unknown > args.max_unknown:
         raise NotEvaluableError(
             f"replay: {100 * unknown:.1f} % of the sphere centres lie in space no camera ever saw, "
-            f"allowed {100 * args.max_unknown:g} %",
+            f"allowed {100 * args.max_unknown:g} %, first more than that at {_first_unknown(args, replay):.3f} s",
             remedy="the figures above say nothing about that part; add a camera, or give a larger --max-unknown",
         )
     if golden is not None:
         check_golden(golden, replay, args.golden_tolerance)
     check_gates(args.require, metrics, first_time=lambda name, holds: first_time(replay, name, holds))
     return 3 if source.loss.damaged else 0
+
+
+def _first_unknown(args: argparse.Namespace, replay: "Replay") -> float:
+    """The first time [s] at which more of the sphere centres than is allowed lie in space never seen."""
+    import numpy as np
+
+    stamps = replay.audit.stamp_ns
+    first = int(np.argmax(replay.audit.unknown_share > args.max_unknown))
+    return float(stamps[first] - stamps[0]) * 1e-9

@@ -7,6 +7,7 @@ import numpy as np
 
 from splatctrl_cli.cli.replay_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
 from splatctrl_cli.cli.replay_compare import figure_names, figures_of
+from splatctrl_cli.cli.replay_states import LOG_FIGURES
 from splatctrl_cli.cli.replay_twists import FIGURES as TWIST_FIGURES
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def metric_names(
     names = [*_HEAD, *(f"min_clearance_{name}" for name in fields if name != "exact"), *_TAIL]
     names += [] if mode == "audit" else _STEPS
     names += {"audit": (), "open-loop": _OPEN_LOOP, "closed-loop": _CLOSED_LOOP}[mode]
+    names += LOG_FIGURES
     names += TWIST_FIGURES if has_twists else ()
     if STANDSTILL in baselines:
         names += [f"{motion}_{figure}" for motion in BESIDE for figure in FIGURES]

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from splatctrl_cli.robot.model import RobotModel
 
 MAX_NOTES = 10  # printed
+LOG_FIGURES = (
+    *("num_poses", "max_pose_position", "max_pose_rotation", "max_pose_rest_position", "max_pose_rest_rotation"),
+    *("clock_offset_s", "clock_uncertainty_s"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +47,20 @@ class LoggedStates:
             else asdict(self.poses) | {"offset": self.poses.offset.tolist()},
             "clock_offset": None if self.clock is None else asdict(self.clock),
         }
+
+    def metrics(self) -> "dict[str, float | None]":
+        """`LOG_FIGURES`: None where the log has no poses, or the offset cannot be told."""
+        poses, clock = self.poses, self.clock
+        values = (
+            0 if poses is None else poses.num_poses,
+            None if poses is None else poses.difference.max_position,
+            None if poses is None else poses.difference.max_rotation,
+            None if poses is None else poses.rest.max_position,
+            None if poses is None else poses.rest.max_rotation,
+            None if clock is None else clock.offset_s,
+            None if clock is None else clock.uncertainty_s,
+        )
+        return dict(zip(LOG_FIGURES, values, strict=True))
 
     def lines(self) -> list[str]:
         """A line for each thing that a person should know."""

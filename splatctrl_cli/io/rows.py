@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.records import Float64
 
-IN_MEMORY = 4 * 2**20  # [bytes] up to which a file is memory
+IN_MEMORY = 2**20  # [bytes] up to which a file is memory
 BLOCK = 4096  # rows at once
 FEW = 4096  # rows that are read beside those that were asked for
 

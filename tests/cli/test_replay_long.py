@@ -1,0 +1,78 @@
+"""Replays whose states come in blocks: the same to the bit, and events that cross a border are one."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.cli import replay_columns, replay_record, replay_store
+from splatctrl_cli.control.explain import EventFold, EventKind, Signal, events_of
+from splatctrl_cli.io import rows, state_columns
+from splatctrl_cli.records import JointState
+from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, splats_of, write_scene
+
+FILES = ("steps.csv", "events.json", "summary.json", "states.json")
+
+
+def in_blocks_of(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
+    for module in (replay_columns, replay_record, replay_store, rows, state_columns):
+        monkeypatch.setattr(module, "CHUNK" if module is replay_columns else "BLOCK", num)
+
+
+@pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
+def test_blocks_of_any_size_give_the_same_files(desk: Desk, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+    move = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    desk.source.states = [
+        JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move, num=24)
+    ]
+    near = ((0.45, 0.1, 0.6), 0.05)
+    scene = write_scene(
+        desk.folder / "scene",
+        (SECOND // 5, splats_of(BALL)),
+        (SECOND, splats_of(BALL, near)),
+        (SECOND * 2, splats_of(BALL)),
+    )
+    follow = ("--follow",) if mode == "closed-loop" else ()
+    for num in (1, 7, 10_000):
+        in_blocks_of(monkeypatch, num)
+        assert desk.replay("--scene", str(scene), "-q", "--mode", mode, *follow, out=str(num)) == 0
+    for file in FILES:
+        whole = (desk.folder / "10000" / file).read_bytes()
+        assert all((desk.folder / out / file).read_bytes() == whole for out in ("1", "7")), file
+
+
+def signals(values: Sequence[float], names: Sequence[str]) -> list[Signal]:
+    value = np.array(values)
+    low = Signal(
+        kind=EventKind.BELOW_MARGIN, is_on=value < 1, value=value, names_at=lambda i: [names[i]], is_high_worse=False
+    )
+    return [low, Signal(kind=EventKind.LIMIT, is_on=value > 2, value=value, names_at=lambda i: [names[i]])]
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 12])
+def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
+    values = [0.5, 0.2, 0.9, 0.2, 3.0, 4.0, 4.0, 1.5, 0.1, 5.0, 5.0, 0.3]
+    names = list("abacddefghij")
+    stamps = np.arange(12, dtype=np.int64) * 1_000_000
+    fold = EventFold()
+    for first in range(0, 12, size):
+        part = slice(first, first + size)
+        fold.add(stamps[part], signals(values[part], names[part]))
+    found = fold.events()
+    assert found == events_of(stamps, signals(values, names))
+    first = found[0]
+    assert (first.num_states, first.worst, first.state, first.worst_name) == (4, 0.2, 1, "b")
+    assert first.names == ("a", "b", "c") and [event.num_states for event in found] == [4, 3, 1, 2, 1]
+
+
+def test_the_first_time_in_unknown_space_is_named(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), is_seen=False)
+    assert desk.replay("--scene", str(scene), "-q") == 5
+    assert "allowed 5 %, first more than that at 0.000 s" in capsys.readouterr().err
+
+
+def test_a_gate_on_poses_that_the_log_lacks_fails(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", "--require", "max_pose_position<=0.01") == 1
+    assert "max_pose_position is unknown" in capsys.readouterr().err
+    assert desk.metrics()["num_poses"] == 0
