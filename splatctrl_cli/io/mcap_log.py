@@ -1,33 +1,46 @@
-"""MCAP read from front to back, with its checksums.
+"""The messages of an MCAP file, by its own records; what is damaged is left out and counted.
 
-The `mcap` package's indexed reader needs an intact summary: it raises on valid files without one and yields nothing
-from a truncated file. The stream reader needs none, so what precedes a cut is read.
+The `mcap` package's readers allocate what a record announces, and its indexed reader needs an intact summary: it
+raises on valid files without one and yields nothing from a truncated file.
 """
 
 import struct
+import zlib
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
-
-_UNREADABLE = (
-    McapError,
-    ValueError,
-    RuntimeError,
-    KeyError,
-    EOFError,
-    MemoryError,
-    struct.error,
-    zstandard.ZstdError,
+from splatctrl_cli.io.mcap_file import McapFile
+from splatctrl_cli.io.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    MESSAGE,
+    SCHEMA,
+    STATISTICS,
+    BadRecordError,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Message,
+    Schema,
+    Statistics,
+    parse_message,
+    parse_record,
 )
-_COMPRESSIONS = ("", "none", "zstd", "lz4")
+from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.io.unpacking import BadBlockError, unpacked, unpacked_start
+
+_HEAD = struct.Struct("<BQ")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogIndex:
+    """What a log says of itself without being read: messages by topic, log times [ns], chunks in file order."""
+
+    counts: dict[str, int]
+    first_ns: int
+    last_ns: int
+    chunks: tuple[ChunkIndex, ...]
 
 
 class McapLog:
@@ -38,79 +51,110 @@ class McapLog:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.files = (path,)
+        self._file = McapFile(path)
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Topic] = {}
-        self._read_summary()
+        self._statistics: Statistics | None = None
+        for part in self._file.summary():  # so that a damaged chunk hides no channel of others
+            if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
+                self._declare(part.opcode, part.content, Damage())
 
     def topics(self) -> tuple[Topic, ...]:
         """The channels of the summary section, and those met while reading."""
         return tuple(self._channels.values())
 
+    def index(self) -> LogIndex | None:
+        """What the summary says; None where it lacks a count of the messages, or channels or chunks it counts."""
+        found = self._statistics
+        if found is None or not found.channel_message_counts.keys() <= self._channels.keys():
+            return None
+        chunks = tuple(self._file.chunk_indexes())
+        if len(chunks) != found.chunk_count:
+            return None
+        counts: dict[str, int] = {}
+        for channel, count in found.channel_message_counts.items():
+            name = self._channels[channel].name
+            counts[name] = counts.get(name, 0) + count
+        return LogIndex(
+            counts=counts, first_ns=found.message_start_time, last_ns=found.message_end_time, chunks=chunks
+        )
+
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in file order; a chunk whose checksum differs is left out, a cut ends the file."""
-        for record in self._records(damage):
-            if isinstance(record, Schema):
-                self._schemas[record.id] = record
-            elif isinstance(record, Channel):
-                self._add_channel(record)
-            elif isinstance(record, Message):
-                topic = self._channels.get(record.channel_id)
-                if topic is None:
-                    damage.add(f"{self.path.name}: a message of undeclared channel {record.channel_id}")
-                elif names is None or topic.name in names:
-                    yield RawMessage(topic=topic, log_time_ns=record.log_time, data=record.data)
+        """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes."""
+        for part in self._file.parts(damage):
+            if part.opcode == CHUNK and part.content:
+                yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
+            elif part.opcode == MESSAGE and part.content:
+                yield from self._message(part.content, damage, names)
+            elif part.opcode in {SCHEMA, CHANNEL}:
+                self._declare(part.opcode, part.content, damage)
 
-    def _records(self, damage: Damage) -> Iterator[McapRecord]:
-        with self.path.open("rb") as stream:
-            reader = StreamReader(
-                stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.path.stat().st_size
-            )
-            records = iter(reader.records)
-            has_footer = False
-            while True:
-                offset = stream.tell()
-                try:
-                    record = next(records)
-                except StopIteration:
-                    return
-                except CRCValidationError:
-                    damage.add(f"{self.path.name}: checksum of the data section differs")
-                    return
-                except _UNREADABLE:
-                    where = "its closing mark is missing" if has_footer else f"cut or damaged after byte {offset}"
-                    damage.add(f"{self.path.name}: {where}")
-                    return
-                has_footer = has_footer or isinstance(record, Footer)
-                if isinstance(record, Chunk):
-                    yield from self._chunk_records(record, offset, damage)
-                else:
-                    yield record
+    def messages_of(
+        self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
+    ) -> Iterator[RawMessage]:
+        """Yield the messages of these chunks only, wherever in the file they lie."""
+        for index in chunks:
+            content = self._file.chunk_at(index)
+            yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
 
-    def _chunk_records(self, chunk: Chunk, offset: int, damage: Damage) -> list[McapRecord]:
-        if chunk.compression not in _COMPRESSIONS:
-            raise InputError(
-                f"{self.path}: chunk compression {chunk.compression!r} is unknown",
-                remedy="rewrite the file with zstd, lz4 or no compression",
-            )
+    def _chunk_messages(
+        self, content: bytes, offset: int, damage: Damage, names: Collection[str] | None, *, is_cut: bool
+    ) -> Iterator[RawMessage]:
+        records = self._records_in(content, offset, damage, is_cut=is_cut)
+        at, end = 0, len(records)
+        while at + _HEAD.size <= end:
+            opcode, length = _HEAD.unpack_from(records, at)
+            start, at = at + _HEAD.size, at + _HEAD.size + length
+            if at > end:
+                if not is_cut:
+                    damage.add(f"{self.path.name}: the chunk at byte {offset} holds a record that it does not end")
+                return
+            if opcode == MESSAGE:
+                yield from self._message(records[start:at], damage, names)
+            elif opcode in {SCHEMA, CHANNEL}:
+                self._declare(opcode, records[start:at], damage)
+
+    def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
+        """The records of a chunk, or of its start where the file ends in it; none where it is damaged."""
         try:
-            records: list[McapRecord] = breakup_chunk(chunk, validate_crc=True)
-        except _UNREADABLE as error:
-            reason = "checksum differs" if isinstance(error, CRCValidationError) else "cannot be decompressed"
-            damage.add(f"{self.path.name}: the chunk at byte {offset} was left out: {reason}")
-            return []
+            chunk = parse_record(CHUNK, content)
+            assert isinstance(chunk, Chunk)
+            if is_cut or len(chunk.records) < chunk.compressed_size:
+                return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
+            records = unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
+            if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
+                raise BadBlockError("checksum differs")
+        except (BadRecordError, BadBlockError) as error:
+            if not is_cut:  # the cut has been counted
+                damage.add(f"{self.path.name}: the chunk at byte {offset} was left out: {error}")
+            return b""
         return records
 
-    def _read_summary(self) -> None:
-        """Take schemas and channels from the summary, so that a damaged chunk hides no channel of others."""
+    def _message(self, content: bytes, damage: Damage, names: Collection[str] | None) -> Iterator[RawMessage]:
         try:
-            with self.path.open("rb") as stream:
-                summary = SeekingReader(stream).get_summary()
-        except _UNREADABLE:
+            message: Message = parse_message(content)
+        except BadRecordError as error:
+            damage.add(f"{self.path.name}: {error}")
             return
-        if summary is not None:
-            self._schemas.update(summary.schemas)
-            for channel in summary.channels.values():
-                self._add_channel(channel)
+        topic = self._channels.get(message.channel_id)
+        if topic is None:
+            damage.add(f"{self.path.name}: a message of undeclared channel {message.channel_id}")
+        elif names is None or topic.name in names:
+            yield RawMessage(topic=topic, log_time_ns=message.log_time, data=message.data)
+
+    def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
+        """Take a schema, a channel or the statistics."""
+        try:
+            record = parse_record(opcode, content)
+        except BadRecordError as error:
+            damage.add(f"{self.path.name}: a schema or channel was left out: {error}")
+            return
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._add_channel(record)
+        elif isinstance(record, Statistics):
+            self._statistics = record
 
     def _add_channel(self, channel: Channel) -> None:
         schema = self._schemas.get(channel.schema_id)

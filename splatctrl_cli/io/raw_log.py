@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+MAX_NOTES = 100  # a long log can be damaged in a million places
+
 
 @dataclass(frozen=True, kw_only=True)
 class Topic:
@@ -39,9 +41,12 @@ class Damage:
     notes: list[str] = field(default_factory=list)
 
     def add(self, note: str) -> None:
-        """Count one damaged part and say which."""
+        """Count one damaged part and say which; of more than MAX_NOTES, the last note says how many more."""
         self.count += 1
-        self.notes.append(note)
+        if self.count <= MAX_NOTES:
+            self.notes.append(note)
+        else:
+            self.notes[MAX_NOTES:] = [f"and {self.count - MAX_NOTES} more"]
 
 
 class RawLog(Protocol):

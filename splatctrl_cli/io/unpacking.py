@@ -1,0 +1,71 @@
+"""Decompression that gives no more bytes than were announced, and never more than a fixed bound at once."""
+
+import bz2
+
+import lz4.frame
+import zstandard
+
+MAX_BLOCK = 128 << 20  # bytes; of one chunk or record, as stored and as unpacked
+_MAX_WINDOW = 1 << 27  # bytes a zstd frame may refer back to: what its own command line accepts
+_PLAIN = ("", "none")
+_FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError)
+
+
+class BadBlockError(ValueError):
+    """A block that was left out, and why."""
+
+
+def unpacked(data: bytes, compression: str, size: int) -> bytes:
+    """The `size` bytes that `data` holds.
+
+    Raises BadBlockError where it is compressed in an unknown way, announces more than MAX_BLOCK, does not decompress,
+    or holds another number of bytes than announced (never more than announced are made).
+    """
+    if size > MAX_BLOCK:
+        raise BadBlockError(f"announces {size} bytes unpacked, at most {MAX_BLOCK} are read")
+    content = _unpacked_up_to(data, compression, size + 1)
+    if len(content) != size:
+        raise BadBlockError(
+            f"announces {size} bytes unpacked, holds {'more' if len(content) > size else len(content)}"
+        )
+    return content
+
+
+def unpacked_start(data: bytes, compression: str, size: int) -> bytes:
+    """What the start of a block, cut somewhere, holds: at most `size` bytes and MAX_BLOCK, perhaps none."""
+    try:
+        return _unpacked_up_to(data, compression, min(size, MAX_BLOCK))
+    except BadBlockError:
+        return b""
+
+
+def _unpacked_up_to(data: bytes, compression: str, most: int) -> bytes:
+    if compression in _PLAIN:
+        return data[:most]
+    try:
+        match compression:
+            case "zstd":
+                return _of_zstd(data, most)
+            case "lz4":
+                return _of_lz4(data, most)
+            case "bz2":
+                return bz2.BZ2Decompressor().decompress(data, max_length=most)
+    except _FAILURES:
+        raise BadBlockError("cannot be decompressed") from None
+    raise BadBlockError(f"compression {compression!r} is unknown; expected zstd, lz4 or bz2")
+
+
+def _of_zstd(data: bytes, most: int) -> bytes:
+    decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+    with decompressor.stream_reader(data, read_across_frames=True) as stream:
+        return stream.read(most)
+
+
+def _of_lz4(data: bytes, most: int) -> bytes:
+    parts, length = [], 0
+    while data and length < most:
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        parts.append(decompressor.decompress(data, max_length=most - length))
+        length += len(parts[-1])
+        data = decompressor.unused_data or b""
+    return parts[0] if len(parts) == 1 else b"".join(parts)
