@@ -1,10 +1,9 @@
 """`python -m benchmarks.long_log FOLDER SECONDS`: a moving arm logged at 1 kHz, and what a replay of it takes."""
 
 import argparse
-import os
 import subprocess
 import sys
-import time
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,13 @@ from mcap.writer import CompressionType, Writer
 from numpy.lib.format import write_array_header_1_0
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.measure import SAMPLE
-from splatctrl_cli.records import Float64
+from benchmarks.measure import SAMPLE, Limit, Options, Result
+from benchmarks.scenes import sample_fitter, sample_robot
+from splatctrl_cli.config import Config
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.records import Box, Float64
 
 RATE = 1000  # states per second
 FORMS = ("npz", "csv", "mcap")
@@ -55,14 +59,20 @@ def write_log(folder: Path, seconds: float, form: str = "npz", *, with_velocity:
     return write(folder / f"long_{num}.{form}", num, with_velocity)
 
 
+_WAIT = """
+import resource, subprocess, sys, time
+start = time.perf_counter()
+code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, code)
+"""
+
+
 def measured(command: Sequence[str]) -> Spent:
-    """Run a command and wait for it."""
-    start = time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    kilobytes = usage.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
-    return Spent(seconds=time.perf_counter() - start, megabytes=kilobytes / 1024, code=process.returncode)
+    """Run a command and wait for it, from a small process: a child's largest memory begins with its parent's."""
+    answer = subprocess.run([sys.executable, "-c", _WAIT, *command], capture_output=True, text=True, check=True)
+    seconds, memory, code = answer.stdout.split()[-3:]
+    per_megabyte = 2**20 if sys.platform == "darwin" else 2**10
+    return Spent(seconds=float(seconds), megabytes=float(memory) / per_megabyte, code=int(code))
 
 
 def replay_command(log: Path, scene: Sequence[str], out: Path, *more: str) -> list[str]:
@@ -70,6 +80,40 @@ def replay_command(log: Path, scene: Sequence[str], out: Path, *more: str) -> li
     robot = ["--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml")]
     call = [sys.executable, "-m", "splatctrl_cli", "replay", str(log), *robot, *scene]
     return [*call, "-o", str(out), "--force", "-q", "--max-unknown", "1", *more]
+
+
+def run(options: Options) -> Result:
+    """The audit of a log at 1 kHz against a baked grid, as a process: states per second, and memory per state."""
+    lengths = (10.0, 60.0) if options.is_quick else (20.0, 120.0)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        field = _baked(folder / "field.npz")
+        spent = []
+        for seconds in lengths:
+            log = write_log(folder, seconds)
+            spent.append(measured(replay_command(log, ("--field", str(field)), folder / "out")))
+    num = round(RATE * (lengths[1] - lengths[0]))
+    rate = num / (spent[1].seconds - spent[0].seconds)
+    slope = 1e6 * (spent[1].megabytes - spent[0].megabytes) / num
+    return Result(
+        title="long log: replay --mode audit of a log at 1 kHz",
+        columns=("log [s]", "time [s]", "largest memory [MB]"),
+        rows=[[f"{s:g}", f"{of.seconds:.1f}", f"{of.megabytes:.0f}"] for s, of in zip(lengths, spent, strict=True)],
+        figures={"states_per_s": rate, "mb_per_million_states": slope},
+        limits=[
+            Limit(figure="states_per_s", bound=5_000.0, is_least=True),
+            Limit(figure="mb_per_million_states", bound=300.0),
+        ],
+    )
+
+
+def _baked(file: Path) -> Path:
+    """The sample log's map, baked over the arm's reach."""
+    model, fitter = sample_robot(), sample_fitter()
+    reach = model.reach()
+    box = Box(lower=model.base_position - reach, upper=model.base_position + reach)
+    write_npz(file, bake(field_splats(fitter.splats()), box, Config().field, occupancy=fitter.occupancy.grid()))
+    return file
 
 
 def _write_npz(path: Path, num: int, with_velocity: bool) -> Path:
