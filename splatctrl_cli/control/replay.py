@@ -21,6 +21,7 @@ from splatctrl_cli.control.checks import (
     static_violations,
 )
 from splatctrl_cli.control.course import LoggedMotion
+from splatctrl_cli.control.detour import Detour, PlanDetour
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.rates import SceneStepAt, rate_of
@@ -101,7 +102,8 @@ class SceneChange:
 class ReplayTrace:
     """T steps: stamp_ns (T,), position (T, J) [rad] at which each step was taken, and the steps themselves.
 
-    anchored: indices of the steps before which the arm was put back into the logged posture; num_reached: goals.
+    anchored: indices of the steps before which the arm was put back into the logged posture; num_reached: goals;
+    detours: indices of the steps after which a planned way out of a local minimum was taken.
     """
 
     stamp_ns: Stamps
@@ -112,6 +114,7 @@ class ReplayTrace:
     scene_changes: tuple[SceneChange, ...]
     anchored: tuple[int, ...] = ()
     num_reached: int = 0
+    detours: tuple[int, ...] = ()
 
 
 class StepRecord(Protocol):
@@ -164,13 +167,15 @@ def closed_loop(
     *,
     scene_step_at: SceneStepAt | None = None,
     solver: QpSolver | None = None,
+    plan_detour: PlanDetour | None = None,
     record: StepRecord | None = None,
 ) -> ReplayTrace:
     """Integrate the controller's velocities at `config.period` until the goal, a stall or `config.max_time`.
 
     field_at gives the field known at a stamp [ns], the same object for the same scene; scene_step_at the two newest
-    scenes, for `config.distance_rate`. record: where the steps are kept, None for memory. Raises InputError for a
-    start outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
+    scenes, for `config.distance_rate`. At a stall plan_detour is asked for a way out, `config.max_detours` times.
+    record: where the steps are kept, None for memory. Raises InputError for a start outside the limits or a goal out
+    of reach, NotEvaluableError for a start in collision or outside the field.
     """
     check_config(config)
     q = checked_posture(model, task.start, what="start")
@@ -204,8 +209,11 @@ def closed_loop(
             outcome = Outcome.GOAL_REACHED
             break
         if task.last_ns is None and _has_stalled(positions[course.since :], config):
-            outcome = Outcome.STALLED
-            break
+            detour = None if plan_detour is None or not course.may_detour else plan_detour(stamp, q, course.pose)
+            if detour is None:
+                outcome = Outcome.STALLED
+                break
+            course.leave(index, detour)
         q, last_velocity = q + config.period * step.velocity, step.velocity
     return ReplayTrace(
         stamp_ns=kept.stamp_ns,
@@ -216,6 +224,7 @@ def closed_loop(
         scene_changes=tuple(changes),
         anchored=tuple(anchored),
         num_reached=course.num_reached,
+        detours=tuple(course.detours),
     )
 
 
@@ -226,7 +235,9 @@ class _Course:
         self._model, self._config, self._task = model, config, task
         self._waypoints = (*task.via, Waypoint(T_world_goal=task.T_world_goal, posture=None))
         self.num_reached = 0
-        self.since = 0  # the step from which a stall counts: the last anchor or waypoint
+        self.since = 0  # the step from which a stall counts: the last anchor, waypoint or detour
+        self.detours: list[int] = []
+        self._detour: Detour | None = None
         last_ns = task.last_ns
         left = config.max_time if last_ns is None else (last_ns - task.stamp_ns) * 1e-9 + config.period
         self.num_steps = max(round(left / config.period), 1)
@@ -248,9 +259,27 @@ class _Course:
         assert self._task.anchors is not None
         return self._task.anchors.at(stamp_ns)
 
+    @property
+    def may_detour(self) -> bool:
+        """Whether another planned way may be taken."""
+        return len(self.detours) < self._config.max_detours
+
+    @property
+    def pose(self) -> Float64:
+        """The pose (4, 4) of the next waypoint."""
+        return self._waypoints[self.num_reached].T_world_goal
+
+    def leave(self, index: int, detour: Detour) -> None:
+        """Go on to the next waypoint along a way that begins here."""
+        self._detour = detour
+        self.detours.append(index)
+        self.since = index
+
     def goal(self, stamp_ns: int, q: Float64) -> tuple[Float64, Guide | None]:
         """The goal's pose at a stamp and posture (J,), and how it moves."""
         task = self._task
+        if self._detour is not None:
+            return self._detour.goal(self._model, task.frame)
         if task.twists is not None:
             return task.twists.goal_at(self._model, self._config, task.frame, q, stamp_ns)
         if task.follow is not None:
@@ -263,6 +292,10 @@ class _Course:
 
     def has_ended(self, stamp_ns: int, index: int, step: ControlStep) -> bool:
         """True at the last goal; on the way there a goal that is reached gives way to the next; a twist has none."""
+        if self._detour is not None:
+            self._detour.advance(self._config.period, step.pose_error)
+            self._detour = None if self._detour.is_over else self._detour
+            return False
         if self._task.twists is not None or not is_at_goal(step.pose_error, self._config):
             return False
         if self._task.follow is not None:
