@@ -60,10 +60,11 @@ class FramesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthTable:
-    """``[depth]``: how depth is stored, and metres per count."""
+    """``[depth]``: how depth is stored, metres per count, and the count that means none beside 0 (-1: no other)."""
 
     encoding: str = "uint16"
     scale: float = 1e-3
+    invalid: int = -1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,18 +94,43 @@ class SplitTable:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ListedView:
+    """A view by its files, where a layout names them one by one instead of by globs.
+
+    matrix: its pose as the layout writes it, None where it has none; camera: its lens, None for [camera];
+    depth_scale: metres per count, None for that of [depth].
+    """
+
+    name: str
+    color: Path
+    depth: Path
+    matrix: Float64 | None
+    human: Path | None = None
+    stamp_ns: int | None = None
+    camera: CameraTable | None = None
+    depth_scale: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Description:
-    """A whole description; camera and frames may be left to a transforms.json."""
+    """A whole description; camera and frames may be left to a transforms.json, poses to --camera-pose.
+
+    listed: the views of a layout, instead of frames; unpaired: colour and depth files without partner; notes: what a
+    layout leaves open and was taken as usual.
+    """
 
     path: Path
     root: Path
-    poses: PosesTable
+    poses: PosesTable | None
     camera: CameraTable | None
     depth_camera: CameraTable | None
     frames: FramesTable | None
     depth: DepthTable
     stamps: StampsTable
     split: SplitTable
+    listed: tuple[ListedView, ...] = ()
+    unpaired: tuple[int, int] = (0, 0)
+    notes: tuple[str, ...] = ()
 
     @property
     def T_color_depth(self) -> Float64:
@@ -179,7 +205,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
-    known = {f.name for f in fields(Description)} - {"path"}
+    known = {f.name for f in fields(Description)} - {"path", "listed", "unpaired", "notes"}
     _check_keys(content, known, str(path), "")
     folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
     if not folder.is_dir():
@@ -187,7 +213,7 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
     description = Description(
         path=path,
         root=folder,
-        poses=_required(PosesTable, content, "poses", path),
+        poses=_optional(PosesTable, content, "poses", path),
         camera=_optional(CameraTable, content, "camera", path),
         depth_camera=_optional(CameraTable, content, "depth_camera", path),
         frames=_optional(FramesTable, content, "frames", path),
@@ -195,9 +221,10 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         stamps=_optional(StampsTable, content, "stamps", path) or StampsTable(),
         split=_optional(SplitTable, content, "split", path) or SplitTable(),
     )
-    _check_choice(path, "poses.format", description.poses.format, FORMATS)
-    _check_choice(path, "poses.convention", description.poses.convention, CONVENTIONS)
-    _check_choice(path, "poses.axes", description.poses.axes, AXES)
+    if description.poses is not None:
+        _check_choice(path, "poses.format", description.poses.format, FORMATS)
+        _check_choice(path, "poses.convention", description.poses.convention, CONVENTIONS)
+        _check_choice(path, "poses.axes", description.poses.axes, AXES)
     _check_choice(path, "depth.encoding", description.depth.encoding, DEPTH_ENCODINGS)
     for name, camera in (("camera", description.camera), ("depth_camera", description.depth_camera)):
         if camera is not None:
@@ -207,7 +234,7 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
             f"{path}: depth.scale: expected metres per count, got {description.depth.scale}",
             remedy="see docs/input.md",
         )
-    if description.poses.format != "nerfstudio":
+    if description.poses is None or description.poses.format != "nerfstudio":
         for name in ("camera", "frames"):
             if getattr(description, name) is None:
                 raise InputError(f"{path}: [{name}] is missing", remedy="see docs/input.md")

@@ -2,14 +2,16 @@
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform, transform_from
+from splatctrl_cli.geometry import invert_transform, quat_from_rotation, transform_from
+from splatctrl_cli.io.tf_tree import TfTree
 from splatctrl_cli.records import Float64
 
 FORMATS = ("matrix-blocks", "trajectory-log", "tum", "nerfstudio", "matrix-files")
@@ -17,6 +19,7 @@ CONVENTIONS = ("camera_to_world", "world_to_camera")
 AXES = ("opencv", "opengl")
 OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 MAX_ENTRY = 1e6  # [m] of a pose
+POSE_TOLERANCE_NS = 20_000_000  # before the first and after the last pose of a trajectory
 MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
 
 
@@ -111,6 +114,29 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
 def read_matrix_file(path: Path) -> Float64:
     """A 4x4 matrix alone in a text file."""
     return _matrix([line for line in _lines(path) if line and not line.startswith("#")][:4], str(path))
+
+
+class Trajectory:
+    """Poses of one camera by stamp [s, as text], interpolated as those of tf."""
+
+    def __init__(self, poses: Mapping[str, Float64]) -> None:
+        self._tree = TfTree()
+        for text, T in poses.items():
+            stamp_ns = stamp_of_text(text)
+            if stamp_ns is not None:
+                self._tree.add("world", "camera", stamp_ns, T[:3, 3], quat_from_rotation(T[:3, :3]), static=False)
+
+    def at(self, stamp_ns: int) -> Float64 | None:
+        """T_world_camera (4, 4); None where the trajectory does not reach."""
+        return self._tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
+
+
+def stamp_of_text(text: str) -> int | None:
+    """Nanoseconds of seconds as written, without the rounding of floats; None where the text is no number."""
+    try:
+        return round(Decimal(text) * 1_000_000_000)
+    except (InvalidOperation, ValueError, OverflowError):
+        return None
 
 
 READERS: dict[str, Callable[[Path], dict[str, Float64]]] = {
