@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.config import Config
     from splatctrl_cli.control.audit import DistanceFunction
     from splatctrl_cli.control.comparison import Motion, MotionFigures, Yardstick
+    from splatctrl_cli.control.detour import PlanDetour
     from splatctrl_cli.control.planned import PlannedPath
     from splatctrl_cli.control.replay import ReplayTask
     from splatctrl_cli.records import Float64
@@ -205,6 +206,18 @@ def _planned(
             is_intervened=shaped if baseline == BIRRT_IK else None,
         )
     return plans, motions
+
+
+def planned_ways_out(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> "PlanDetour | None":
+    """What plans the closed loop's ways out of local minima; None where it may take none."""
+    from splatctrl_cli.control.planned import planned_detours
+
+    def scene_at(stamp_ns: int) -> _Certified:
+        return _Certified(distance=certified_distance(inputs.scene.at(stamp_ns)))
+
+    if config.control.max_detours == 0:
+        return None
+    return planned_detours(inputs.model, scene_at, task.frame, config.planner, config.control, home=task.home)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,7 +36,8 @@ _OPEN_LOOP = (
 )
 _CLOSED_LOOP = (
     *("goal_reached", "stalled", "num_goals_reached", "start_time_s", "num_steps", "position_error"),
-    *("rotation_error", "num_scene_hits", "num_anchors", "max_divergence_joints", "max_divergence_position"),
+    *("rotation_error", "num_scene_hits", "num_anchors", "num_detours"),
+    *("max_divergence_joints", "max_divergence_position"),
     *("max_divergence_rotation_deg", "end_divergence_joints", "end_divergence_position"),
     "end_divergence_rotation_deg",
 )
@@ -233,6 +234,7 @@ def _closed_loop_metrics(replay: "Replay") -> Metrics:
         "rotation_error": float(np.linalg.norm(last.pose_error[3:])),
         "num_scene_hits": sum(change.is_hit for change in trace.scene_changes),
         "num_anchors": len(trace.anchored),
+        "num_detours": len(trace.detours),
         **{f"max_divergence_{name}": _largest(values) for name, values in ends.items()},
         **{f"end_divergence_{name}": _last(values) for name, values in ends.items()},
     }

@@ -10,7 +10,7 @@ import numpy as np
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.known_scene import KnownScene
 from splatctrl_cli.cli.replay_baseline import read_baselines, read_zone, separations
-from splatctrl_cli.cli.replay_compare import Comparison, compared
+from splatctrl_cli.cli.replay_compare import Comparison, compared, planned_ways_out
 from splatctrl_cli.cli.replay_goal import goal_waypoints
 from splatctrl_cli.cli.replay_record import ReplayRecord
 from splatctrl_cli.cli.replay_store import Figures, StoredAudit, StoredLoop, StoredOpenLoop, StoredSteps
@@ -194,6 +194,7 @@ def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", co
         task,
         lambda stamp: scene.at(stamp).barrier,
         scene_step_at=scene.step_at,
+        plan_detour=planned_ways_out(inputs, task, config),
         record=loop,
     )
     apart = Figures()

@@ -75,6 +75,7 @@ def events_document(replay: "Replay") -> dict[str, Any]:
             if abs(change.after - change.before) > 0.01
         ],
         "anchored": [] if replay.closed_loop is None else list(replay.closed_loop.anchored),
+        "detours": [] if replay.closed_loop is None else list(replay.closed_loop.detours),
     }
 
 
