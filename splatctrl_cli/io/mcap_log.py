@@ -14,6 +14,7 @@ from splatctrl_cli.io.mcap_file import McapFile
 from splatctrl_cli.io.mcap_records import (
     CHANNEL,
     CHUNK,
+    FIRST_OPCODE,
     MESSAGE,
     SCHEMA,
     STATISTICS,
@@ -21,16 +22,17 @@ from splatctrl_cli.io.mcap_records import (
     Channel,
     Chunk,
     ChunkIndex,
-    Message,
     Schema,
     Statistics,
-    parse_message,
     parse_record,
 )
 from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
-from splatctrl_cli.io.unpacking import BadBlockError, unpacked, unpacked_start
+from splatctrl_cli.io.unpacking import MAX_BLOCK, BadBlockError, unpacked, unpacked_start
 
 _HEAD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+FREE_BYTES = 256 << 20  # that chunks may unpack to in any file, and beside it:
+MOST_RATIO = 1000  # times the file's size. Depth and colour as recorded compress 2 to 20 times.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +57,7 @@ class McapLog:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Topic] = {}
         self._statistics: Statistics | None = None
+        self._unpacked = 0
         for part in self._file.summary():  # so that a damaged chunk hides no channel of others
             if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
                 self._declare(part.opcode, part.content, Damage())
@@ -81,11 +84,14 @@ class McapLog:
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes."""
+        self._unpacked = 0
         for part in self._file.parts(damage):
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
             elif part.opcode == MESSAGE and part.content:
-                yield from self._message(part.content, damage, names)
+                message = self._message(part.content, 0, len(part.content), damage, names)
+                if message is not None:
+                    yield message
             elif part.opcode in {SCHEMA, CHANNEL}:
                 self._declare(part.opcode, part.content, damage)
 
@@ -105,12 +111,14 @@ class McapLog:
         while at + _HEAD.size <= end:
             opcode, length = _HEAD.unpack_from(records, at)
             start, at = at + _HEAD.size, at + _HEAD.size + length
-            if at > end:
+            if at > end or opcode < FIRST_OPCODE:
                 if not is_cut:
-                    damage.add(f"{self.path.name}: the chunk at byte {offset} holds a record that it does not end")
+                    damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are no record")
                 return
             if opcode == MESSAGE:
-                yield from self._message(records[start:at], damage, names)
+                message = self._message(records, start, at, damage, names)
+                if message is not None:
+                    yield message
             elif opcode in {SCHEMA, CHANNEL}:
                 self._declare(opcode, records[start:at], damage)
 
@@ -121,6 +129,9 @@ class McapLog:
             assert isinstance(chunk, Chunk)
             if is_cut or len(chunk.records) < chunk.compressed_size:
                 return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
+            self._unpacked += min(chunk.uncompressed_size, MAX_BLOCK)
+            if chunk.uncompressed_size <= MAX_BLOCK and self._unpacked > FREE_BYTES + MOST_RATIO * self._file.size:
+                raise BadBlockError(f"the file so far unpacks to over {MOST_RATIO} times its size")
             records = unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
             if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
                 raise BadBlockError("checksum differs")
@@ -130,17 +141,21 @@ class McapLog:
             return b""
         return records
 
-    def _message(self, content: bytes, damage: Damage, names: Collection[str] | None) -> Iterator[RawMessage]:
-        try:
-            message: Message = parse_message(content)
-        except BadRecordError as error:
-            damage.add(f"{self.path.name}: {error}")
-            return
-        topic = self._channels.get(message.channel_id)
+    def _message(
+        self, records: bytes, start: int, end: int, damage: Damage, names: Collection[str] | None
+    ) -> RawMessage | None:
+        """The message in these bytes of `records`; None where it is not wanted or no message."""
+        if end - start < _MESSAGE.size:
+            damage.add(f"{self.path.name}: a message record of {end - start} bytes")
+            return None
+        channel, _, log_time_ns, _ = _MESSAGE.unpack_from(records, start)
+        topic = self._channels.get(channel)
         if topic is None:
-            damage.add(f"{self.path.name}: a message of undeclared channel {message.channel_id}")
-        elif names is None or topic.name in names:
-            yield RawMessage(topic=topic, log_time_ns=message.log_time, data=message.data)
+            damage.add(f"{self.path.name}: a message of undeclared channel {channel}")
+            return None
+        if names is not None and topic.name not in names:
+            return None
+        return RawMessage(topic=topic, log_time_ns=log_time_ns, data=records[start + _MESSAGE.size : end])
 
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
         """Take a schema, a channel or the statistics."""
