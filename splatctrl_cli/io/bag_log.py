@@ -1,4 +1,4 @@
-"""ROS 1 bags, ROS 2 sqlite3 bags and ROS 2 bag folders, through rosbags."""
+"""Opens a recorded log by its content; ROS 2 sqlite3 bags and compressed bag folders are read through rosbags."""
 
 import re
 from collections.abc import Collection, Iterator
@@ -8,28 +8,26 @@ from typing import Any
 
 import yaml
 from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag1 import Reader as Bag1Reader
-from rosbags.rosbag1 import ReaderError as Bag1Error
 from rosbags.rosbag2 import Reader as Bag2Reader
 from rosbags.rosbag2 import ReaderError as Bag2Error
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.bag1_log import Bag1Log
 from splatctrl_cli.io.mcap_log import McapLog
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
 
-_UNREADABLE = (Bag1Error, Bag2Error, ValueError, RuntimeError, KeyError, EOFError, AssertionError, OSError)
+_UNREADABLE = (Bag2Error, ValueError, RuntimeError, KeyError, EOFError, AssertionError, OSError)
 
 
 class BagLog:
-    """A log that one rosbags reader reads: a ROS 1 bag, one sqlite3 file, or a compressed ROS 2 bag folder."""
+    """A log that one rosbags reader reads: one sqlite3 file, or a compressed ROS 2 bag folder."""
 
     def __init__(self, path: Path, reader_type: Any, container: str) -> None:
         self.path = path
         self.files = (path,) if path.is_file() else tuple(sorted(p for p in path.iterdir() if p.is_file()))
         self.container = container
         self._reader_type = reader_type
-        self._encoding = "ros1" if reader_type is Bag1Reader else "cdr"
         with closing(self._opened()) as reader:
             self._topics = {connection.id: self._topic(connection) for connection in reader.connections}
 
@@ -59,20 +57,16 @@ class BagLog:
         try:
             reader.open()
         except _UNREADABLE as error:
-            hint = "rosbag reindex" if self._encoding == "ros1" else "ros2 bag reindex"
             raise InputError(
-                f"{self.path}: not a readable {self.container}: {error}", remedy=f"try '{hint}'"
+                f"{self.path}: not a readable {self.container}: {error}", remedy="try 'ros2 bag reindex'"
             ) from None
         return reader
 
     def _topic(self, connection: Any) -> Topic:
-        encoding = self._encoding
-        if encoding == "cdr":
-            encoding = connection.ext.serialization_format
         return Topic(
             name=connection.topic,
             type_name=connection.msgtype,
-            encoding=encoding,
+            encoding=connection.ext.serialization_format,
             definition=connection.msgdef.data,
             definition_format="idl" if connection.msgdef.format == MessageDefinitionFormat.IDL else "msg",
         )
@@ -111,7 +105,7 @@ def open_raw_log(path: Path) -> RawLog:
     if magic.startswith(b"\x89MCAP0\r\n"):
         return McapLog(path)
     if magic.startswith(b"#ROSBAG V"):
-        return BagLog(path, Bag1Reader, "ROS 1 bag")
+        return Bag1Log(path)
     if magic.startswith(b"SQLite format 3"):
         return BagLog(path, Sqlite3Reader, "ROS 2 bag (sqlite3)")
     if path.suffix in {".mcap", ".bag", ".db3"}:

@@ -27,12 +27,10 @@ from splatctrl_cli.io.mcap_records import (
     parse_record,
 )
 from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
-from splatctrl_cli.io.unpacking import MAX_BLOCK, BadBlockError, unpacked, unpacked_start
+from splatctrl_cli.io.unpacking import BadBlockError, Budget, unpacked_start
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-FREE_BYTES = 256 << 20  # that chunks may unpack to in any file, and beside it:
-MOST_RATIO = 1000  # times the file's size. Depth and colour as recorded compress 2 to 20 times.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +55,7 @@ class McapLog:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Topic] = {}
         self._statistics: Statistics | None = None
-        self._unpacked = 0
+        self._budget = Budget(self._file.size)
         for part in self._file.summary():  # so that a damaged chunk hides no channel of others
             if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
                 self._declare(part.opcode, part.content, Damage())
@@ -84,7 +82,7 @@ class McapLog:
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes."""
-        self._unpacked = 0
+        self._budget = Budget(self._file.size)
         for part in self._file.parts(damage):
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
@@ -129,10 +127,7 @@ class McapLog:
             assert isinstance(chunk, Chunk)
             if is_cut or len(chunk.records) < chunk.compressed_size:
                 return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
-            self._unpacked += min(chunk.uncompressed_size, MAX_BLOCK)
-            if chunk.uncompressed_size <= MAX_BLOCK and self._unpacked > FREE_BYTES + MOST_RATIO * self._file.size:
-                raise BadBlockError(f"the file so far unpacks to over {MOST_RATIO} times its size")
-            records = unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
+            records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
             if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
                 raise BadBlockError("checksum differs")
         except (BadRecordError, BadBlockError) as error:

@@ -6,6 +6,8 @@ import lz4.frame
 import zstandard
 
 MAX_BLOCK = 128 << 20  # bytes; of one chunk or record, as stored and as unpacked
+FREE_BYTES = 256 << 20  # that the blocks of any file may unpack to, and beside it:
+MOST_RATIO = 1000  # times the file's size; colour and depth as recorded compress 2 to 20 times
 _MAX_WINDOW = 1 << 27  # bytes a zstd frame may refer back to: what its own command line accepts
 _PLAIN = ("", "none")
 _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError)
@@ -13,6 +15,21 @@ _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, M
 
 class BadBlockError(ValueError):
     """A block that was left out, and why."""
+
+
+class Budget:
+    """What all blocks of a file may unpack to, so that its size bounds the time it takes."""
+
+    def __init__(self, file_size: int) -> None:
+        self._left = FREE_BYTES + MOST_RATIO * file_size
+
+    def unpacked(self, data: bytes, compression: str, size: int) -> bytes:
+        """`unpacked`, as long as the file's budget lasts. Raises BadBlockError."""
+        if size <= MAX_BLOCK:
+            self._left -= size
+            if self._left < 0:
+                raise BadBlockError(f"the file so far unpacks to over {MOST_RATIO} times its size")
+        return unpacked(data, compression, size)
 
 
 def unpacked(data: bytes, compression: str, size: int) -> bytes:
