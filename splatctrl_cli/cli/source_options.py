@@ -27,7 +27,14 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=X,Y,Z,QX,QY,QZ,QW",
-        help="pose of a fixed camera in the world, instead of tf (repeatable)",
+        help="pose of a fixed camera in the world, instead of the recorded one, or NAME=identity (repeatable)",
+    )
+    group.add_argument(
+        "--intrinsics",
+        action="append",
+        default=[],
+        metavar="NAME=FX,FY,CX,CY",
+        help="lens of a camera whose recording has none, in pixels (repeatable)",
     )
     group.add_argument(
         "--human-topic",
@@ -65,6 +72,7 @@ def source_options(args: argparse.Namespace) -> "SourceOptions":
         camera_topics=tuple(_topics(text) for text in args.camera),
         camera_poses=dict(_pose(text) for text in args.camera_pose),
         human_topics=dict(_human_topic(text) for text in args.human_topic),
+        intrinsics=dict(_lens(text) for text in args.intrinsics),
         depth_scale=args.depth_scale,
         pairing_tolerance_s=args.pairing_tolerance,
         joint_topic=args.joint_topic,
@@ -109,10 +117,25 @@ def _human_topic(text: str) -> tuple[str, str]:
 
 def _pose(text: str) -> tuple[str, tuple[float, ...]]:
     name, _, rest = text.partition("=")
+    if name and rest == "identity":
+        return name, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     try:
         values = tuple(float(value) for value in rest.split(","))
     except ValueError:
         values = ()
     if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
-        raise UsageError(f"--camera-pose {text}: expected NAME=X,Y,Z,QX,QY,QZ,QW with a unit quaternion")
+        raise UsageError(
+            f"--camera-pose {text}: expected NAME=X,Y,Z,QX,QY,QZ,QW with a unit quaternion, or NAME=identity"
+        )
+    return name, values
+
+
+def _lens(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, rest = text.partition("=")
+    try:
+        values = tuple(float(value) for value in rest.split(","))
+    except ValueError:
+        values = ()
+    if not name or len(values) != 4 or not min(values[:2]) > 0:
+        raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels")
     return name, values

@@ -38,7 +38,7 @@ MASKED_COLUMNS = (*COLUMNS, "human")  # where the recording has masks
 FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
 FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
 _NOT_FOR_CAPTURES = (
-    *("world_frame", "camera_topics", "camera_poses", "human_topics"),
+    *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
     *("depth_scale", "root", "holdout"),
 )
 _AGAIN = "run `splatctrl ingest` again"
@@ -282,6 +282,11 @@ def _write_shot(folder: Path, shot: Shot, cameras: dict[str, dict[str, Any]], su
     frame = shot.frame
     unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
     camera = cameras.setdefault(frame.camera, {**asdict(frame.intrinsics), "depth_scale": unit, "num_frames": 0})
+    if any(camera[name] != value for name, value in asdict(frame.intrinsics).items()):
+        raise InputError(
+            f"{shot.origin}: camera {frame.camera} changes its lens, and a capture holds one of each camera",
+            remedy="leave --holdout to `reconstruct` and `score`",
+        )
     stem = f"{camera['num_frames']:06d}"
     camera["num_frames"] += 1
     color = shot.color_file

@@ -12,11 +12,13 @@ from splatctrl_cli.io.capture import is_capture, read_capture_header
 from splatctrl_cli.io.describe_file import describe_file
 from splatctrl_cli.io.describe_grid import covers, header_facts
 from splatctrl_cli.io.grid_channels import FORMAT
+from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.known_space import known_space
+from splatctrl_cli.io.layouts import layout_of, open_layout
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig import camera_topics, missing
-from splatctrl_cli.io.rig_folder import open_image_folder
+from splatctrl_cli.io.rig_folder import RigFolderSource, open_image_folder
 from splatctrl_cli.io.scene_folder import read_occupancy
 from splatctrl_cli.io.shot import Shot
 from splatctrl_cli.io.summary import Grid, Summary
@@ -38,7 +40,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
     if start.startswith(_LOG_MAGICS) or path.suffix in _LOG_SUFFIXES:
         return describe_log(open_raw_log(path), options)
     if path.suffix == ".toml":
-        return _describe_images(path, options)
+        return _describe_images(path, open_image_folder(path, options), "image folder")
     return describe_file(path)
 
 
@@ -114,6 +116,8 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
         return _describe_capture(path)
     if is_bag_folder(path):
         return describe_log(open_raw_log(path), options)
+    if (layout := layout_of(path)) is not None:
+        return _describe_images(path, open_layout(path, options), layout.name)
     files = sorted(p for p in path.rglob("*") if p.is_file())
     names = {p.relative_to(path).as_posix() for p in files}
     is_dtu = any(name.startswith("Cameras/") for name in names) and any(
@@ -182,8 +186,7 @@ def _describe_capture(path: Path) -> Summary:
     return Summary(path=str(path), kind="capture", facts=facts, grids=(grid,), notes=tuple(loss["notes"]))
 
 
-def _describe_images(path: Path, options: SourceOptions) -> Summary:
-    source = open_image_folder(path, options)
+def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, kind: str) -> Summary:
     first = next((item for item in source.shots() if isinstance(item, Shot)), None)
     counts = source.count_views()
     facts: dict[str, object] = {"has_clock": source.has_clock}
@@ -202,7 +205,7 @@ def _describe_images(path: Path, options: SourceOptions) -> Summary:
         "without_pose": loss.without_pose,
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
-    return Summary(path=str(path), kind="image folder", facts=facts, grids=(grid,), notes=tuple(loss.notes))
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), notes=tuple(loss.notes))
 
 
 def _count(path: Path) -> int:

@@ -44,6 +44,8 @@ class ImageFolderSource:
 
     def __init__(self, path: Path, options: SourceOptions, description: Description | None = None) -> None:
         options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
+        if description is None:
+            options.refuse(("intrinsics",), "a folder whose description has [camera]", path)
         self.name = path.name
         self._description = with_transforms(description or read_description(path, options.root))
         self._loss = LossReport()
@@ -51,6 +53,7 @@ class ImageFolderSource:
         self._num_invalid = 0
         self._views = views_of(self._description, options, self._loss)
         self._lenses: dict[str, _Lens] = {}
+        _check_names(path, {view.lens.name for view in self._views}, options)
         names = tuple(sorted({view.camera for view in self._views}))
         if options.cameras is not None:
             for name in options.cameras:
@@ -202,6 +205,12 @@ class ImageFolderSource:
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
         return metres(np.where(counts == table.invalid, np.uint16(0), counts), view.depth_scale)
+
+
+def _check_names(path: Path, lenses: set[str], options: SourceOptions) -> None:
+    for name in (*options.camera_poses, *options.intrinsics):
+        if name not in lenses:
+            raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(sorted(lenses))}")
 
 
 def _float_pixels(path: Path) -> NDArray[np.float32] | None:

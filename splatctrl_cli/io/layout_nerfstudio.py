@@ -4,7 +4,7 @@ Its fields, their defaults and the half pixel of the principal point are those o
 ("Data conventions") and of nerfstudio/data/dataparsers/nerfstudio_dataparser.py.
 """
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from splatctrl_cli.io.folder_description import (
     PosesTable,
     SplitTable,
     StampsTable,
-    check_camera,
 )
+from splatctrl_cli.io.layout import Lenses
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.poses import read_nerfstudio
 
@@ -33,8 +33,9 @@ def matches(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def read(folder: Path, _options: SourceOptions) -> Description:
+def read(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description; depth is in millimetres unless --depth-scale says otherwise."""
+    options.refuse(("intrinsics",), "a folder with transforms.json", folder)
     description = Description(
         path=folder / FILE,
         root=folder,
@@ -52,7 +53,8 @@ def read(folder: Path, _options: SourceOptions) -> Description:
 def with_transforms(description: Description) -> Description:
     """With the camera and the views of a transforms.json where the description leaves them to it."""
     table = description.poses
-    if table is None or table.format != "nerfstudio" or (description.camera and description.frames):
+    is_whole = bool(description.listed or (description.camera and description.frames))
+    if is_whole or table is None or table.format != "nerfstudio":
         return description
     path = description.root / table.file
     content, matrices = read_nerfstudio(path)
@@ -85,26 +87,6 @@ def with_transforms(description: Description) -> Description:
             )
         return replace(description, camera=views[0].camera)
     return replace(description, camera=views[0].camera, listed=tuple(sorted(_short(views), key=lambda v: v.name)))
-
-
-class Lenses:
-    """The different lenses of a layout's views, as cameras ``camera``, ``camera-1``, ``camera-2``, ..."""
-
-    def __init__(self) -> None:
-        self._tables: list[CameraTable] = []
-
-    def __len__(self) -> int:
-        return len(self._tables)
-
-    def named(self, table: CameraTable, where: str) -> CameraTable:
-        """The camera of a lens; a new one where no view before had it. Raises InputError as `check_camera`."""
-        for known in self._tables:
-            if asdict(replace(known, name=table.name)) == asdict(table):
-                return known
-        check_camera(table, where)
-        number = len(self._tables)
-        self._tables.append(replace(table, name=table.name if number == 0 else f"{table.name}-{number}"))
-        return self._tables[-1]
 
 
 def _camera(content: dict[str, Any], entry: dict[str, Any], path: Path) -> CameraTable:

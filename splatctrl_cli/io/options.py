@@ -24,9 +24,10 @@ class SourceOptions:
 
     world_frame: frame of poses (default: the root of the tf tree). cameras: only these (default: all).
     camera_topics: topics by camera name, instead of those found. camera_poses: T_world_camera of fixed cameras as
-    x, y, z, qx, qy, qz, qw, instead of tf. human_topics: image topics by camera name, not 0 where a pixel shows a
-    person. depth_scale: [m per count] of depth images. root: folder of an image folder's files. holdout: frames
-    (index or name) of an image folder that become camera `holdout`.
+    x, y, z, qx, qy, qz, qw, instead of those recorded. human_topics: image topics by camera name, not 0 where a
+    pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, where the input has none. depth_scale:
+    [m per count] of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an
+    image folder that become camera `holdout`.
     """
 
     world_frame: str | None = None
@@ -34,6 +35,7 @@ class SourceOptions:
     camera_topics: tuple[CameraTopics, ...] = ()
     camera_poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     human_topics: Mapping[str, str] = field(default_factory=dict)
+    intrinsics: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     depth_scale: float | None = None
     pairing_tolerance_s: float = 0.020
     pose_tolerance_s: float = 0.020

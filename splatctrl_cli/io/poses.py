@@ -116,6 +116,11 @@ def read_matrix_file(path: Path) -> Float64:
     return _matrix([line for line in _lines(path) if line and not line.startswith("#")][:4], str(path))
 
 
+def read_numbers(path: Path) -> list[float]:
+    """All numbers of a text file, in order."""
+    return [value for line in _lines(path) if not line.startswith("#") for value in _numbers(line.split(), str(path))]
+
+
 class Trajectory:
     """Poses of one camera by stamp [s, as text], interpolated as those of tf."""
 

@@ -25,12 +25,15 @@ class RigFolderSource:
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
-        options.refuse(("holdout",), "a description with several cameras", path)
+        options.refuse(("holdout", "intrinsics"), "a description with several cameras", path)
         self.name = path.name
-        of_each = replace(options, cameras=None)
-        parts = [ImageFolderSource(path, of_each, description) for description in read_rig(path, options.root)]
-        by_name = {part.cameras[0]: part for part in parts}
-        for name in options.cameras or ():
+        by_name = {}
+        for description in read_rig(path, options.root):
+            assert description.camera is not None
+            name = description.camera.name
+            pose = {name: options.camera_poses[name]} if name in options.camera_poses else {}
+            by_name[name] = ImageFolderSource(path, replace(options, cameras=None, camera_poses=pose), description)
+        for name in (*(options.cameras or ()), *options.camera_poses):
             if name not in by_name:
                 raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(by_name)}")
         self.cameras = options.cameras or tuple(by_name)

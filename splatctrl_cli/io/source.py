@@ -5,6 +5,7 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.io.capture import CaptureSource, is_capture
+from splatctrl_cli.io.layouts import open_layout
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
 from splatctrl_cli.io.rig_folder import open_image_folder
 from splatctrl_cli.io.ros_log import RosLogSource
@@ -14,7 +15,8 @@ __all__ = ["CameraTopics", "SourceOptions", "open_source"]
 
 
 def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
-    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, or image folder's TOML description.
+    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder, or image folder's TOML
+    description.
 
     Raises InputError where there is nothing, or nothing that can be used.
     """
@@ -26,8 +28,5 @@ def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
     if is_capture(path):
         return CaptureSource(path, options)
     if path.is_dir() and not is_bag_folder(path):
-        raise InputError(
-            f"{path}: a folder that is neither a capture nor a ROS 2 bag",
-            remedy="expected capture.json or metadata.yaml in it; for images give the .toml that describes them",
-        )
+        return open_layout(path, options)
     return RosLogSource(open_raw_log(path), options)

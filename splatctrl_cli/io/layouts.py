@@ -1,0 +1,58 @@
+"""The dataset layouts that are known by their own files, so that their folders need no description."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io import (
+    layout_bop,
+    layout_frames,
+    layout_nerfstudio,
+    layout_redwood,
+    layout_scannet,
+    layout_tum,
+)
+from splatctrl_cli.io.folder_description import Description
+from splatctrl_cli.io.image_folder import ImageFolderSource
+from splatctrl_cli.io.options import SourceOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """A layout: its name, whether a folder has it, and the folder as a description."""
+
+    name: str
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, SourceOptions], Description]
+
+
+LAYOUTS = tuple(
+    Layout(name=name, matches=module.matches, read=module.read)
+    for name, module in (
+        ("TUM RGB-D", layout_tum),
+        ("BOP scene", layout_bop),
+        ("ScanNet export", layout_scannet),
+        ("7-Scenes", layout_frames),
+        ("nerfstudio", layout_nerfstudio),
+        ("Open3D scene", layout_redwood),
+    )
+)
+
+
+def layout_of(folder: Path) -> Layout | None:
+    """The layout of a folder, None where it has none of these."""
+    return next((layout for layout in LAYOUTS if layout.matches(folder)), None)
+
+
+def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
+    """The records of a dataset's folder. Raises InputError where it has no layout that is known."""
+    layout = layout_of(folder)
+    if layout is None:
+        names = ", ".join(known.name for known in LAYOUTS)
+        raise InputError(
+            f"{folder}: a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
+            remedy="give the capture, the bag, one scene of the dataset, or for other images a .toml (docs/input.md)",
+        )
+    options.refuse(("root",), f"a folder laid out as {layout.name}", folder)
+    return ImageFolderSource(folder, options, layout.read(folder, options))
