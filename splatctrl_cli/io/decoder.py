@@ -1,10 +1,10 @@
 """Messages of the standard types from their bytes, by the definitions the log itself carries."""
 
+import re
 import struct
 from typing import Any
 
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from splatctrl_cli.io.raw_log import RawMessage, Topic
 
@@ -14,7 +14,9 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
-_UNDECODABLE = (SerdeError, TypesysError, struct.error, ValueError, IndexError, KeyError, AssertionError, TypeError)
+_MOST_TEXT = 1 << 20  # characters of a definition
+_MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is no number
+_ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
 
 
 class UndecodableMessageError(ValueError):
@@ -31,21 +33,32 @@ class MessageDecoder:
 
     def __init__(self) -> None:
         self._stores: dict[Topic, Any] = {}
+        self._refused: dict[Topic, str] = {}
 
     def decode(self, message: RawMessage) -> Any:
         """The message as an object with its fields. Raises UndecodableMessageError."""
         topic = message.topic
+        store = self._store(topic)
         try:
-            if topic not in self._stores:
-                self._stores[topic] = _type_store(topic)
-            store = self._stores[topic]
             if topic.encoding == "ros1":
                 return store.deserialize_ros1(message.data, topic.type_name)
             return store.deserialize_cdr(message.data, topic.type_name)
-        except _UNDECODABLE as error:
+        except Exception as error:  # generated code over foreign bytes: there is no list of what it raises
             raise UndecodableMessageError(
                 f"{topic.name}: a {topic.type_name} that does not decode: {error}"
             ) from None
+
+    def _store(self, topic: Topic) -> Any:
+        if topic not in self._stores and topic not in self._refused:
+            try:
+                self._stores[topic] = _type_store(topic)
+            except Exception as error:  # a parser over foreign text, RecursionError and MemoryError included
+                self._refused[topic] = " ".join(str(error).split())[:200] or type(error).__name__
+        if topic in self._refused:
+            raise UndecodableMessageError(
+                f"{topic.name}: the definition of {topic.type_name} is not usable: {self._refused[topic]}"
+            )
+        return self._stores[topic]
 
 
 def header_stamp_ns(message: RawMessage) -> int:
@@ -70,6 +83,7 @@ def stamp_ns(header: Any) -> int:
 def _type_store(topic: Topic) -> Any:
     if not topic.definition:
         return get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
+    _check_definition(topic.definition)
     store = get_typestore(Stores.EMPTY)
     if topic.definition_format == "idl":
         separator = "=" * 80 + "\n"
@@ -80,3 +94,12 @@ def _type_store(topic: Topic) -> Any:
     else:
         store.register(get_types_from_msg(topic.definition, topic.type_name))
     return store
+
+
+def _check_definition(text: str) -> None:
+    """Raise ValueError for a definition that would take much memory or time to compile."""
+    if len(text) > _MOST_TEXT:
+        raise ValueError(f"{len(text)} characters, at most {_MOST_TEXT} are read")
+    largest = max((int("".join(sizes)[:12]) for sizes in _ARRAY.findall(text)), default=0)
+    if largest > _MOST_ITEMS:
+        raise ValueError(f"an array of {largest} items, at most {_MOST_ITEMS} are read")

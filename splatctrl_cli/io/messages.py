@@ -143,6 +143,8 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 def _raw_pixels(message: Any) -> NDArray[Any]:
     width, height, step = int(message.width), int(message.height), int(message.step)
     name = f"image {width}x{height} {message.encoding}"
+    if message.encoding not in _LAYOUT and width * height > 1 << 31:
+        raise UndecodableMessageError(f"{name}: too large for an image")
     if message.encoding not in _LAYOUT:
         return np.zeros((height, width, 0), dtype=np.uint8)  # kind "other": described, never used
     channels, code = _LAYOUT[message.encoding]
@@ -151,6 +153,7 @@ def _raw_pixels(message: Any) -> NDArray[Any]:
     data = np.asarray(message.data, dtype=np.uint8)
     if width == 0 or height == 0 or step < row or data.size < step * (height - 1) + row:
         raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    step = row if height == 1 else step  # a single row may announce any step: nothing follows it
     padded = np.zeros(step * height, dtype=np.uint8)
     padded[: min(data.size, padded.size)] = data[: padded.size]
     rows = np.ascontiguousarray(padded.reshape(height, step)[:, :row])
