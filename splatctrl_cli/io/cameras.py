@@ -2,9 +2,12 @@
 
 from collections.abc import Collection
 
+import numpy as np
+
 from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 from splatctrl_cli.io.messages import ImageMessage
 from splatctrl_cli.io.options import CameraTopics
+from splatctrl_cli.io.realsense import device_of
 from splatctrl_cli.io.survey import Calibration, Survey, TopicSurvey
 
 _TRANSPORTS = {"compressed", "compressedDepth"}
@@ -28,8 +31,9 @@ def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraT
     groups: dict[tuple[str, ...], list[TopicSurvey]] = {}
     for depth in depths:
         prefixes = [common_prefix(depth.topic.name, color.topic.name) for color in colors]
+        device = device_of(depth.topic.name)
         if prefixes:
-            groups.setdefault(max(prefixes, key=len), []).append(depth)
+            groups.setdefault((device,) if device else max(prefixes, key=len), []).append(depth)
     cameras: list[CameraTopics] = []
     taken: set[str] = set()
     for namespace in sorted(groups, key=lambda parts: (-len(parts), parts)):
@@ -91,6 +95,9 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
     if color_image is None or depth_image is None:
         return False
     if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
+        return False
+    T_color_depth = survey.realsense.T_between(color, depth)
+    if T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6):
         return False
     if color_image.frame_id != depth_image.frame_id and not _says_registered(depth):
         return False

@@ -9,6 +9,12 @@ from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+SAME_MODELS = {  # what others call them
+    "Brown Conrady": "plumb_bob",
+    "radtan": "plumb_bob",
+    "Kannala Brandt4": "equidistant",
+    "fisheye": "equidistant",
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 from splatctrl_cli.io.masks import check_mask_topics
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
-from splatctrl_cli.io.registration import DISTORTION_MODELS, DepthToColor, Undistortion
+from splatctrl_cli.io.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
 from splatctrl_cli.io.survey import Calibration, Survey
 from splatctrl_cli.io.tf_tree import TfTree
 from splatctrl_cli.records import Float64, Intrinsics
@@ -20,7 +20,9 @@ from splatctrl_cli.records import Float64, Intrinsics
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """One RGB-D camera of a log; fixed_pose is T_world_camera where a person gave it, human_topic its masks."""
+    """One RGB-D camera of a log; fixed_pose is T_world_camera where a person gave it, human_topic its masks,
+    depth_scale [m per count] what a person or the log says of it.
+    """
 
     name: str
     color_topic: str
@@ -31,6 +33,7 @@ class Camera:
     undistortion: Undistortion | None = None
     depth_to_color: DepthToColor | None = None
     fixed_pose: Float64 | None = None
+    depth_scale: float | None = None
     human_topic: str = ""
 
     def pose_at(self, tf: TfTree, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
@@ -47,7 +50,7 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
         raise _no_camera(log, survey)
     known = {camera.name: camera for camera in found}
     names = tuple(known) if options.cameras is None else options.cameras
-    for name in (*names, *options.camera_poses):
+    for name in (*names, *options.camera_poses, *options.intrinsics):
         if name not in known:
             raise InputError(f"{log.path}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")
     check_mask_topics(log.path, survey, options.human_topics, tuple(known))
@@ -152,6 +155,7 @@ class _Builder:
             undistortion=self._undistortion(calibration, intrinsics),
             depth_to_color=None if self._is_registered else self._registration(intrinsics),
             fixed_pose=None if fixed is None else transform_from(fixed[:3], fixed[3:]),
+            depth_scale=self._depth_scale,
             human_topic=self._options.human_topics.get(topics.name, ""),
         )
 
@@ -183,13 +187,23 @@ class _Builder:
         topics = self._topics
         return is_registered(self._survey, topics.color, topics.depth, topics.info, topics.depth_info)
 
+    @property
+    def _depth_scale(self) -> float | None:
+        if self._options.depth_scale is not None:
+            return self._options.depth_scale
+        return self._survey.realsense.depth_unit(self._topics.depth)
+
     def _calibration(self, info: str, image_topic: str) -> Calibration:
         calibration = self._survey.topics[info].calibration if info else None
+        given = self._options.intrinsics.get(self._topics.name)
+        if calibration is None and given is not None:
+            return self._given(given, image_topic)
         if calibration is None:
             there = [t.topic.name for t in self._survey.of_type(CAMERA_INFO)]
             raise InputError(
                 f"{self._where}: topic {image_topic} has no usable CameraInfo",
-                remedy=f"record its camera_info, or name it with --camera; CameraInfo topics there: {_listed(there)}",
+                remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {_listed(there)};"
+                f" or give --intrinsics {self._topics.name}=FX,FY,CX,CY",
             )
         image = self._survey.topics[image_topic].first_image
         assert image is not None
@@ -204,6 +218,21 @@ class _Builder:
             )
         sized = replace(calibration, width=size[0], height=size[1])
         return _rectified(sized) if _is_rectified(image_topic) else sized
+
+    def _given(self, intrinsics: tuple[float, ...], image_topic: str) -> Calibration:
+        """What --intrinsics says, for images without distortion of the size that they are."""
+        image = self._survey.topics[image_topic].first_image
+        assert image is not None
+        fx, fy, cx, cy = intrinsics
+        return Calibration(
+            width=image.width,
+            height=image.height,
+            K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+            projection=np.zeros((3, 3)),
+            distortion_model="plumb_bob",
+            distortion=np.zeros(0),
+            frame_id=image.frame_id,
+        )
 
     def _check_world(self) -> str:
         """The world frame, after checking that tf joins the camera to it."""
@@ -227,12 +256,13 @@ class _Builder:
     def _undistortion(self, calibration: Calibration, intrinsics: Intrinsics) -> Undistortion | None:
         if not np.any(np.abs(calibration.distortion) > 1e-9):
             return None
-        if calibration.distortion_model not in DISTORTION_MODELS:
+        model = SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
+        if model not in DISTORTION_MODELS:
             raise InputError(
                 f"{self._where}: {self._topics.info}: distortion model {calibration.distortion_model!r} is unknown",
                 remedy=f"rectify the images first; known models: {', '.join(DISTORTION_MODELS)}",
             )
-        return Undistortion(intrinsics, calibration.distortion_model, calibration.distortion)
+        return Undistortion(intrinsics, model, calibration.distortion)
 
     def _registration(self, color: Intrinsics) -> DepthToColor:
         """How raw depth reaches the colour camera. Raises InputError where K or the transform is not known."""
@@ -246,13 +276,15 @@ class _Builder:
             raise InputError(f"{what}, and {topics.depth} has no CameraInfo", remedy=f"record it, or {remedy}")
         calibration = self._calibration(topics.depth_info, topics.depth)
         frame = depth_image.frame_id
-        if frame == color_frame:
+        T_color_depth = self._survey.realsense.T_between(topics.color, topics.depth)
+        if T_color_depth is None and frame == color_frame:
             raise InputError(
                 f"{what}: their CameraInfo differ but both say frame {frame!r}",
                 remedy=f"{remedy}, or correct the frames",
             )
-        span = tf.span_ns(frame) or tf.span_ns(color_frame) or (0, 0)
-        T_color_depth = tf.lookup(color_frame, frame, span[0])
+        if T_color_depth is None:
+            span = tf.span_ns(frame) or tf.span_ns(color_frame) or (0, 0)
+            T_color_depth = tf.lookup(color_frame, frame, span[0])
         if T_color_depth is None:
             raise InputError(
                 f"{what}, and tf does not join their frames {frame!r} and {color_frame!r};"

@@ -149,10 +149,10 @@ class RosLogSource:
         for planned, (color, depth, *masks) in images.of_frames(self._damage):
             human = self._human(planned.camera, masks[0]) if masks else None
             self._num_invalid += num_invalid(depth.pixels)
-            shot = _shot(planned, color, depth, human, self._options.depth_scale)
+            shot = _shot(planned, color, depth, human)
             camera = planned.camera
             if camera.name not in checked:
-                scale = _scale(depth, self._options.depth_scale)
+                scale = _scale(depth, camera.depth_scale)
                 if check_depth(shot.frame.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
                     checked.add(camera.name)
             yield shot
@@ -208,10 +208,9 @@ def _keys(planned: _Planned) -> list[tuple[str, int]]:
     return keys if planned.human_index is None else [*keys, (camera.human_topic, planned.human_index)]
 
 
-def _shot(
-    planned: _Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, scale: float | None
-) -> Shot:
+def _shot(planned: _Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None) -> Shot:
     camera = planned.camera
+    scale = camera.depth_scale
     pixels, metres = color_of(color), depth_of(depth, scale)
     is_counts = depth.pixels.dtype.kind == "u"
     if camera.undistortion is not None:

@@ -19,6 +19,7 @@ from splatctrl_cli.io.decoder import (
 from splatctrl_cli.io.joint_log import JointLog
 from splatctrl_cli.io.messages import ImageMessage, read_image
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.io.realsense import OPTION, TRANSFORM, RealSense
 from splatctrl_cli.io.state_messages import STANDARD_TYPES, STATE_TYPES, read_states
 from splatctrl_cli.io.tf_tree import TfTree
 from splatctrl_cli.records import Float64
@@ -59,6 +60,7 @@ class Survey:
 
     topics: dict[str, TopicSurvey] = field(default_factory=dict)
     tf: TfTree = field(default_factory=TfTree)
+    realsense: RealSense = field(default_factory=RealSense)
     damage: Damage = field(default_factory=Damage)
 
     @property
@@ -79,19 +81,24 @@ def survey(log: RawLog) -> Survey:
     for topic in log.topics():
         result.topics.setdefault(topic.name, TopicSurvey(topic=topic))
     for message in log.messages(result.damage):
-        entry = result.topics.setdefault(message.topic.name, TopicSurvey(topic=message.topic))
-        if entry.count == 0:
-            entry.topic = message.topic
-            entry.first_log_ns = entry.last_log_ns = message.log_time_ns
-        entry.count += 1
-        entry.first_log_ns = min(entry.first_log_ns, message.log_time_ns)
-        entry.last_log_ns = max(entry.last_log_ns, message.log_time_ns)
-        if is_ros(message.topic):
-            try:
-                _take(result, entry, decoder, message)
-            except (UndecodableMessageError, ValueError) as error:
-                result.damage.add(str(error))
+        add_message(result, decoder, message)
     return result
+
+
+def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) -> None:
+    """Count one message, and take from it what a survey keeps."""
+    entry = result.topics.setdefault(message.topic.name, TopicSurvey(topic=message.topic))
+    if entry.count == 0:
+        entry.topic = message.topic
+        entry.first_log_ns = entry.last_log_ns = message.log_time_ns
+    entry.count += 1
+    entry.first_log_ns = min(entry.first_log_ns, message.log_time_ns)
+    entry.last_log_ns = max(entry.last_log_ns, message.log_time_ns)
+    if is_ros(message.topic):
+        try:
+            _take(result, entry, decoder, message)
+        except (UndecodableMessageError, ValueError) as error:
+            result.damage.add(str(error))
 
 
 def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: RawMessage) -> None:
@@ -104,6 +111,8 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
         entry.calibration = _calibration(decoder.decode(message))
     elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
         entry.joints.extend(read_states(decoder.decode(message), kind, message.log_time_ns))
+    elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
+        result.realsense.add(message.topic.name, decoder.decode(message))
     elif kind in TRANSFORMS:
         _add_transforms(result.tf, decoder.decode(message), static=message.topic.name.endswith("tf_static"))
 
