@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_file import (
     BAG_HEADER,
     CHUNK,
@@ -27,7 +28,7 @@ class Bag1Log:
     """One ROS 1 bag.
 
     rosbags' reader (rosbags/rosbag1/reader.py) goes by the index: it refuses a bag without one, and ends at the
-    first damaged chunk.
+    first damaged chunk. Raises InputError where there is no record at all.
     """
 
     container = "ROS 1 bag"
@@ -37,6 +38,8 @@ class Bag1Log:
         self.files = (path,)
         self._file = BagFile(path)
         self._topics: dict[int, Topic] = {}
+        if next(self._file.records(Damage()), None) is None:
+            raise InputError(f"{path}: not a readable ROS 1 bag: no whole record", remedy="record or copy it again")
         for record in self._file.connections():
             self._connect(record.fields, record.body, Damage())
 

@@ -14,6 +14,7 @@ from splatctrl_cli.io.describe_grid import covers, header_facts
 from splatctrl_cli.io.grid_channels import FORMAT
 from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.known_space import known_space
+from splatctrl_cli.io.large_log import survey_to_describe
 from splatctrl_cli.io.layouts import layout_of, open_layout
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
@@ -22,7 +23,7 @@ from splatctrl_cli.io.rig_folder import RigFolderSource, open_image_folder
 from splatctrl_cli.io.scene_folder import read_occupancy
 from splatctrl_cli.io.shot import Shot
 from splatctrl_cli.io.summary import Grid, Summary
-from splatctrl_cli.io.survey import Survey, TopicSurvey, survey
+from splatctrl_cli.io.survey import Survey, TopicSurvey
 
 _LOG_MAGICS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3")
 _LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
@@ -46,7 +47,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
 
 def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     """Topics, times, frames, cameras, and what a reconstruction would lack."""
-    found = survey(log)
+    found, sampling = survey_to_describe(log)
     with_messages = [t for t in found.topics.values() if t.count]
     facts: dict[str, object] = {
         "bytes": sum(file.stat().st_size for file in log.files),
@@ -66,7 +67,7 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
         rows = [[c.name, c.color, c.depth, c.info or "-"] for c in cameras]
         grids.append(Grid(name="cameras", header=("camera", "color", "depth", "camera_info"), rows=rows))
     lacks = missing(log, found, options) if found.num_messages else ["the log holds no messages"]
-    notes = [*found.damage.notes, *found.tf.notes]
+    notes = [*sampling, *found.damage.notes, *found.tf.notes]
     return Summary(
         path=str(log.path),
         kind=log.container,

@@ -7,10 +7,10 @@ raises on valid files without one and yields nothing from a truncated file.
 import struct
 import zlib
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli.io.mcap_file import McapFile
+from splatctrl_cli.io.mcap_index import LogIndex, index_by_heads
 from splatctrl_cli.io.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -31,16 +31,6 @@ from splatctrl_cli.io.unpacking import BadBlockError, Budget, unpacked_start
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LogIndex:
-    """What a log says of itself without being read: messages by topic, log times [ns], chunks in file order."""
-
-    counts: dict[str, int]
-    first_ns: int
-    last_ns: int
-    chunks: tuple[ChunkIndex, ...]
 
 
 class McapLog:
@@ -64,21 +54,24 @@ class McapLog:
         """The channels of the summary section, and those met while reading."""
         return tuple(self._channels.values())
 
-    def index(self) -> LogIndex | None:
-        """What the summary says; None where it lacks a count of the messages, or channels or chunks it counts."""
+    def index(self) -> LogIndex:
+        """What the file says of itself: by its summary, else by the heads of its records."""
         found = self._statistics
-        if found is None or not found.channel_message_counts.keys() <= self._channels.keys():
-            return None
-        chunks = tuple(self._file.chunk_indexes())
-        if len(chunks) != found.chunk_count:
-            return None
-        counts: dict[str, int] = {}
-        for channel, count in found.channel_message_counts.items():
-            name = self._channels[channel].name
-            counts[name] = counts.get(name, 0) + count
-        return LogIndex(
-            counts=counts, first_ns=found.message_start_time, last_ns=found.message_end_time, chunks=chunks
-        )
+        if found is not None:
+            chunks = tuple(self._file.chunk_indexes())
+            if len(chunks) == found.chunk_count:
+                return LogIndex(
+                    counts=dict(found.channel_message_counts),
+                    first_ns=found.message_start_time,
+                    last_ns=found.message_end_time,
+                    chunks=chunks,
+                    notes=(),
+                )
+        return index_by_heads(self._file)
+
+    def topic_of(self, channel: int) -> Topic | None:
+        """The topic of a channel, if it has been declared so far."""
+        return self._channels.get(channel)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes."""

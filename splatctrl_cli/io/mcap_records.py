@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 MAGIC = b"\x89MCAP0\r\n"
 MESSAGE, CHUNK, ATTACHMENT, SCHEMA, CHANNEL = 0x05, 0x06, 0x09, 0x03, 0x04
-DATA_END, FOOTER, CHUNK_INDEX, STATISTICS = 0x0F, 0x02, 0x08, 0x0B
+DATA_END, FOOTER, CHUNK_INDEX, STATISTICS, MESSAGE_INDEX = 0x0F, 0x02, 0x08, 0x0B, 0x07
 FIRST_OPCODE = 0x01
 
 _MESSAGE = struct.Struct("<HIQQ")
@@ -342,7 +342,7 @@ _PARSERS: dict[int, Callable[[_Fields], Record]] = {
     ),
     MESSAGE: lambda f: parse_message(f.rest()),
     CHUNK: _chunk,
-    0x07: lambda f: MessageIndex(channel_id=f.u16(), records=f.pairs()),
+    MESSAGE_INDEX: lambda f: MessageIndex(channel_id=f.u16(), records=f.pairs()),
     CHUNK_INDEX: _chunk_index,
     ATTACHMENT: lambda f: Attachment(
         log_time=f.u64(), create_time=f.u64(), name=f.text(), media_type=f.text(), data=f.take(f.u64()), crc=f.u32()
