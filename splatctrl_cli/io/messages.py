@@ -9,33 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.io.decoder import IMAGE, UndecodableMessageError, stamp_ns
+from splatctrl_cli.io.encodings import BAYER, COLOR_CONVERSIONS, DEPTH_ENCODINGS, raw_pixels, to_rgb
+from splatctrl_cli.io.rvl import decode_rvl
 from splatctrl_cli.records import Float32, UInt8
 
+__all__ = [
+    "COLOR_CONVERSIONS",
+    "DEPTH_ENCODINGS",
+    "ImageMessage",
+    "color_of",
+    "decode_file",
+    "depth_of",
+    "read_image",
+]
+
 MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
-DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
-COLOR_CONVERSIONS = {
-    "rgb8": None,
-    "8UC3": cv2.COLOR_BGR2RGB,  # OpenCV's order
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-    "8UC4": cv2.COLOR_BGRA2RGB,
-    "mono8": cv2.COLOR_GRAY2RGB,
-    "8UC1": cv2.COLOR_GRAY2RGB,
-    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
-    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
-    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
-}
-_LAYOUT = {  # channels and dtype by encoding
-    **dict.fromkeys(["rgb8", "bgr8", "8UC3"], (3, "u1")),
-    **dict.fromkeys(["rgba8", "bgra8", "8UC4"], (4, "u1")),
-    **dict.fromkeys(["mono8", "8UC1"], (1, "u1")),
-    **dict.fromkeys(["yuv422", "uyvy", "yuv422_yuy2", "yuyv"], (2, "u1")),
-    **dict.fromkeys(["16UC1", "mono16"], (1, "u2")),
-    "32FC1": (1, "f4"),
-}
 _CLOSING_MARKS = ((b"\xff\xd8\xff", b"\xff\xd9"), (b"\x89PNG", b"IEND"))
+_MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 _TAIL = 64  # bytes in which the closing mark of a file stands; some encoders pad
 
 
@@ -79,7 +69,7 @@ class ImageMessage:
 def read_image(message: Any, type_name: str) -> ImageMessage:
     """The image of a decoded sensor_msgs/Image or CompressedImage. Raises UndecodableMessageError."""
     if type_name == IMAGE:
-        pixels, encoding, compressed = _raw_pixels(message), message.encoding, None
+        pixels, encoding, compressed = raw_pixels(message), message.encoding, None
     else:
         pixels, encoding, compressed = _compressed_pixels(message.format, bytes(message.data))
     return ImageMessage(
@@ -93,12 +83,7 @@ def read_image(message: Any, type_name: str) -> ImageMessage:
 
 def color_of(image: ImageMessage) -> UInt8:
     """Colour (H, W, 3) uint8 RGB."""
-    if image.compressed is not None:
-        code: int | None = cv2.COLOR_GRAY2RGB if image.is_gray else cv2.COLOR_BGR2RGB
-    else:
-        code = COLOR_CONVERSIONS[image.encoding]
-    pixels = image.pixels if code is None else cv2.cvtColor(np.ascontiguousarray(image.pixels), code)
-    return np.ascontiguousarray(pixels, dtype=np.uint8)
+    return to_rgb(image.pixels, image.encoding)
 
 
 def depth_of(image: ImageMessage, scale: float | None) -> Float32:
@@ -123,11 +108,13 @@ def metres(counts: NDArray[Any], scale: float) -> Float32:
 
 
 def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
-    """Pixels of a JPEG, PNG, ... file as OpenCV reads it (BGR), its orientation tag ignored.
+    """Pixels of a JPEG, PNG, WebP, ... file as OpenCV reads it (BGR), its orientation tag ignored.
 
     None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
     """
     if any(data.startswith(start) and end not in data[-_TAIL:] for start, end in _CLOSING_MARKS):
+        return None
+    if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
         return None
     flags = cv2.IMREAD_COLOR if color else cv2.IMREAD_UNCHANGED
     buffer = np.frombuffer(data, dtype=np.uint8)
@@ -140,28 +127,7 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
     return None if pixels is None else np.asarray(pixels)
 
 
-def _raw_pixels(message: Any) -> NDArray[Any]:
-    width, height, step = int(message.width), int(message.height), int(message.step)
-    name = f"image {width}x{height} {message.encoding}"
-    if message.encoding not in _LAYOUT and width * height > 1 << 31:
-        raise UndecodableMessageError(f"{name}: too large for an image")
-    if message.encoding not in _LAYOUT:
-        return np.zeros((height, width, 0), dtype=np.uint8)  # kind "other": described, never used
-    channels, code = _LAYOUT[message.encoding]
-    dtype = np.dtype((">" if message.is_bigendian else "<") + code)
-    row = width * channels * dtype.itemsize
-    data = np.asarray(message.data, dtype=np.uint8)
-    if width == 0 or height == 0 or step < row or data.size < step * (height - 1) + row:
-        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
-    step = row if height == 1 else step  # a single row may announce any step: nothing follows it
-    padded = np.zeros(step * height, dtype=np.uint8)
-    padded[: min(data.size, padded.size)] = data[: padded.size]
-    rows = np.ascontiguousarray(padded.reshape(height, step)[:, :row])
-    pixels = rows.view(dtype).astype(dtype.newbyteorder("="), copy=False)
-    return pixels.reshape(height, width) if channels == 1 else pixels.reshape(height, width, channels)
-
-
-def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes]:
+def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:
     if "compressedDepth" in form:
         return _compressed_depth(form, data)
     pixels = decode_file(data, color=False)
@@ -171,17 +137,32 @@ def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes
         return pixels, "16UC1", data
     color = decode_file(data, color=pixels.ndim != 2)
     assert color is not None
+    recorded = form.partition(";")[0].strip()
+    if color.ndim == 2 and recorded in BAYER:
+        return color, recorded, None  # a mosaic in a file: its bytes are no colour image
     return color, "mono8" if color.ndim == 2 else "bgr8", data
 
 
-def _compressed_depth(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes]:
-    """compressed_depth_image_transport: 12 bytes (int32, two float32 A, B), then a PNG; 32FC1 is A / (count - B)."""
-    counts = decode_file(data[12:], color=False)
+def _compressed_depth(form: str, data: bytes) -> tuple[NDArray[Any], str, None]:
+    """compressed_depth_image_transport: 12 bytes (int32, two float32 A, B), then a PNG or the sizes (two int32) and
+    RVL; 32FC1 is A / (count - B) (its codec.cpp and rvl_codec.cpp).
+    """
+    counts = _rvl_counts(data[12:]) if "rvl" in form.lower() else decode_file(data[12:], color=False)
     if counts is None or counts.ndim != 2:
-        raise UndecodableMessageError(f"compressed depth ({form}): {len(data)} bytes that hold no depth PNG")
+        raise UndecodableMessageError(f"compressed depth ({form}): {len(data)} bytes that hold no depth image")
     if not form.strip().startswith("32FC1"):
-        return counts, "16UC1", data[12:]
+        return counts, "16UC1", None
     _, a, b = struct.unpack_from("<iff", data)
     with np.errstate(divide="ignore"):
         depth = np.where(counts > 0, a / (counts.astype(np.float64) - b), 0.0)
-    return depth.astype(np.float32), "32FC1", data[12:]
+    return depth.astype(np.float32), "32FC1", None
+
+
+def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
+    try:
+        width, height = struct.unpack_from("<ii", data)
+        if not (width > 0 and height > 0 and width * height <= _MOST_PIXELS):
+            raise ValueError(f"RVL: an image of {width}x{height}")
+        return decode_rvl(data[8:], width * height).reshape(height, width)
+    except (ValueError, struct.error) as error:
+        raise UndecodableMessageError(f"compressed depth: {error}") from None

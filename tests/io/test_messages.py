@@ -1,5 +1,6 @@
 """Image messages: encodings, byte order, row step."""
 
+import struct
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 
 from splatctrl_cli.io.decoder import COMPRESSED_IMAGE, IMAGE, UndecodableMessageError
 from splatctrl_cli.io.messages import color_of, depth_of, read_image
+from splatctrl_cli.io.rvl import decode_rvl
 from tests.io.make_log import header
 
 RGB = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
@@ -99,7 +101,7 @@ def test_compressed_depth_transport_is_read() -> None:
 
 
 def test_an_unknown_encoding_is_neither_color_nor_depth() -> None:
-    assert read_image(message(RGB[..., 0], "bayer_rggb8"), IMAGE).kind == "other"
+    assert read_image(message(RGB[..., 0], "rgb16"), IMAGE).kind == "other"
 
 
 def test_bytes_that_are_no_image_are_refused() -> None:
@@ -114,3 +116,133 @@ def test_a_cut_image_is_refused_not_filled_with_grey(suffix: str) -> None:
     cut = SimpleNamespace(header=header(5, "o"), format=suffix, data=data[: len(data) * 3 // 4])
     with pytest.raises(UndecodableMessageError, match="no image file"):
         read_image(cut, COMPRESSED_IMAGE)
+
+
+PATTERNS = {"rggb": "RGGB", "bggr": "BGGR", "gbrg": "GBRG", "grbg": "GRBG"}
+
+
+def mosaic(rgb: tuple[int, int, int], pattern: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """8x8 pixels of one colour, of which each tells only one channel."""
+    values = dict(zip("RGB", rgb, strict=True))
+    first = [values[letter] for letter in pattern]
+    return np.tile(np.array(first, np.uint8).reshape(2, 2), (4, 4))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_bayer_mosaic_of_one_colour_is_that_colour(pattern: str) -> None:
+    image = read_image(message(mosaic((200, 100, 30), PATTERNS[pattern]), f"bayer_{pattern}8", padding=3), IMAGE)
+    assert image.kind == "color"
+    assert (color_of(image)[2:-2, 2:-2] == [200, 100, 30]).all()
+
+
+def test_a_bayer_mosaic_in_an_image_file_is_interpolated_too() -> None:
+    data = cv2.imencode(".png", mosaic((200, 100, 30), "GRBG"))[1].ravel()
+    form = "bayer_grbg8; png compressed bayer_grbg8"
+    image = read_image(SimpleNamespace(header=header(5, "o"), format=form, data=data), COMPRESSED_IMAGE)
+    assert (color_of(image)[2:-2, 2:-2] == [200, 100, 30]).all()
+    assert image.compressed is None
+
+
+Y, U, V = 120, 90, 170  # BT.601, video range
+EXPECTED = np.array([1.164 * (Y - 16) + 1.596 * (V - 128), 1.164 * (Y - 16) - 0.813 * (V - 128) - 0.391 * (U - 128)])
+
+
+@pytest.mark.parametrize(
+    ("encoding", "four"),
+    [("yuv422", (U, Y, V, Y)), ("uyvy", (U, Y, V, Y)), ("yuv422_yuy2", (Y, U, Y, V)), ("yuyv", (Y, U, Y, V))],
+)
+def test_yuv_422_is_read_in_either_order(encoding: str, four: tuple[int, ...]) -> None:
+    pixels = np.tile(np.array(four, np.uint8).reshape(1, 2, 2), (4, 3, 1))
+    rgb = color_of(read_image(message(pixels, encoding, padding=2), IMAGE))
+    assert rgb.shape == (4, 6, 3)
+    assert rgb[..., :2] == pytest.approx(np.broadcast_to(EXPECTED, (4, 6, 2)), abs=1.5)
+
+
+@pytest.mark.parametrize(("encoding", "pair"), [("nv12", (U, V)), ("nv21", (V, U))])
+@pytest.mark.parametrize("padding", [0, 2])
+def test_planar_yuv_is_read_with_half_as_many_rows_of_colour(
+    encoding: str, pair: tuple[int, int], padding: int
+) -> None:
+    rows = np.full((6, 6), Y, np.uint8)
+    rows[4:] = np.tile(np.array(pair, np.uint8), 3)
+    planar = message(rows, encoding, padding=padding)
+    planar.height = 4
+    image = read_image(planar, IMAGE)
+    assert (image.width, image.height, image.kind) == (6, 4, "color")
+    assert color_of(image)[..., :2] == pytest.approx(np.broadcast_to(EXPECTED, (4, 6, 2)), abs=1.5)
+    planar.data = planar.data[:-7]
+    with pytest.raises(UndecodableMessageError, match="do not hold it"):
+        read_image(planar, IMAGE)
+
+
+def test_webp_is_read_and_a_cut_one_refused() -> None:
+    data = cv2.imencode(".webp", cv2.cvtColor(RGB, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_WEBP_QUALITY, 101])[1].ravel()
+    whole = SimpleNamespace(header=header(5, "o"), format="webp", data=data)
+    assert np.array_equal(color_of(read_image(whole, COMPRESSED_IMAGE)), RGB)
+    whole.data = data[:-4]
+    with pytest.raises(UndecodableMessageError, match="no image file"):
+        read_image(whole, COMPRESSED_IMAGE)
+
+
+def test_float_depth_of_the_compressed_transport_is_inverse_depth() -> None:
+    a, b = 100.0, 2.0
+    depth = np.where(COUNTS > 2, a / (COUNTS.astype(np.float64) - b), 0)
+    png = cv2.imencode(".png", COUNTS)[1].tobytes()
+    data = np.frombuffer(struct.pack("<iff", 0, a, b) + png, np.uint8)
+    form = SimpleNamespace(header=header(5, "o"), format="32FC1; compressedDepth png", data=data)
+    image = read_image(form, COMPRESSED_IMAGE)
+    assert depth_of(image, None) == pytest.approx(depth, rel=1e-6)
+
+
+def encoded_rvl(pixels: np.ndarray[Any, np.dtype[np.uint16]]) -> bytes:
+    """Wilson's encoder, number by number."""
+    nibbles: list[int] = []
+
+    def put(value: int) -> None:
+        while True:
+            low, value = value & 7, value >> 3
+            nibbles.append(low | (8 if value else 0))
+            if not value:
+                return
+
+    flat, previous, index = pixels.ravel().astype(int).tolist(), 0, 0
+    while index < len(flat):
+        zeros = next((k for k, v in enumerate(flat[index:]) if v), len(flat) - index)
+        values = next((k for k, v in enumerate(flat[index + zeros :]) if not v), len(flat) - index - zeros)
+        put(zeros)
+        put(values)
+        for value in flat[index + zeros : index + zeros + values]:
+            delta, previous = value - previous, value
+            put((delta << 1) ^ (delta >> 63))
+        index += zeros + values
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{n:x}" for n in nibbles[k : k + 8]), 16) for k in range(0, len(nibbles), 8)]
+    return struct.pack(f"<{len(words)}I", *words)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_rvl_gives_back_what_its_encoder_took(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pixels = np.where(rng.random((13, 17)) < seed / 6, 0, rng.integers(1, 65536, (13, 17))).astype(np.uint16)
+    assert np.array_equal(decode_rvl(encoded_rvl(pixels), pixels.size), pixels.ravel())
+
+
+def test_an_rvl_stream_has_the_bits_of_the_paper() -> None:
+    """By hand: 1 zero, 2 values: +4 is 8 = nibbles 8+0, 1; -1 is 1."""
+    assert decode_rvl(struct.pack("<I", 0x12811000), 3).tolist() == [0, 4, 3]
+
+
+def test_the_rvl_transport_is_depth_and_a_cut_or_bloated_one_is_refused() -> None:
+    stream = struct.pack("<iffii", 0, 0.0, 0.0, COUNTS.shape[1], COUNTS.shape[0]) + encoded_rvl(COUNTS)
+    form = "16UC1; compressedDepth rvl"
+
+    def read(data: bytes) -> Any:
+        return read_image(SimpleNamespace(header=header(5, "o"), format=form, data=data), COMPRESSED_IMAGE)
+
+    assert depth_of(read(stream), None) == pytest.approx(COUNTS * 1e-3, rel=1e-6)
+    with pytest.raises(UndecodableMessageError, match="RVL"):
+        read(stream[:-4])
+    with pytest.raises(UndecodableMessageError, match="an image of 2147483647x2147483647"):
+        read(stream[:12] + b"\xff\xff\xff\x7f" * 2 + stream[20:])
+    with pytest.raises(UndecodableMessageError, match="33 bits"):
+        read(stream[:20] + b"\xff" * 36 + bytes(4))
