@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.measure import ROOT, SAMPLE, Limit, Options, Result
+from splatctrl_cli.cli import launch
 
 SPLATCTRL = str(Path(sys.executable).with_name("splatctrl"))
 
@@ -51,7 +52,7 @@ def _reconstruct(out: Path) -> list[str]:
 
 def process(command: Sequence[str]) -> tuple[float, float]:
     """Wall time [s] and peak resident memory [MiB] of a process. Raises where it does not end well."""
-    launcher = [sys.executable, "-S", str(ROOT / "benchmarks" / "launch.py")]
+    launcher = [sys.executable, "-S", launch.__file__]
     done = subprocess.run([*launcher, *command], cwd=ROOT, capture_output=True, text=True, check=True)
     elapsed, peak, code = done.stdout.split()
     if code != "0":

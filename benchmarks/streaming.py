@@ -14,6 +14,7 @@ from pathlib import Path
 
 from benchmarks.measure import ROOT, SAMPLE, Limit, Options, Result
 from benchmarks.scenes import enlarged, sample_robot
+from splatctrl_cli.cli import launch
 from splatctrl_cli.config import load_config
 from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Box, RgbdFrame
@@ -54,7 +55,7 @@ def _measured(num_steps: int) -> tuple[list[float], float, float]:
     """Seconds of each time step, and [MiB]: the decoded frames, and the peak of a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "streaming.json"
-        launcher = [sys.executable, "-S", str(ROOT / "benchmarks" / "launch.py")]
+        launcher = [sys.executable, "-S", launch.__file__]
         command = [sys.executable, "-m", "benchmarks.streaming", str(out), str(num_steps)]
         done = subprocess.run([*launcher, *command], cwd=ROOT, capture_output=True, text=True, check=True)
         _, peak, code = done.stdout.split()

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from benchmarks.cli import SPLATCTRL
 from benchmarks.measure import ROOT
-from benchmarks.methods import figure, pair, reference
 
 HEADER = (
     *("variant", "splats", "fit [s]", "training dB", "held-out dB seen / all", "SSIM seen / all"),
@@ -58,6 +57,21 @@ def row(recording: list[str], name: str, words: list[str]) -> list[str]:
         pair(scores, "depth_median", 1, 1e3),
         figure(scores["in_front_seen"], 1, 100.0),
     ]
+
+
+def pair(scores: dict[str, float | None], name: str, digits: int, factor: float = 1.0) -> str:
+    """Over the pixels that a training view saw, and over all."""
+    return " / ".join(figure(scores[f"{name}_{region}"], digits, factor) for region in ("seen", "all"))
+
+
+def figure(value: float | None, digits: int, factor: float = 1.0) -> str:
+    """A number as the table shows it."""
+    return "-" if value is None else f"{factor * value:.{digits}f}"
+
+
+def reference(recording: list[str]) -> list[str]:
+    """The same recording as `score` wants it named."""
+    return recording if recording[0].startswith("-") else ["--reference", *recording]
 
 
 def _known_to_score(recording: list[str]) -> list[str]:

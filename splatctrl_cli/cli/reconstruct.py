@@ -17,6 +17,7 @@ from splatctrl_cli.cli.common import (
     configured,
     table,
 )
+from splatctrl_cli.cli.score_reference import add_scan, open_dtu, open_held_out, refuse_scan_options
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import InputError, UsageError
 
@@ -38,8 +39,10 @@ def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
     parser = add_command(subparsers, "reconstruct", run, summary="fit splats to a log, a capture or a DTU scan")
     parser.add_argument("source", type=Path, nargs="?", help="log, capture folder, or an image folder's .toml")
-    parser.add_argument("--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, instead")
-    parser.add_argument("--scan", metavar="NAME", help="which scan of --dtu (default: the only one)")
+    parser.add_argument(
+        "--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, or in IDR's and NeuS's, instead"
+    )
+    add_scan(parser)
     add_output(parser, default="scene", what="scene folder")
     add_source(parser)
     parser.add_argument(
@@ -220,13 +223,14 @@ def _open(args: argparse.Namespace) -> "RecordSource":
 
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
-    if args.dtu is None:
-        source = open_source(args.source, source_options(args))
-        check_pose_jumps(source, args.max_pose_jump)
-        return source
-    from splatctrl_cli.io.dtu_source import DtuSource, view_numbers
-
-    return DtuSource(args.dtu, args.scan, view_numbers([word for word in (args.holdout or "").split(",") if word]))
+    if args.dtu is not None:
+        return open_dtu(args)
+    refuse_scan_options(args)
+    if args.protocol is not None:
+        return open_held_out(args, args.source)[0]
+    source = open_source(args.source, source_options(args))
+    check_pose_jumps(source, args.max_pose_jump)
+    return source
 
 
 def check_pose_jumps(source: "ShotSource", limit: float) -> None:

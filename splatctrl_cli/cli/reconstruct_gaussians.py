@@ -110,13 +110,17 @@ def _audit(path: Path, rows: "list[GaussianAuditRow]", console: Console) -> "Cal
 
 def _metrics(rows: "list[GaussianAuditRow]", frames: "list[RgbdFrame]") -> dict[str, object]:
     """For ``run.json`` and gates."""
+    from splatctrl_cli.evaluate.recording import first_frame
+
     last = rows[-1]
+    first = {frame.camera: frame for frame in reversed(frames)}
     return {
         "method": "3dgs",
         "cameras": list(dict.fromkeys(frame.camera for frame in frames)),
         "has_clock": False,
         "stamp_ns": max(frame.stamp_ns for frame in frames),
         "training_stamps_ns": [frame.stamp_ns for frame in frames],
+        "first_frames": [first_frame(frame).as_dict() for frame in first.values()],
         "iterations": last.iteration,
         "splats": last.gaussians,
         "degree": last.degree,

@@ -72,6 +72,7 @@ class Reconstruction:
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
         self.stamps: list[int] = []
+        self.first_frames: dict[str, dict[str, Any]] = {}  # of each camera, what tells this recording from another
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
         self._early: TimeStep | None = None  # the first that said nothing of the workspace
@@ -138,6 +139,7 @@ class Reconstruction:
         elif not self.source.has_clock and self.fitter.num_steps == 1:
             console.log("warning: more views than fit in one time step; the last ones are refined on, the rest seed")
         self._check_cameras(step, console)
+        self._keep_first_frames(step)
         row = self.fitter.step(step.frames, self._posture(step))
         self.stamps.extend(frame.stamp_ns for frame in step.frames)
         self._record(row)
@@ -169,6 +171,13 @@ class Reconstruction:
                 others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
                 raise InputError(line, remedy=f"correct the poses,{others} or give --allow-disagreement")
             console.log(f"warning: {line}")
+
+    def _keep_first_frames(self, step: "TimeStep") -> None:
+        from splatctrl_cli.evaluate.recording import first_frame
+
+        for frame in step.frames:
+            if frame.camera not in self.first_frames:
+                self.first_frames[frame.camera] = first_frame(frame).as_dict()
 
     def _has_new_pairs(self, step: "TimeStep") -> bool:
         """Whether two views of this time step are from cameras that have not been compared yet."""
@@ -223,6 +232,7 @@ class Reconstruction:
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.disagreement,
+            "first_frames": list(self.first_frames.values()),
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }
 
@@ -266,6 +276,7 @@ class Reconstruction:
             "num_read": self.num_read,
             "is_refined": self.is_refined,
             "disagreement": self.disagreement,
+            "first_frames": self.first_frames,
             "stamps": [] if self.source.has_clock else self.stamps,
         }
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
@@ -279,6 +290,7 @@ class Reconstruction:
         self.is_refined = checkpoint.progress["is_refined"]
         self.stamps = checkpoint.progress["stamps"]
         self.disagreement = checkpoint.progress["disagreement"]
+        self.first_frames = checkpoint.progress["first_frames"]
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
+from scipy.ndimage import correlate1d, uniform_filter
 
 from splatctrl_cli.records import Bool, Float64
 
 SSIM_WINDOW = 11  # pixels
 SSIM_SIGMA = 1.5  # pixels
+BOX = 7  # pixels: the window of scikit-image's default
+BOX_RANGE = 2.0  # what it takes for images of floats, [-1, 1], when no range is given
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
@@ -68,6 +70,29 @@ def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Boo
     similarity = ssim_map(image, reference)
     selected = similarity if mask is None else similarity[mask]
     return float(selected.mean()) if selected.size else math.nan
+
+
+def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool, fill: float) -> float:
+    """SSIM of images (H, W, 3) in [0, 1] that are `fill` outside the mask (H, W), as NeRF's papers print it.
+
+    They call scikit-image with its defaults (skimage/metrics/_structural_similarity.py before 0.20): box window of
+    7 pixels, sample moments, the data range of floats taken as 2, and a border of 3 pixels left out of the mean.
+    That range lifts the figure: compare it only with figures of the same kind. nan for images below 7 pixels.
+    """
+    x, y = (np.where(mask[:, :, None], picture, fill).astype(np.float64) for picture in (image, reference))
+    if min(x.shape[:2]) < BOX:
+        return math.nan
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
+        uniform_filter(picture, size=(BOX, BOX, 1)) for picture in (x, y, x * x, y * y, x * y)
+    )
+    sample = BOX**2 / (BOX**2 - 1)
+    variance_x, variance_y = sample * (mean_xx - mean_x**2), sample * (mean_yy - mean_y**2)
+    covariance = sample * (mean_xy - mean_x * mean_y)
+    c1, c2 = (0.01 * BOX_RANGE) ** 2, (0.03 * BOX_RANGE) ** 2
+    similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    similarity /= (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
+    border = BOX // 2
+    return float(similarity[border:-border, border:-border].mean())
 
 
 def depth_errors(

@@ -1,7 +1,7 @@
 """Scores of rendered views against recorded ones, over all pixels and over those that a training camera saw."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -9,8 +9,11 @@ import numpy as np
 
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.free_space import in_front
-from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, psnr, ssim_map
-from splatctrl_cli.records import Bool, Float32, RgbdFrame
+from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, psnr, published_ssim, ssim_map
+from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+
+Perceptual = Callable[[Float64, Float64], float]
+"""Render and photo (H, W, 3) in [0, 1] -> LPIPS."""
 
 PROTOCOL = {
     "average": "mean over views of each view's own figure; a view without a pixel of the region is left out",
@@ -25,6 +28,9 @@ PROTOCOL = {
     "is at least 0.5) and the reference depth, over pixels of the region that have both [m]; depth_coverage is their "
     "share of the region's pixels that have a reference depth",
     "in_front": "share of those pixels whose normalised depth is nearer than the reference by more than 3 cm",
+    "masked": "the pixels that the mask rule selects; its share of the view is mask_share",
+    "ssim_published": "of the whole view with render and photo set to one colour outside the mask, as scikit-image's "
+    "default has it: 7x7 box, sample moments, data range 2, border of 3 pixels left out",
     "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
     "centre lies in a voxel that was observed free; null where the scene has no occupancy grid",
 }
@@ -47,19 +53,33 @@ class RegionScore:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewScore:
-    """One view: `valid_share` of its pixels have a reference depth; `all` and `seen` are its regions."""
+    """One view: `valid_share` of its pixels have a reference depth; `all` and `seen` are its regions.
+
+    Where there is a mask: `masked` is its region, ssim_published that of the view with the rest filled. lpips where
+    weights were given. size: width and height [px].
+    """
 
     view: str
     camera: str
     stamp_ns: int
+    size: tuple[int, int]
     valid_share: float
     seen: RegionScore
     all: RegionScore
+    masked: RegionScore | None = None
+    ssim_published: float = math.nan
+    lpips: float | None = None
 
     def figures(self) -> dict[str, float]:
         """The view's figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
         figures = {"valid_share": self.valid_share, "seen_share": self.seen.share}
-        for name, region in (("seen", self.seen), ("all", self.all)):
+        regions = {"seen": self.seen, "all": self.all}
+        if self.masked is not None:
+            figures |= {"mask_share": self.masked.share, "ssim_published": self.ssim_published}
+            regions["masked"] = self.masked
+        if self.lpips is not None:
+            figures["lpips"] = self.lpips
+        for name, region in regions.items():
             figures |= {f"psnr_{name}": region.psnr, f"ssim_{name}": region.ssim}
             depth = asdict(region.depth)
             figures[f"depth_pixels_{name}"] = depth.pop("num_pixels")
@@ -69,11 +89,22 @@ class ViewScore:
         return figures
 
 
-def score_view(*, view: str, color: Float32, depth: Float32, frame: RgbdFrame, seen: Bool) -> ViewScore:
+def score_view(
+    *,
+    view: str,
+    color: Float32,
+    depth: Float32,
+    frame: RgbdFrame,
+    seen: Bool,
+    mask: Bool | None = None,
+    fill: float = 0.0,
+    perceptual: Perceptual | None = None,
+) -> ViewScore:
     """The scores of a rendering against `frame`.
 
     color (H, W, 3) in [0, 1], depth (H, W) [m] normalised by accumulated opacity, 0 = none; seen (H, W): pixels
-    that a training camera saw. `PROTOCOL` says what each figure means.
+    that a training camera saw; mask (H, W): pixels that the mask rule selects, `fill` the grey outside it for
+    ssim_published; perceptual: LPIPS. `PROTOCOL` says what each figure means.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -95,17 +126,23 @@ def score_view(*, view: str, color: Float32, depth: Float32, frame: RgbdFrame, s
         view=view,
         camera=frame.camera,
         stamp_ns=frame.stamp_ns,
+        size=(frame.intrinsics.width, frame.intrinsics.height),
         valid_share=float(np.mean(frame.depth > 0)),
         seen=score_region(seen),
         all=score_region(np.ones(frame.depth.shape, dtype=np.bool_)),
+        masked=None if mask is None else score_region(mask),
+        ssim_published=math.nan if mask is None else published_ssim(rendered, photo, mask, fill),
+        lpips=None if perceptual is None else perceptual(rendered, photo),
     )
 
 
 def metric_names() -> tuple[str, ...]:
-    """The names of `total_score`, known before anything is scored."""
+    """The names that `total_score` can have, known before anything is scored; those of a mask and of LPIPS only where
+    they were given.
+    """
     depth = ("pixels", *(f.name for f in fields(DepthErrors) if f.name != "num_pixels"), "coverage")
-    names = ["num_views", "valid_share", "seen_share"]
-    for region in ("seen", "all"):
+    names = ["num_views", "valid_share", "seen_share", "mask_share", "ssim_published", "lpips"]
+    for region in ("seen", "all", "masked"):
         names += [f"psnr_{region}", f"ssim_{region}", *(f"depth_{name}_{region}" for name in depth)]
         names.append(f"in_front_{region}")
     return tuple(names)

@@ -11,7 +11,8 @@ from splatctrl_cli.records import RecordSource, RgbdFrame
 class View:
     """A frame to score, its name, and the training frames that count as known at its time.
 
-    The name is the camera and a number: among the camera's frames with a clock, among all views without one.
+    The name is the camera and a number: with a clock among the camera's frames, without one among all views, or the
+    stamp where stamps are the views' own numbers.
     """
 
     name: str
@@ -20,7 +21,12 @@ class View:
 
 
 def views_to_score(
-    source: RecordSource, *, scoring: Collection[str], training: Collection[str], has_clock: bool
+    source: RecordSource,
+    *,
+    scoring: Collection[str],
+    training: Collection[str],
+    has_clock: bool,
+    numbered_by_stamp: bool = False,
 ) -> Iterator[View]:
     """The frames of the `scoring` cameras in time order.
 
@@ -31,7 +37,8 @@ def views_to_score(
         known = tuple(frame for frame in _frames(source) if frame.camera in training)
         for number, frame in enumerate(_frames(source)):
             if frame.camera in scoring:
-                yield View(name=_name(frame.camera, number), frame=frame, training=known)
+                name = _name(frame.camera, frame.stamp_ns if numbered_by_stamp else number)
+                yield View(name=name, frame=frame, training=known)
         return
     counts: Counter[str] = Counter()
     newest: dict[str, RgbdFrame] = {}

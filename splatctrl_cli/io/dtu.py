@@ -16,7 +16,7 @@ import numpy as np
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.io.pfm import read_pfm, write_pfm
-from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
 
 MILLIMETRES = 1000.0
 LIGHT = 3  # of seven; the one MVSNet's own lists test with
@@ -24,43 +24,51 @@ RAW = (1600, 1200)  # pixels of DTU's cameras; 640x512 is half of that, cropped 
 CROPPED = (640, 512)
 CROP = (80, 44)  # pixels cut off left and top of the half-size image
 VISIBLE_ABOVE = 10  # of depth_visual
+BRIGHT = 128  # from which a mask says yes
 
 
 @dataclass(frozen=True, kw_only=True)
 class DtuView:
-    """One view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m] (0 = none), K in pixels, camera pose [m]."""
+    """One view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m] (0 = none), K in pixels, camera pose [m].
+
+    mask (H, W): True on the object, None where no mask is known.
+    """
 
     name: str
     color: UInt8
     depth: Float32
     intrinsics: Intrinsics
     T_world_camera: Float64
+    mask: Bool | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class DtuScan:
-    """The views of one scan by number; files: what was read; without_depth: views left out for want of depth."""
+    """The views of one scan, their numbers, the files that were read, and the names of views without_depth."""
 
     name: str
     views: tuple[DtuView, ...]
+    numbers: tuple[int, ...]
     files: tuple[Path, ...]
     without_depth: tuple[str, ...]
 
 
-def read_dtu(root: Path, scan: str | None = None) -> DtuScan:
-    """The views of scan `scan` (default: the only one) of a DTU folder.
+def read_dtu(root: Path, scan: str | None = None, masks: Path | None = None) -> DtuScan:
+    """The views of scan `scan` (default: the only one) of a DTU folder; `masks` holds NNN.png by view number.
 
     K is scaled to the images as MVSNet's own loaders do (the file's K may be for 1600x1200 or for a quarter of the
     image). Depth of another size than the image is sampled, not blended: from 1600x1200 at the pixels the image
-    was cut from; a smaller map sets only the pixels it was made for. Raises InputError naming the file.
+    was cut from; a smaller map sets only the pixels it was made for. A view without depth is left out. Raises
+    InputError naming the file.
     """
     scan, folder = _scan_folder(root, scan)
     images = _images(folder)
     views: list[DtuView] = []
+    numbers: list[int] = []
     files: list[Path] = []
     without_depth: list[str] = []
     for number, path in images.items():
-        color = _read_image(path)
+        color = read_image(path)
         size = (color.shape[1], color.shape[0])
         camera = _camera_file(root, number)
         K, T_world_camera = _read_camera(camera)
@@ -69,7 +77,9 @@ def read_dtu(root: Path, scan: str | None = None) -> DtuScan:
             without_depth.append(path.name)
             continue
         visual = depth_path.with_name(f"depth_visual_{number:04d}.png")
-        depth = _read_depth(depth_path, visual, size)
+        depth = read_depth(depth_path, visual, size)
+        mask_path = None if masks is None else _mask_file(masks, number)
+        numbers.append(number)
         views.append(
             DtuView(
                 name=path.stem,
@@ -77,14 +87,22 @@ def read_dtu(root: Path, scan: str | None = None) -> DtuScan:
                 depth=depth,
                 intrinsics=_fitted(K, size, camera),
                 T_world_camera=T_world_camera,
+                mask=None if mask_path is None else read_mask(mask_path, size),
             )
         )
         files += [path, camera, depth_path, *([visual] if visual.exists() else [])]
+        files += [] if mask_path is None else [mask_path]
     if not views:
         raise InputError(
             f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
         )
-    return DtuScan(name=scan, views=tuple(views), files=tuple(files), without_depth=tuple(without_depth))
+    return DtuScan(
+        name=scan,
+        views=tuple(views),
+        numbers=tuple(numbers),
+        files=tuple(files),
+        without_depth=tuple(without_depth),
+    )
 
 
 def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
@@ -104,14 +122,20 @@ def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
         depths.joinpath(f"depth_visual_{number:04d}.png").write_bytes(cv2.imencode(".png", visual)[1].tobytes())
 
 
-def _scan_folder(root: Path, scan: str | None) -> tuple[str, Path]:
+def scan_folders(root: Path) -> dict[str, Path]:
+    """The folders of images by scan. Raises InputError where there is no Rectified."""
     rectified = root / "Rectified"
     if not rectified.is_dir():
         raise InputError(
-            f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, got none",
-            remedy="give the folder that holds Rectified",
+            f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, or scans with cameras_sphere.npz,"
+            " got none",
+            remedy="give the folder that holds Rectified, or the scans in IDR's layout",
         )
-    folders = {path.name.removesuffix("_train"): path for path in sorted(rectified.iterdir()) if path.is_dir()}
+    return {path.name.removesuffix("_train"): path for path in sorted(rectified.iterdir()) if path.is_dir()}
+
+
+def _scan_folder(root: Path, scan: str | None) -> tuple[str, Path]:
+    folders = scan_folders(root)
     if scan is None and len(folders) == 1:
         scan = next(iter(folders))
     if scan is None or scan not in folders:
@@ -134,11 +158,36 @@ def _images(folder: Path) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _read_image(path: Path) -> UInt8:
+def read_image(path: Path) -> UInt8:
+    """The image (H, W, 3) as RGB. Raises InputError for what is none."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
     return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> Bool:
+    """(H, W) True where the image is bright in every channel; of another size, the nearest pixel says."""
+    image = read_image(path)
+    if image.shape[1::-1] != size:
+        width, height = size
+        if image.shape[1] * height != image.shape[0] * width:
+            raise InputError(
+                f"{path}: expected a mask of {width}x{height} or of that shape, got {image.shape[1]}x{image.shape[0]}"
+            )
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    return np.asarray((image >= BRIGHT).all(axis=2))
+
+
+def _mask_file(folder: Path, number: int) -> Path:
+    """``007.png`` or the like, in the folder or in its ``mask``, as IDR's archive and RegNeRF's have it."""
+    for place in (folder, folder / "mask"):
+        for path in sorted(place.glob("*.png")):
+            if path.stem.isdecimal() and int(path.stem) == number:
+                return path
+    raise InputError(
+        f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
+    )
 
 
 def _camera_file(root: Path, number: int) -> Path:
@@ -203,7 +252,7 @@ def _depth_file(root: Path, scan: str, number: int) -> Path | None:
     return None
 
 
-def _read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
+def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
     """Depth (H, W) [m] at the pixels of an image of `size` (width, height), 0 = none."""
     depth = read_pfm(path)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))

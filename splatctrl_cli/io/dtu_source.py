@@ -1,12 +1,14 @@
-"""A DTU scan (MVSNet layout) as a record source: views to train from and views held out for scoring."""
+"""A DTU scan (MVSNet's or IDR's layout) as a record source: views to train from and views held out for scoring."""
 
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.io.dtu import read_dtu
+from splatctrl_cli.io.dtu import DtuScan, read_dtu
+from splatctrl_cli.io.idr import idr_scans, read_idr
 from splatctrl_cli.io.output import sha256
-from splatctrl_cli.records import LossReport, Record, RgbdFrame
+from splatctrl_cli.io.protocols import ScoreProtocol, Split
+from splatctrl_cli.records import Bool, LossReport, Record, RgbdFrame
 
 TRAINING_CAMERA = "camera"
 HOLDOUT_CAMERA = "holdout"
@@ -21,34 +23,68 @@ def view_numbers(words: Sequence[str]) -> list[int]:
 
 
 class DtuSource:
-    """The views of a scan that have depth, numbered from 0 in the scan's order; their numbers are their stamps.
+    """The views of a scan, by their numbers (view 0 is ``rect_001``), which are their stamps, too.
 
     The scene does not move, so there is no clock. Views whose number is in `holdout` belong to camera ``holdout``,
-    the others to ``camera``.
+    the others to ``camera``; a `protocol` says instead which train, are held out, and are left out. masks, depths:
+    folders with what the layout itself lacks.
     """
 
-    def __init__(self, root: Path, scan: str | None = None, holdout: Collection[int] = ()) -> None:
+    def __init__(
+        self,
+        root: Path,
+        scan: str | None = None,
+        holdout: Collection[int] = (),
+        *,
+        protocol: ScoreProtocol | None = None,
+        masks: Path | None = None,
+        depths: Path | None = None,
+    ) -> None:
         self._root = root
-        found = read_dtu(root, scan)
-        self._name, self._views, self._files = found.name, found.views, found.files
-        self._holdout = frozenset(holdout)
-        notes = [f"{name}: without depth, left out" for name in found.without_depth]
+        self._layout = "IDR" if not (root / "Rectified").is_dir() and idr_scans(root) else "MVSNet"
+        found = self._read(scan, masks, depths)
+        self._name, self._files = found.name, found.files
+        self._views = dict(zip(found.numbers, found.views, strict=True))
+        numbers = tuple(self._views)
+        if protocol is not None:
+            if holdout:
+                raise UsageError("--holdout: the protocol says what is held out", remedy="leave one of them out")
+            self._split = protocol.split(numbers, f"{root}/{found.name}")
+        else:
+            self._split = _held_out(numbers, frozenset(holdout), root)
+        is_left_out = self._layout == "MVSNet"
+        notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in found.without_depth]
         self._loss = LossReport(unpaired_color=len(notes), notes=notes)
-        outside = sorted(number for number in self._holdout if not 0 <= number < len(self._views))
-        if outside:
-            raise UsageError(
-                f"--holdout {outside[0]}: {root} has no such view", remedy=f"views: 0 to {len(self._views) - 1}"
-            )
-        if self._holdout and len(self._holdout) == len(self._views):
-            raise UsageError(f"--holdout: all {len(self._views)} views of {root} are held out", remedy="leave some")
+
+    def _read(self, scan: str | None, masks: Path | None, depths: Path | None) -> DtuScan:
+        if self._layout == "MVSNet":
+            if depths is not None:
+                raise UsageError(f"--depths {depths}: MVSNet's layout has its own", remedy="leave it out")
+            return read_dtu(self._root, scan, masks)
+        if masks is not None:
+            raise UsageError(f"--masks {masks}: IDR's layout has its own", remedy="leave it out")
+        return read_idr(self._root, scan, depths)
 
     @property
     def name(self) -> str:
         return f"{self._root.name}/{self._name}"
 
     @property
+    def layout(self) -> str:
+        """``MVSNet`` or ``IDR``."""
+        return self._layout
+
+    @property
+    def split(self) -> Split:
+        """Which views train and which are held out."""
+        return self._split
+
+    @property
     def cameras(self) -> tuple[str, ...]:
-        return (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._holdout else (TRAINING_CAMERA,)
+        return (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held() else (TRAINING_CAMERA,)
+
+    def _held(self) -> set[int]:
+        return set(self._split.scored) - set(self._split.training)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -62,11 +98,23 @@ class DtuSource:
     def loss(self) -> LossReport:
         return self._loss
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether any view has any depth."""
+        return any(bool((view.depth > 0).any()) for view in self._views.values())
+
+    def mask(self, number: int) -> Bool | None:
+        """(H, W) True on the object in the view of that number; None where no mask is known."""
+        return self._views[number].mask
+
     def records(self) -> Iterator[Record]:
-        for number, view in enumerate(self._views):
+        held, left_out = self._held(), set(self._split.left_out)
+        for number, view in self._views.items():
+            if number in left_out:
+                continue
             yield RgbdFrame(
                 stamp_ns=number,
-                camera=HOLDOUT_CAMERA if number in self._holdout else TRAINING_CAMERA,
+                camera=HOLDOUT_CAMERA if number in held else TRAINING_CAMERA,
                 color=view.color,
                 depth=view.depth,
                 intrinsics=view.intrinsics,
@@ -74,4 +122,22 @@ class DtuSource:
             )
 
     def digests(self) -> dict[str, str]:
-        return {str(path.relative_to(self._root)): sha256(path) for path in sorted(set(self._files))}
+        return {_relative(path, self._root): sha256(path) for path in sorted(set(self._files))}
+
+
+def _relative(path: Path, root: Path) -> str:
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
+
+
+def _held_out(numbers: tuple[int, ...], holdout: frozenset[int], root: Path) -> Split:
+    outside = sorted(holdout - set(numbers))
+    if outside:
+        raise UsageError(f"--holdout {outside[0]}: {root} has no such view", remedy=f"views: {_span(numbers)}")
+    if holdout and len(holdout) == len(numbers):
+        raise UsageError(f"--holdout: all {len(numbers)} views of {root} are held out", remedy="leave some")
+    return Split(training=tuple(n for n in numbers if n not in holdout), scored=tuple(sorted(holdout)))
+
+
+def _span(numbers: tuple[int, ...]) -> str:
+    is_whole = numbers == tuple(range(numbers[0], numbers[-1] + 1))
+    return f"{numbers[0]} to {numbers[-1]}" if is_whole else ", ".join(map(str, numbers))

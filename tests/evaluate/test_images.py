@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.images import depth_errors, psnr, ssim, ssim_map
+from splatctrl_cli.evaluate.images import depth_errors, psnr, published_ssim, ssim, ssim_map
 from splatctrl_cli.records import Float64
 from tests.reference.images import ssim_at
 
@@ -89,3 +89,25 @@ def test_depth_errors_without_a_common_pixel_are_not_numbers() -> None:
     assert errors.num_pixels == 0
     assert math.isnan(errors.median)
     assert math.isnan(errors.within_1cm)
+
+
+def test_published_ssim_is_the_box_window_of_scikit_image_on_filled_images() -> None:
+    rng = np.random.default_rng(5)
+    image, reference = rng.random((14, 17, 3)), rng.random((14, 17, 3))
+    mask = rng.random((14, 17)) < 0.7
+    x, y = (np.where(mask[:, :, None], picture, 1.0) for picture in (image, reference))
+    values = []
+    for row in range(3, 11):
+        for column in range(3, 14):
+            for channel in range(3):
+                a = x[row - 3 : row + 4, column - 3 : column + 4, channel].ravel()
+                b = y[row - 3 : row + 4, column - 3 : column + 4, channel].ravel()
+                covariance = np.cov(a, b)
+                c1, c2 = 0.02**2, 0.06**2
+                values.append(
+                    (2 * a.mean() * b.mean() + c1)
+                    * (2 * covariance[0, 1] + c2)
+                    / ((a.mean() ** 2 + b.mean() ** 2 + c1) * (covariance[0, 0] + covariance[1, 1] + c2))
+                )
+    assert published_ssim(image, reference, mask, 1.0) == pytest.approx(np.mean(values), abs=1e-12)
+    assert math.isnan(published_ssim(image[:5], reference[:5], mask[:5], 1.0))

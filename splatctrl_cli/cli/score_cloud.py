@@ -1,0 +1,113 @@
+"""``score --cloud``: the scene's surface against reference points or a mesh."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.score_views import rendered
+from splatctrl_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.io.scene_folder import SceneFolder
+    from splatctrl_cli.records import Float64, GaussianSet, RgbdFrame, SplatSet
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudSettings:
+    """What --cloud and its options say. unit: metres per unit of the file."""
+
+    path: Path
+    unit: float
+    max_distance: float
+    spacing: float
+
+    def words(self) -> str:
+        """How the figures come about."""
+        return (
+            f"{self.path}, 1 unit = {self.unit:g} m; points thinned to {1e3 * self.spacing:g} mm; means below"
+            f" {1e3 * self.max_distance:g} mm"
+        )
+
+
+def add_cloud(parser: argparse.ArgumentParser) -> None:
+    """``--cloud`` and what goes with it."""
+    group = parser.add_argument_group("surface")
+    group.add_argument(
+        "--cloud", type=Path, metavar="FILE", help="reference points (.ply) or mesh: accuracy, completeness, Chamfer"
+    )
+    group.add_argument(
+        "--cloud-unit", type=float, metavar="M", help="metres per unit (default: 0.001 with --dtu, else 1)"
+    )
+    group.add_argument(
+        "--cloud-max", type=float, default=0.02, metavar="M", help="farther points count in a share, not in a mean"
+    )
+    group.add_argument(
+        "--cloud-spacing",
+        type=float,
+        default=0.0002,
+        metavar="M",
+        help="both sides are thinned to it (default: 0.0002)",
+    )
+
+
+def cloud_settings(args: argparse.Namespace) -> CloudSettings | None:
+    """None where no cloud is given. Raises UsageError for a length that is not above 0."""
+    if args.cloud is None:
+        if args.cloud_unit is not None:
+            raise UsageError("--cloud-unit: only with --cloud", remedy="leave it out")
+        return None
+    unit = args.cloud_unit if args.cloud_unit is not None else (0.001 if args.dtu is not None else 1.0)
+    for name, value in (("unit", unit), ("max", args.cloud_max), ("spacing", args.cloud_spacing)):
+        if not 0 < value < float("inf"):
+            raise UsageError(f"--cloud-{name}: expected a length above 0, got {value:g}")
+    return CloudSettings(path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing)
+
+
+def cloud_figures(
+    settings: CloudSettings, scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int
+) -> dict[str, Any]:
+    """The figures by flat name. `frames`: the training views that the surface is looked at from."""
+    from splatctrl_cli.evaluate.cloud import cloud_score, thinned
+    from splatctrl_cli.evaluate.visibility import seen_by
+
+    reference = thinned(_reference(settings), settings.spacing)
+    points = thinned(_surface(scene, frames, threads), settings.spacing)
+    score = cloud_score(points, reference, seen_by(reference, frames), max_distance=settings.max_distance)
+    return score.figures()
+
+
+def _reference(settings: CloudSettings) -> "Float64":
+    from splatctrl_cli.evaluate.cloud import points_on
+    from splatctrl_cli.io.points import is_mesh, read_positions
+    from splatctrl_cli.mesh_distance import load_mesh
+
+    if not is_mesh(settings.path):
+        return settings.unit * read_positions(settings.path)
+    mesh = load_mesh(settings.path)
+    return points_on(replace(mesh, vertices=settings.unit * mesh.vertices), settings.spacing)
+
+
+def _surface(scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int) -> "Float64":
+    """World points (P, 3) [m] of the final splats' rendered depth at the poses of `frames`, the robot left out."""
+    import numpy as np
+
+    from splatctrl_cli.evaluate.visibility import surface_points
+
+    splats = _without_robot(scene)
+    parts = []
+    for frame in frames:
+        depth = rendered(splats, frame.intrinsics, frame.T_world_camera, threads).normalised_depth()
+        parts.append(surface_points(replace(frame, depth=depth))[0])
+    return np.concatenate(parts) if parts else np.empty((0, 3))
+
+
+def _without_robot(scene: "SceneFolder") -> "SplatSet | GaussianSet":
+    from splatctrl_cli.records import Label
+
+    if scene.is_anisotropic:
+        return scene.gaussians()
+    splats = scene.splats()
+    kept = splats.labels != Label.ROBOT
+    return replace(splats, **{name: values[kept] for name, values in vars(splats).items()})

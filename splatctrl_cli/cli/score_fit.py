@@ -1,0 +1,306 @@
+"""``score --fit``: both methods on the same views, scored alike, and printed beside what the paper prints."""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.common import Console, check_gate_names, check_gates, configured, table
+from splatctrl_cli.cli.score_reference import words
+from splatctrl_cli.cli.score_report import cell, protocol_lines
+from splatctrl_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.records import RecordSource
+
+    ScoreScene = Callable[[argparse.Namespace, Console, Path | None], tuple[dict[str, Any], RecordSource]]
+
+NUM_SPLATS = 10_000  # IV-A: what both methods begin with, and the budget of ours
+METHODS = {"3dgs": "3D-GS", "budget": "ours"}
+PAPER = {"3dgs": ("23.27", "50,000-100,000"), "budget": ("23.33", "10,000")}  # IV-A: PSNR [dB] and Gaussians on DTU
+PROTOCOL = "dtu-holdout8"  # the paper names neither scans nor views
+FIRST_ITERATIONS = 300  # of ours: on the first time step, the rest refines
+KEYS = {"3dgs": "3dgs", "budget": "ours"}
+GATED = ("psnr_gain", *(f"{what}_{key}" for key in KEYS.values() for what in ("psnr", "splats", "memory", "seconds")))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """One method on one scan: splats, peak memory [MiB], seconds of fitting, and the scores of its views."""
+
+    scan: str
+    method: str
+    splats: int
+    iterations: int
+    memory: float
+    seconds: float
+    score: dict[str, Any]
+
+    @property
+    def psnr(self) -> float | None:
+        """[dB] by the protocol: over the mask where there is one."""
+        metrics = self.score["metrics"]
+        value: float | None = metrics["psnr_masked"] if "psnr_masked" in metrics else metrics["psnr_all"]
+        return value
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        values = {name: value for name, value in vars(self).items() if name != "score"}
+        return {**values, "psnr": self.psnr, "metrics": self.score["metrics"]}
+
+
+def add_fit(parser: argparse.ArgumentParser) -> None:
+    """``--fit`` and its options."""
+    group = parser.add_argument_group("fit")
+    group.add_argument(
+        "--fit",
+        action="store_true",
+        help="fit the scans of --dtu (--scan A,B; default: all), or the folder of --reference, with both methods,"
+        f" then score them (default protocol of scans: {PROTOCOL})",
+    )
+    group.add_argument(
+        "--fit-iterations", type=int, metavar="N", help="of each method (default: those of the configuration, 2300)"
+    )
+    group.add_argument(
+        "--fit-splats", type=int, metavar="N", help="the budget, and Gaussians to begin with (default: 10000)"
+    )
+
+
+def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
+    """Fit, score, print the table, and return the exit code."""
+    _refuse(args)
+    config = configured(args)
+    iterations, splats = args.fit_iterations, NUM_SPLATS if args.fit_splats is None else args.fit_splats
+    if iterations is None:
+        iterations = config.scene.first_iterations + config.scene.refine_iterations
+    for name, value in (("iterations", iterations), ("splats", splats)):
+        if value < 1:
+            raise UsageError(f"--fit-{name}: expected at least 1, got {value}")
+    check_gate_names(args.require, GATED)
+    console, scans = Console(args), _scans(args)
+    if args.dtu is not None:
+        args.protocol = args.protocol or PROTOCOL
+    fits: list[Fitted] = []
+    with _folder(args) as folder:
+        for scan in scans:
+            for method, name in METHODS.items():
+                console.log(f"{scan}: fits {name}, {iterations} iterations")
+                place = folder / scan / method
+                scene, memory = _reconstruct(args, place / "scene", scan, _settings(method, iterations, splats))
+                fits.append(_scored(args, console, place, scan, method, scene, memory, score_scene))
+        result = _result(args, fits, iterations, splats)
+        if args.out is not None:
+            _write(folder, args, result, config.as_dict())
+    console.result(result, _lines(result, fits))
+    check_gates(args.require, result["metrics"])
+    return 0
+
+
+def _refuse(args: argparse.Namespace) -> None:
+    if args.scene is not None:
+        raise UsageError(f"--fit: makes the scenes itself, got {args.scene}", remedy="leave SCENE or --fit out")
+    if args.cloud is not None:
+        raise UsageError("--fit: compares with no cloud", remedy="score the scenes that --fit -o leaves with --cloud")
+    if args.dtu is not None and args.holdout:
+        raise UsageError("--fit: goes by a protocol", remedy=f"give --protocol holdout:{args.holdout}")
+    if args.reference is not None and args.reference.suffix != ".toml":
+        raise UsageError(
+            f"--fit: expected scans (--dtu) or the TOML of an image folder, got {args.reference}",
+            remedy="the baseline fits views of a scene that stands still",
+        )
+
+
+def _scored(
+    args: argparse.Namespace,
+    console: Console,
+    place: Path,
+    scan: str,
+    method: str,
+    scene: Path,
+    memory: float,
+    score_scene: "ScoreScene",
+) -> Fitted:
+    run = json.loads((scene / "run.json").read_text(encoding="utf-8"))
+    dtu_scan = scan if args.dtu is not None else None
+    scoring = argparse.Namespace(**{**vars(args), "scene": scene, "scan": dtu_scan})
+    folder = place / "score" if args.out is not None else None
+    if folder is not None:
+        folder.mkdir()
+    result, _ = score_scene(scoring, console, folder)
+    return Fitted(
+        scan=scan,
+        method=method,
+        splats=int(run["metrics"]["splats"]),
+        iterations=int(run["metrics"]["iterations"]),
+        memory=memory,
+        seconds=float(run["seconds"]["fit"]),
+        score=result,
+    )
+
+
+def _settings(method: str, iterations: int, splats: int) -> list[str]:
+    first = min(FIRST_ITERATIONS, iterations)
+    settings = (
+        *(f"gaussians.iterations={iterations}", f"scene.first_iterations={first}"),
+        f"scene.refine_iterations={iterations - first}",
+    )
+    given = [word for setting in settings for word in ("--set", setting)]
+    return [*given, "--method", method, "--max-splats", str(splats)]
+
+
+def _reconstruct(args: argparse.Namespace, scene: Path, scan: str, settings: list[str]) -> tuple[Path, float]:
+    """`reconstruct` in a process of its own; returns the scene and the process's peak memory [MiB].
+
+    Raises InputError with what it says where it does not end well.
+    """
+    from splatctrl_cli.cli import launch
+
+    scene.parent.mkdir(parents=True)
+    source = [str(args.reference)] if args.dtu is None else ["--dtu", str(args.dtu), "--scan", scan]
+    command = [sys.executable, "-m", "splatctrl_cli", "reconstruct", *source, "-q", "-o", str(scene), *settings]
+    command += ["--seed", str(args.seed), "--threads", str(args.threads)]
+    command += [word for setting in args.set for word in ("--set", setting)]
+    for name in ("config", "depths", "protocol", "root", "holdout", "depth_scale"):
+        if getattr(args, name) is not None:
+            command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
+    launcher = [sys.executable, "-S", str(Path(launch.__file__))]
+    done = subprocess.run([*launcher, *command], check=False, capture_output=True, text=True)
+    said = done.stderr.strip().splitlines()
+    _, peak, code = done.stdout.split() if done.stdout else ("", "0", "-1")
+    if code != "0":
+        raise InputError(f"{scan}: reconstruct ended with {code}: {said[-1] if said else 'it said nothing'}")
+    return scene, float(peak) / 1024
+
+
+def _scans(args: argparse.Namespace) -> list[str]:
+    from splatctrl_cli.io.dtu import scan_folders
+    from splatctrl_cli.io.idr import idr_scans
+
+    if args.dtu is None:
+        return [args.reference.stem]
+    found = idr_scans(args.dtu) if not (args.dtu / "Rectified").is_dir() else {}
+    known = list(found or scan_folders(args.dtu))
+    wanted = known if args.scan is None else words(args.scan)
+    unknown = [name for name in wanted if name not in known]
+    if unknown or not wanted:
+        got = f"no scan {unknown[0]!r}" if unknown else "no scan"
+        raise InputError(f"{args.dtu}: {got}", remedy=f"scans: {', '.join(known) or 'none is there'}")
+    return list(dict.fromkeys(wanted))
+
+
+@contextmanager
+def _folder(args: argparse.Namespace) -> Iterator[Path]:
+    """Where the scenes go: the output, or a place for the time of the run."""
+    from splatctrl_cli.io.output import output_path
+
+    if args.out is None:
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder)
+        return
+    with output_path(args.out, force=args.force, is_folder=True) as partial:
+        yield partial
+
+
+def _result(args: argparse.Namespace, fits: Sequence[Fitted], iterations: int, splats: int) -> dict[str, Any]:
+    metrics: dict[str, float | None] = {}
+    for method, key in KEYS.items():
+        rows = [fit for fit in fits if fit.method == method]
+        metrics[f"psnr_{key}"] = _mean([fit.psnr for fit in rows])
+        metrics[f"splats_{key}"] = _mean([fit.splats for fit in rows])
+        metrics[f"memory_{key}"] = max(fit.memory for fit in rows)
+        metrics[f"seconds_{key}"] = _mean([fit.seconds for fit in rows])
+    ours, theirs = metrics["psnr_ours"], metrics["psnr_3dgs"]
+    metrics["psnr_gain"] = None if ours is None or theirs is None else ours - theirs
+    first = fits[0].score["protocol"]
+    scans = list(dict.fromkeys(fit.scan for fit in fits))
+    averaging = "mean over the views of a scan" + (", then over the scans" if len(scans) > 1 else "")
+    return {
+        "source": str(args.dtu or args.reference),
+        "scans": scans,
+        "protocol": first | {"averaging": averaging},
+        "psnr": "over every pixel" if first["mask_rule"] == "none" else "over the mask",
+        "settings": {
+            "splats": splats,
+            "iterations": iterations,
+            "seed": args.seed,
+            "losses": "identical: scene.lambda_* of the configuration",
+        },
+        "paper": {METHODS[name]: {"psnr": float(psnr), "splats": number} for name, (psnr, number) in PAPER.items()},
+        "metrics": metrics,
+        "fits": [fit.as_dict() for fit in fits],
+    }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None where any is missing."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
+
+
+def _lines(result: dict[str, Any], fits: Sequence[Fitted]) -> list[str]:
+    metrics, settings = result["metrics"], result["settings"]
+    rows = []
+    for method, name in METHODS.items():
+        scans = [cell("psnr", fit.psnr) for fit in fits if fit.method == method]
+        rest = [_whole(metrics[f"{what}_{KEYS[method]}"]) for what in ("splats", "memory", "seconds")]
+        rows.append([name, *PAPER[method], *scans, cell("psnr", metrics[f"psnr_{KEYS[method]}"]), *rest])
+    header = ("method", "paper dB", "paper splats", *(f"{scan} dB" for scan in result["scans"]))
+    return [
+        *table((*header, "mean dB", "splats", "memory MiB", "fit s"), rows),
+        "",
+        *_each(fits),
+        "",
+        *protocol_lines(result["protocol"]),
+        f"PSNR {result['psnr']}; {settings['splats']:,} splats to begin with, {settings['iterations']} iterations,"
+        f" seed {settings['seed']}, the same losses",
+        "memory: the largest of the scans; the paper names no scans, views, resolution or iterations for its figures",
+    ]
+
+
+EACH = ("psnr_seen", "psnr_all", "ssim_seen", "ssim_all", "depth_median_seen", "depth_median_all")
+
+
+def _each(fits: Sequence[Fitted]) -> list[str]:
+    """What else was scored, a row for each fit."""
+    rows = []
+    for fit in fits:
+        metrics = fit.score["metrics"]
+        figures = [cell(name, metrics[name]) for name in EACH]
+        rows.append([fit.scan, METHODS[fit.method], fit.splats, *figures, f"{fit.memory:.0f}", f"{fit.seconds:.0f}"])
+    header = (
+        "scan",
+        "method",
+        "splats",
+        "dB seen",
+        "dB all",
+        "SSIM seen",
+        "SSIM all",
+        "depth mm seen",
+        "depth mm all",
+    )
+    return table((*header, "memory MiB", "fit s"), rows)
+
+
+def _whole(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
+
+
+def _write(folder: Path, args: argparse.Namespace, result: dict[str, Any], config: dict[str, Any]) -> None:
+    from splatctrl_cli.io.output import Stopwatch, write_json, write_run
+
+    write_json(folder / "score.json", result)
+    write_run(
+        folder,
+        command="score",
+        config=config,
+        inputs={},
+        metrics=result["metrics"],
+        stopwatch=Stopwatch(),
+        seed=args.seed,
+    )

@@ -1,0 +1,220 @@
+"""What `score` compares with: the recording, which of its views are scored by which protocol, and their masks."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.common import Console
+from splatctrl_cli.cli.source_options import source_options
+from splatctrl_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.io.dtu_source import DtuSource
+    from splatctrl_cli.io.protocols import ScoreProtocol, Split
+    from splatctrl_cli.io.scene_folder import SceneFolder
+    from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """source: the recording with all its cameras. protocol and split where one was named; training_stamps_ns: of the
+    views that it trains on. mask: of a frame, the pixels that the mask rule selects; mask_rule says it in words.
+    Without depth, nothing says what a training camera saw.
+    """
+
+    source: "RecordSource"
+    layout: str
+    protocol: "ScoreProtocol | None" = None
+    split: "Split | None" = None
+    training_stamps_ns: frozenset[int] = frozenset()
+    mask: "Callable[[RgbdFrame], Bool | None] | None" = None
+    mask_rule: str = "none"
+    numbered_by_stamp: bool = False
+    has_depth: bool = True
+
+    @property
+    def scores_training(self) -> bool:
+        """Whether the protocol scores the views that trained."""
+        return self.protocol is not None and self.protocol.scores_training
+
+
+def add_scan(parser: argparse.ArgumentParser) -> None:
+    """``--scan``, ``--protocol`` and ``--depths``: what `reconstruct` and `score` ask of a DTU scan."""
+    parser.add_argument("--scan", metavar="NAME", help="which scan of --dtu (default: the only one)")
+    parser.add_argument(
+        "--protocol",
+        metavar="NAME",
+        help="which views train and which are scored: dtu-train, dtu-holdout8, regnerf-3, regnerf-6, regnerf-9, "
+        "mvsnerf, holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (docs/score.md)",
+    )
+    parser.add_argument(
+        "--depths", type=Path, metavar="DIR", help="depth_map_0000.pfm and so on of a scan in IDR's layout"
+    )
+
+
+def open_dtu(args: argparse.Namespace, masks: Path | None = None) -> "DtuSource":
+    """The scan that --dtu, --scan, --holdout, --protocol and --depths name."""
+    from splatctrl_cli.io.dtu_source import DtuSource, view_numbers
+    from splatctrl_cli.io.protocols import score_protocol
+
+    protocol = None if args.protocol is None else score_protocol(args.protocol)
+    holdout = view_numbers(words(args.holdout or ""))
+    return DtuSource(args.dtu, args.scan, holdout, protocol=protocol, masks=masks, depths=args.depths)
+
+
+def open_held_out(args: argparse.Namespace, path: Path) -> tuple["RecordSource", "ScoreProtocol", "Split"]:
+    """An image folder with the views held out that --protocol holdout:RULE names, by their places in it."""
+    from splatctrl_cli.io.protocols import score_protocol
+    from splatctrl_cli.io.source import open_source
+
+    protocol = score_protocol(args.protocol)
+    if path.suffix != ".toml" or not args.protocol.startswith("holdout:"):
+        raise UsageError(
+            f"--protocol {args.protocol}: expected --dtu, or holdout:RULE and the TOML of an image folder",
+            remedy="leave --protocol out, or give --dtu ROOT",
+        )
+    if args.holdout:
+        raise UsageError("--holdout: the protocol says what is held out", remedy="leave one of them out")
+    options = replace(source_options(args), cameras=None)
+    numbers = range(sum(1 for _ in open_source(path, options).poses()))
+    split = protocol.split(numbers, str(path))
+    return open_source(path, replace(options, holdout=tuple(map(str, split.scored)))), protocol, split
+
+
+def refuse_scan_options(args: argparse.Namespace) -> None:
+    """Raise UsageError for what belongs to --dtu where there is none."""
+    for name in ("scan", "depths"):
+        if getattr(args, name):
+            raise UsageError(f"--{name} {getattr(args, name)}: only with --dtu", remedy="leave it out")
+
+
+def open_reference(args: argparse.Namespace, console: Console) -> Reference:
+    """The recording with all its cameras: --cameras chooses those to score, the others say what was seen."""
+    if args.dtu is not None:
+        return _dtu_reference(args, console)
+    from splatctrl_cli.io.source import open_source
+
+    refuse_scan_options(args)
+    if args.masks is not None:
+        raise UsageError(f"--masks {args.masks}: only with --dtu", remedy="leave it out")
+    if args.protocol is not None:
+        source, protocol, split = open_held_out(args, args.reference)
+        stamps = [stamp for stamp, _, _ in source.poses()]  # type: ignore[attr-defined]
+        return Reference(
+            source=source,
+            layout="image folder",
+            protocol=protocol,
+            split=split,
+            training_stamps_ns=frozenset(stamps[n] for n in split.training),
+        )
+    return Reference(source=open_source(args.reference, replace(source_options(args), cameras=None)), layout="")
+
+
+def _dtu_reference(args: argparse.Namespace, console: Console) -> Reference:
+    source = open_dtu(args, args.masks)
+    split, protocol = source.split, None
+    if args.protocol is not None:
+        from splatctrl_cli.io.protocols import score_protocol
+
+        protocol = score_protocol(args.protocol)
+    mask, rule = _mask_of(source, "given" if protocol is None else protocol.mask)
+    if protocol is not None and protocol.mask == "object" and mask is None:
+        console.log(
+            f"warning: {args.protocol}: its published figures are over the object alone, and there is no mask: every"
+            " pixel counts here; --masks DIR gives the masks"
+        )
+    return Reference(
+        source=source,
+        layout=f"{source.layout}'s",
+        protocol=protocol,
+        split=split,
+        training_stamps_ns=frozenset(split.training) if protocol else frozenset(),
+        mask=mask,
+        mask_rule=rule,
+        numbered_by_stamp=True,
+        has_depth=source.has_depth,
+    )
+
+
+def _mask_of(source: "DtuSource", wanted: str) -> "tuple[Callable[[RgbdFrame], Bool | None] | None, str]":
+    if wanted == "depth":
+        return (lambda frame: frame.depth > 0), "pixels with a reference depth"
+    if any(source.mask(number) is not None for number in source.split.scored or source.split.training):
+        return (lambda frame: source.mask(frame.stamp_ns)), "object mask"
+    return None, "none"
+
+
+def words(text: str) -> list[str]:
+    """The words between commas."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def cameras_to_score(args: argparse.Namespace, reference: Reference, training: Sequence[str]) -> tuple[str, ...]:
+    """The cameras that are scored: by default those that did not train. Raises UsageError where there is none."""
+    where, recorded = args.reference or args.dtu, reference.source.cameras
+    if reference.scores_training:
+        return recorded
+    if args.cameras is None:
+        cameras = tuple(name for name in recorded if name not in training)
+        if cameras:
+            return cameras
+        if args.allow_training and recorded:
+            return recorded
+        raise UsageError(
+            f"{where}: each camera is called like one that trained the scene ({', '.join(recorded)})",
+            remedy="give the views that reconstruct left out as --holdout or --protocol, or --allow-training",
+        )
+    cameras = tuple(dict.fromkeys(words(args.cameras)))
+    unknown = [name for name in cameras if name not in recorded]
+    if unknown:
+        raise InputError(f"{where}: no camera {unknown[0]!r}", remedy=f"use one of: {', '.join(recorded)}")
+    trained = [name for name in cameras if name in training]
+    if trained and not args.allow_training:
+        raise UsageError(
+            f"--cameras {args.cameras}: {trained[0]} trained the scene, its score says nothing about other views",
+            remedy="give a camera that was held out, or --allow-training",
+        )
+    return cameras
+
+
+def check_training(args: argparse.Namespace, reference: Reference, scene: "SceneFolder") -> None:
+    """Raise UsageError where the scene was not trained on the views that the protocol trains on."""
+    if reference.protocol is None or reference.split is None:
+        return
+    trained, expected = scene.training_stamps_ns, reference.training_stamps_ns
+    if trained == expected:
+        return
+    lacks, others = len(expected - trained), len(trained - expected)
+    raise UsageError(
+        f"{args.scene}: protocol {reference.protocol.name} trains on {len(expected)} views"
+        f" ({reference.split.words()}), of which {lacks} did not train the scene, and {others} others did",
+        remedy=f"reconstruct with --protocol {reference.protocol.name}",
+    )
+
+
+def recording_check(args: argparse.Namespace, reference: Reference, scene: "SceneFolder") -> dict[str, Any]:
+    """What the recording has in common with the one that made the scene. Raises InputError where they differ.
+
+    By the first frame of each camera that trained; for a scene of an older version, by the digests of the files.
+    """
+    from splatctrl_cli.evaluate.recording import differences
+
+    recorded = scene.run["metrics"].get("first_frames") if "metrics" in scene.run else None
+    where = args.reference or args.dtu
+    if recorded:
+        basis = "intrinsics, stamp, pose and picture of each training camera's first frame"
+        lines = differences(recorded, reference.source.records())
+    elif scene.run.get("inputs"):
+        basis = "digests of the files"
+        then, now = set(scene.run["inputs"].values()), set(reference.source.digests().values())
+        lines = [] if then <= now or now <= then else [f"{len(then - now)} of {len(then)} files that made it differ"]
+    else:
+        return {"basis": "nothing was recorded that could be compared", "differences": []}
+    if lines and not args.allow_other_recording:
+        raise InputError(
+            f"{where}: not the recording that {args.scene} was made from: {'; '.join(lines)}",
+            remedy="give that recording, or --allow-other-recording to score against this one",
+        )
+    return {"basis": basis, "differences": lines}

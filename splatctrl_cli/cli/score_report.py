@@ -1,0 +1,201 @@
+"""What `score` prints and writes: the protocol it went by, a row per view, the mean."""
+
+import argparse
+from math import nan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.cli.common import table
+from splatctrl_cli.cli.score_cloud import CloudSettings
+from splatctrl_cli.cli.score_reference import Reference
+from splatctrl_cli.cli.score_views import Scores
+
+if TYPE_CHECKING:
+    from splatctrl_cli.evaluate.perceptual import Lpips
+    from splatctrl_cli.io.output import Stopwatch
+    from splatctrl_cli.io.scene_folder import SceneFolder
+
+
+def result_of(
+    args: argparse.Namespace,
+    scene: "SceneFolder",
+    reference: Reference,
+    cameras: tuple[str, ...],
+    scores: Scores,
+    *,
+    recording: dict[str, Any],
+    cloud: tuple[CloudSettings, dict[str, float]] | None,
+    lpips: "Lpips | None",
+) -> dict[str, Any]:
+    """Everything that --json prints."""
+    from splatctrl_cli.evaluate.score import PROTOCOL, as_json, total_score
+
+    metrics = total_score(scores.views) | (cloud[1] if cloud else {})
+    metrics |= {"free_mass": _free_mass(args.scene, scene), "num_skipped": len(scores.skipped)}
+    definitions = PROTOCOL | ({"cloud": cloud[0].words()} if cloud else {})
+    return {
+        "scene": str(args.scene),
+        "reference": str(args.reference or args.dtu),
+        "cameras": list(cameras),
+        "training_cameras": list(scene.cameras),
+        "has_clock": scores.has_clock,
+        "snapshots": args.snapshots if scores.has_clock else "final",
+        "recording": recording,
+        "protocol": _protocol(reference, scene, scores, lpips) | {"definitions": definitions},
+        "metrics": as_json(metrics),
+        "skipped_views": scores.skipped,
+        "views": [
+            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scores.views
+        ],
+    }
+
+
+def _protocol(reference: Reference, scene: "SceneFolder", scores: Scores, lpips: "Lpips | None") -> dict[str, Any]:
+    """What a figure has to be printed with to be compared with another."""
+    named, split = reference.protocol, reference.split
+    sizes = sorted({view.size for view in scores.views})
+    return {
+        "name": "none" if named is None else named.name,
+        "source": "none" if named is None else named.source,
+        "layout": reference.layout,
+        "training_views": None if split is None else list(split.training),
+        "scored_views": None if split is None else list(split.scored),
+        "left_out_views": None if split is None else list(split.left_out),
+        "split": "by camera" if split is None else split.words(),
+        "mask_rule": reference.mask_rule,
+        "resolution": [f"{width}x{height}" for width, height in sizes],
+        "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
+        "background": [round(value, 4) for value in scene.background],
+        "averaging": "mean over the views of the scan",
+        "lpips": None if lpips is None else lpips.name,
+    }
+
+
+def _free_mass(path: Path, scene: "SceneFolder") -> float:
+    """nan where the scene has no occupancy grid."""
+    from splatctrl_cli.evaluate.free_space import free_mass
+
+    if not (path / "occupancy.npz").is_file():
+        return nan
+    return free_mass(scene.splats(), scene.occupancy(), float(scene.run["config"]["occupancy"]["free_below"]))
+
+
+def write_scores(
+    folder: Path,
+    args: argparse.Namespace,
+    reference: Reference,
+    result: dict[str, Any],
+    scores: Scores,
+    stopwatch: "Stopwatch",
+) -> None:
+    """The files of ``score -o``."""
+    import csv
+
+    from splatctrl_cli.evaluate.pictures import comparison_picture
+    from splatctrl_cli.io.output import sha256, write_json, write_run
+
+    write_json(folder / "score.json", result)
+    with (folder / "views.csv").open("w", newline="", encoding="utf-8") as stream:
+        rows = csv.DictWriter(stream, fieldnames=list(result["views"][0]), lineterminator="\n")
+        rows.writeheader()
+        rows.writerows(result["views"])
+    with stopwatch.stage("pictures"):
+        for camera, (_, best) in scores.best.items() if args.images != "none" else ():
+            worst = scores.worst[camera][1]
+            comparison = [best] if worst.title == best.title else [best, worst]
+            comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
+    protocol = {name: value for name, value in result["protocol"].items() if name != "definitions"}
+    write_run(
+        folder,
+        command="score",
+        config={"cameras": result["cameras"], "snapshots": result["snapshots"], "protocol": protocol},
+        inputs={**reference.source.digests(), "scene/splats.ply": sha256(args.scene / "splats.ply")},
+        metrics=result["metrics"],
+        stopwatch=stopwatch,
+    )
+
+
+COLUMNS = {
+    "psnr_seen": "dB seen",
+    "psnr_all": "dB all",
+    "psnr_masked": "dB mask",
+    "ssim_seen": "SSIM seen",
+    "ssim_all": "SSIM all",
+    "ssim_published": "SSIM publ.",
+    "lpips": "LPIPS",
+    "depth_median_seen": "depth mm seen",
+    "depth_median_all": "depth mm all",
+    "in_front_seen": "in front",
+    "seen_share": "seen",
+    "mask_share": "mask",
+    "valid_share": "valid",
+}
+SHARES = ("seen_share", "in_front_seen", "mask_share", "valid_share")
+
+
+def lines_of(result: dict[str, Any]) -> list[str]:
+    """The table, and what belongs to its figures."""
+    metrics, columns = result["metrics"], [name for name in COLUMNS if name in result["metrics"]]
+    stamps = [f"{view['stamp_ns'] / 1e9:.3f}" if result["has_clock"] else "-" for view in result["views"]]
+    views = [
+        [view["view"], stamp, *(cell(n, view[n]) for n in columns)]
+        for view, stamp in zip(result["views"], stamps, strict=True)
+    ]
+    views.append([f"mean of {metrics['num_views']:.0f}", "-", *(cell(name, metrics[name]) for name in columns)])
+    lines = table(("view", "stamp [s]", *(COLUMNS[name] for name in columns)), views)
+    lines.insert(len(lines) - 1, lines[1])
+    lines += ["", *protocol_lines(result["protocol"])]
+    lines.append(
+        f"{_count(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
+        f"depth: median of the absolute error; seen: by {', '.join(result['training_cameras'])} within 2 cm"
+    )
+    if "chamfer" in metrics:
+        lines += _cloud_lines(metrics, result["protocol"]["definitions"]["cloud"])
+    lines += [f"warning: another recording: {line}" for line in result["recording"]["differences"]]
+    lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
+    if metrics["free_mass"] is not None:
+        lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")
+    return lines
+
+
+def protocol_lines(protocol: dict[str, Any]) -> list[str]:
+    """Protocol, split, mask rule, averaging, resolution and background, for people."""
+    color = ", ".join(f"{value:.2f}" for value in protocol["background"])
+    published = protocol["published_resolution"]
+    resolution = ", ".join(protocol["resolution"])
+    differs = "" if published in (None, resolution) else f" (published figures: {published})"
+    return [
+        f"protocol: {protocol['name']}" + ("" if protocol["name"] == "none" else f" ({protocol['source']})"),
+        f"split: {protocol['split']}",
+        f"mask rule: {protocol['mask_rule']}; averaging: {protocol['averaging']}; resolution: {resolution}{differs};"
+        f" background: ({color})",
+    ]
+
+
+def _cloud_lines(metrics: dict[str, Any], words: str) -> list[str]:
+    def share(name: str) -> str:
+        return "-" if metrics[name] is None else f"{100 * metrics[name]:.1f}% farther"
+
+    parts = [f"accuracy {_millimetres(metrics['accuracy'])} ({share('accuracy_beyond')})"]
+    for name, of in (("completeness", "all"), ("completeness_seen", "seen")):
+        parts.append(f"completeness of {of} {_millimetres(metrics[name])} ({share(name + '_beyond')})")
+    return [f"surface: {', '.join(parts)}, Chamfer {_millimetres(metrics['chamfer'])}", f"cloud: {words}"]
+
+
+def _millimetres(value: float | None) -> str:
+    return "-" if value is None else f"{1e3 * value:.2f} mm"
+
+
+def _count(number: float, noun: str) -> str:
+    return f"{number:.0f} {noun}{'' if number == 1 else 's'}"
+
+
+def cell(name: str, value: float | None) -> str:
+    """A figure as the table shows it."""
+    if value is None:
+        return "-"
+    if name.startswith("depth"):
+        return f"{1000 * value:.1f}"
+    if name in SHARES:
+        return f"{100 * value:.1f}%"
+    return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"

@@ -1,0 +1,183 @@
+"""Renders the views that are scored, from the splats of their time, and scores them one by one."""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.cli.common import Console
+from splatctrl_cli.cli.score_reference import Reference
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.evaluate.pictures import ComparisonRow
+    from splatctrl_cli.evaluate.score import Perceptual, ViewScore
+    from splatctrl_cli.evaluate.views import View
+    from splatctrl_cli.io.output import Stopwatch
+    from splatctrl_cli.io.scene_folder import SceneFolder
+    from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
+    from splatctrl_cli.scene.render import Rendering
+
+
+@dataclass(kw_only=True)
+class Scores:
+    """What scoring gathers: the views, the names of those before the first snapshot, each camera's extremes.
+
+    training: the frames that count as known at the last view.
+    """
+
+    has_clock: bool
+    views: list["ViewScore"] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    best: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
+    worst: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
+    training: tuple["RgbdFrame", ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scorer:
+    """Scores views of `reference`; every view's row of pictures goes to `draw`, where there is one."""
+
+    args: argparse.Namespace
+    scene: "SceneFolder"
+    reference: Reference
+    cameras: tuple[str, ...]
+    perceptual: "Perceptual | None" = None
+    draw: "Callable[[ComparisonRow], None] | None" = None
+
+    def run(self, console: Console, stopwatch: "Stopwatch") -> Scores:
+        """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
+        from splatctrl_cli.evaluate.views import views_to_score
+
+        args, scene, source = self.args, self.scene, self.reference.source
+        has_clock = scene.has_clock and source.has_clock
+        splats_at = _SplatsAt(scene, use_snapshots=has_clock and args.snapshots == "newest")
+        scores = Scores(has_clock=has_clock)
+        views = views_to_score(
+            source,
+            scoring=self.cameras,
+            training=scene.cameras,
+            has_clock=has_clock,
+            numbered_by_stamp=self.reference.numbered_by_stamp,
+        )
+        may_train = args.allow_training or self.reference.scores_training
+        for view in views:
+            if view.frame.stamp_ns in scene.training_stamps_ns and not may_train:
+                raise UsageError(
+                    f"{view.name}: trained the scene, its score says nothing about other views",
+                    remedy="give the --holdout or --protocol that reconstruct was given, or --allow-training",
+                )
+            if has_clock and not splats_at.is_known(view.frame.stamp_ns):
+                scores.skipped.append(view.name)
+                continue
+            with stopwatch.stage("score"):
+                self._score_one(scores, view, splats_at(view.frame.stamp_ns))
+            if len(scores.views) % 20 == 0:
+                console.log(f"scored {len(scores.views)} views")
+        self._check(scores)
+        return scores
+
+    def _check(self, scores: Scores) -> None:
+        where, cameras = self.args.reference or self.args.dtu, ", ".join(self.cameras)
+        if not scores.views:
+            raise NotEvaluableError(
+                f"{where}: no view of {cameras} to score; {len(scores.skipped)} lie before the first snapshot of the"
+                " scene",
+                remedy="give the recording that the scene was reconstructed from, or other --cameras",
+            )
+        if self.reference.has_depth and not any(view.seen.share for view in scores.views):
+            raise NotEvaluableError(
+                f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
+                remedy="is it the same world and the same scene? give the recording that reconstruct was given",
+            )
+
+    def _score_one(self, scores: Scores, view: "View", splats: "SplatSet | GaussianSet") -> None:
+        from splatctrl_cli.evaluate.pictures import ComparisonRow
+        from splatctrl_cli.evaluate.score import score_view
+        from splatctrl_cli.evaluate.visibility import seen_pixels
+
+        frame, protocol = view.frame, self.reference.protocol
+        rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.args.threads)
+        rendering = rendering.before(self.scene.background)
+        depth = rendering.normalised_depth()
+        score = score_view(
+            view=view.name,
+            color=rendering.color,
+            depth=depth,
+            frame=frame,
+            seen=seen_pixels(frame, view.training),
+            mask=None if self.reference.mask is None else self.reference.mask(frame),
+            fill=0.0 if protocol is None else protocol.fill,
+            perceptual=self.perceptual,
+        )
+        scores.views.append(score)
+        scores.training = view.training
+        rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
+        row = ComparisonRow(
+            title=view.name,
+            figures=f"{score.seen.psnr:.1f} dB where seen, {score.all.psnr:.1f} dB in all",
+            photo=frame.color,
+            render=rendering.color,
+            photo_depth=frame.depth,
+            render_depth=depth,
+        )
+        if self.draw is not None:
+            self.draw(row)
+        if frame.camera not in scores.best or rank > scores.best[frame.camera][0]:
+            scores.best[frame.camera] = (rank, row)
+        if frame.camera not in scores.worst or rank < scores.worst[frame.camera][0]:
+            scores.worst[frame.camera] = (rank, row)
+
+
+def rendered(
+    splats: "SplatSet | GaussianSet", intrinsics: "Intrinsics", T_world_camera: "Float64", threads: int
+) -> "Rendering":
+    """What a camera sees of splats of either kind."""
+    from splatctrl_cli.records import GaussianSet
+    from splatctrl_cli.scene.gaussians import render_gaussians
+    from splatctrl_cli.scene.render import render
+
+    if isinstance(splats, GaussianSet):
+        return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
+    return render(splats, intrinsics, T_world_camera, threads=threads)
+
+
+class _SplatsAt:
+    """The splats that a view is rendered from; a snapshot is read once for all the views it serves."""
+
+    def __init__(self, scene: "SceneFolder", *, use_snapshots: bool) -> None:
+        self._scene = scene
+        self._stamps = [] if scene.is_anisotropic else sorted(snapshot.stamp_ns for snapshot in scene.snapshots)
+        self._use_snapshots = use_snapshots
+        self._loaded: tuple[int, SplatSet | GaussianSet] | None = None
+
+    def is_known(self, stamp_ns: int) -> bool:
+        """Whether the scene had a snapshot at that time."""
+        return bool(self._stamps) and self._stamps[0] <= stamp_ns
+
+    def __call__(self, stamp_ns: int) -> "SplatSet | GaussianSet":
+        from bisect import bisect_right
+
+        number = bisect_right(self._stamps, stamp_ns) if self._use_snapshots else -1
+        if self._loaded is None or self._loaded[0] != number:
+            self._loaded = (number, self._read(stamp_ns))
+        return self._loaded[1]
+
+    def _read(self, stamp_ns: int) -> "SplatSet | GaussianSet":
+        if self._scene.is_anisotropic:
+            return self._scene.gaussians()
+        return self._scene.splats_at(stamp_ns) if self._use_snapshots else self._scene.splats()
+
+
+def view_drawer(folder: Path) -> "Callable[[ComparisonRow], None]":
+    """Writes the pictures of each view into `folder`."""
+    from splatctrl_cli.evaluate.view_picture import view_picture
+
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def draw(row: "ComparisonRow") -> None:
+        view_picture(folder / f"{row.title}.png", row)
+
+    return draw

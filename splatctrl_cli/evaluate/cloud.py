@@ -1,0 +1,123 @@
+"""How far the surface of a scene is from reference points, and how much of the reference it covers."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.mesh_distance import TriangleMesh
+from splatctrl_cli.records import Bool, Float64
+
+MAX_DISTANCE = 0.020  # [m] of DTU's evaluation: what is farther off counts in a share, not in a mean
+SPACING = 0.0002  # [m] of DTU's evaluation
+MAX_POINTS = 2_000_000  # on a mesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudScore:
+    """accuracy: mean distance [m] of the surface's points to the reference; completeness: of the reference's points
+    to the surface; chamfer: the mean of both. Points farther than the maximum distance count only in the `*_beyond`
+    shares. completeness_seen: over reference points that a training camera saw. nan where no point is left.
+    """
+
+    accuracy: float
+    completeness: float
+    completeness_seen: float
+    chamfer: float
+    accuracy_beyond: float
+    completeness_beyond: float
+    completeness_seen_beyond: float
+    num_points: int
+    num_reference: int
+
+    def figures(self) -> dict[str, float]:
+        """By flat name."""
+        return {name: float(value) for name, value in vars(self).items()}
+
+
+def cloud_score(points: Float64, reference: Float64, seen: Bool, *, max_distance: float = MAX_DISTANCE) -> CloudScore:
+    """Distances between the surface's points (P, 3) and the reference's (R, 3) [m], world; seen (R,).
+
+    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py, have it: means over distances below `max_distance`; but
+    without their hand-made observation masks and ground planes, instead of which `seen` says what could be
+    reconstructed. Raises NotEvaluableError where nothing lies that near.
+    """
+    if not max_distance > 0:
+        raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
+    if not len(points):
+        raise NotEvaluableError("the scene's surface: expected points to compare with the cloud, got none")
+    to_reference = np.asarray(cKDTree(reference).query(points)[0])
+    to_surface = np.asarray(cKDTree(points).query(reference)[0])
+    if to_reference.min() >= max_distance:
+        raise NotEvaluableError(
+            f"the reference cloud: expected points within {1e3 * max_distance:g} mm of the scene's surface, got none;"
+            f" it spans {_box(reference)} m, the surface {_box(points)} m",
+            remedy="is it the same scene, in the same frame? give the cloud's unit as --cloud-unit",
+        )
+    accuracy, accuracy_beyond = _mean_below(to_reference, max_distance)
+    completeness, completeness_beyond = _mean_below(to_surface, max_distance)
+    completeness_seen, completeness_seen_beyond = _mean_below(to_surface[seen], max_distance)
+    return CloudScore(
+        accuracy=accuracy,
+        completeness=completeness,
+        completeness_seen=completeness_seen,
+        chamfer=(accuracy + completeness) / 2,
+        accuracy_beyond=accuracy_beyond,
+        completeness_beyond=completeness_beyond,
+        completeness_seen_beyond=completeness_seen_beyond,
+        num_points=len(points),
+        num_reference=len(reference),
+    )
+
+
+def cloud_names() -> tuple[str, ...]:
+    """The names of `CloudScore.figures`, known before anything is scored."""
+    return tuple(CloudScore.__dataclass_fields__)
+
+
+def thinned(points: Float64, spacing: float) -> Float64:
+    """One of the points (P, 3) for each cube of edge `spacing` [m] that holds any: the first.
+
+    DTU's evaluation keeps random points that are `spacing` apart; this is as dense, and takes seconds for millions.
+    """
+    if not spacing > 0:
+        raise UsageError(f"--cloud-spacing: expected a distance above 0 m, got {spacing:g}")
+    if not len(points):
+        return points
+    cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
+    counts = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * counts[1] + cells[:, 1]) * counts[2] + cells[:, 2]
+    first = np.sort(np.unique(keys, return_index=True)[1])
+    return points[first]
+
+
+def points_on(mesh: TriangleMesh, spacing: float, *, seed: int = 0) -> Float64:
+    """Random points (P, 3) [m] on a mesh, even by area: four for each square of `spacing` [m], 2 million at most."""
+    corners = mesh.corners
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    num = min(math.ceil(4 * 0.5 * doubled.sum() / spacing**2), MAX_POINTS)
+    rng = np.random.default_rng(seed)
+    face = rng.choice(len(corners), num, p=doubled / doubled.sum())
+    u, v = rng.random((2, num))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    return np.asarray(np.einsum("nk,nka->na", np.stack([1 - u - v, u, v], axis=1), corners[face]))
+
+
+def _mean_below(distances: NDArray[np.floating], limit: float) -> tuple[float, float]:
+    """Mean of the distances below the limit, and the share of the others."""
+    if not len(distances):
+        return math.nan, math.nan
+    near = distances[distances < limit]
+    return float(near.mean()) if len(near) else math.nan, 1.0 - len(near) / len(distances)
+
+
+def _box(points: Float64) -> str:
+    def corner(values: Sequence[float]) -> str:
+        return "(" + ", ".join(f"{value:.3g}" for value in values) + ")"
+
+    return f"{corner(points.min(axis=0))} to {corner(points.max(axis=0))}"

@@ -1,0 +1,138 @@
+"""DTU scans in the layout of IDR and NeuS.
+
+SCAN/cameras_sphere.npz (or cameras.npz) with world_mat_I, the projection (4, 4) of world points to pixels of image I,
+and scale_mat_I, from the unit sphere around the object to the world; SCAN/image/000000.png; SCAN/mask/000.png.
+Image I is the I-th by name (Totoro97/NeuS, models/dataset.py). World lengths are millimetres there, metres here.
+There is no depth: SCAN/depth may hold depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.dtu import MILLIMETRES, DtuScan, DtuView, read_depth, read_image, read_mask
+from splatctrl_cli.records import Float64, Intrinsics
+
+CAMERAS = ("cameras_sphere.npz", "cameras.npz")
+MAX_SKEW = 1.0  # [px] our cameras have none
+PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
+
+
+def idr_scans(root: Path) -> dict[str, Path]:
+    """The folders of scans in this layout, by name: `root` itself, or those in it."""
+    folders = [root] if is_idr(root) else sorted(p for p in root.glob("*") if is_idr(p))
+    return {path.name.removeprefix("dtu_"): path for path in folders}
+
+
+def is_idr(folder: Path) -> bool:
+    """Whether a folder holds a scan in this layout."""
+    return any((folder / name).is_file() for name in CAMERAS)
+
+
+def read_idr(root: Path, scan: str | None = None, depths: Path | None = None) -> DtuScan:
+    """The views of scan `scan` (default: the only one); `depths` holds their depth maps (default: SCAN/depth).
+
+    A view without a depth map stays, with a depth of 0 everywhere. Raises InputError naming the file.
+    """
+    scans = idr_scans(root)
+    if scan is None and len(scans) == 1:
+        scan = next(iter(scans))
+    if scan is None or scan not in scans:
+        got = "several scans" if scan is None else f"no scan '{scan}'"
+        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(scans)}")
+    folder = scans[scan]
+    images = sorted((folder / "image").glob("*.png")) or sorted((folder / "image").glob("*.jpg"))
+    masks = sorted((folder / "mask").glob("*.png"))
+    if not images:
+        raise InputError(f"{folder / 'image'}: expected images such as 000000.png, got none")
+    if masks and len(masks) != len(images):
+        raise InputError(f"{folder / 'mask'}: expected {len(images)} masks, one for each image, got {len(masks)}")
+    path = next(folder / name for name in CAMERAS if (folder / name).is_file())
+    projections = _projections(path, len(images))
+    files = [path, *images, *masks]
+    views, without_depth = [], []
+    for number, (image, P) in enumerate(zip(images, projections, strict=True)):
+        color = read_image(image)
+        size = (color.shape[1], color.shape[0])
+        K, T_world_camera = decompose(P, f"{path}: world_mat_{number}")
+        depth = np.zeros(color.shape[:2], np.float32)
+        depth_path = (depths or folder / "depth") / f"depth_map_{number:04d}.pfm"
+        if depth_path.is_file():
+            visual = depth_path.with_name(f"depth_visual_{number:04d}.png")
+            depth = read_depth(depth_path, visual, size)
+            files += [depth_path, *([visual] if visual.is_file() else [])]
+        else:
+            without_depth.append(image.name)
+        views.append(
+            DtuView(
+                name=image.stem,
+                color=color,
+                depth=depth,
+                intrinsics=_intrinsics(K, size, path),
+                T_world_camera=T_world_camera,
+                mask=read_mask(masks[number], size) if masks else None,
+            )
+        )
+    if depths is not None and len(without_depth) == len(views):
+        raise InputError(f"{depths}: expected depth_map_0000.pfm and so on, got none")
+    return DtuScan(
+        name=scan,
+        views=tuple(views),
+        numbers=tuple(range(len(views))),
+        files=tuple(files),
+        without_depth=tuple(without_depth),
+    )
+
+
+def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
+    """K (3, 3) with K[2, 2] = 1 and T_world_camera (4, 4) [m] of a projection (3, 4) of world points [mm].
+
+    P = s K [R | t] with any scale s, negative ones too; the camera stands where P is 0. Raises InputError for a P
+    that is no camera.
+    """
+    M = P[:, :3]
+    determinant = np.linalg.det(M)
+    if not np.isfinite(P).all() or abs(determinant) < 1e-12 * np.linalg.norm(M) ** 3:
+        raise InputError(f"{where}: expected a camera's projection, got a matrix that cannot be inverted")
+    K, R = cv2.decomposeProjectionMatrix(P if determinant > 0 else -P)[:2]
+    signs = np.where(np.diag(K) < 0, -1.0, 1.0)  # K diag(signs), diag(signs) R: a camera with a positive focal length
+    K, R = np.asarray(K, np.float64) * signs, signs[:, None] * np.asarray(R, np.float64)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = R.T
+    T_world_camera[:3, 3] = -np.linalg.solve(M, P[:, 3]) / MILLIMETRES
+    return K / K[2, 2], T_world_camera
+
+
+def _projections(path: Path, num: int) -> list[Float64]:
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            world = [np.asarray(archive[f"world_mat_{i}"], np.float64)[:3, :4] for i in range(num)]
+            radius = float(archive["scale_mat_0"][0, 0]) / MILLIMETRES
+    except KeyError as error:
+        raise InputError(f"{path}: {error.args[0]}; expected world_mat and scale_mat of {num} images") from None
+    except Exception as error:  # numpy raises many kinds for a file that is no archive
+        raise InputError(f"{path}: not the cameras of a scan: {error}") from None
+    low, high = PLAUSIBLE_RADIUS
+    if not low <= radius <= high:
+        raise InputError(
+            f"{path}: scale_mat_0: expected a sphere of {low:g} to {high:g} m around the object, got {radius:g} m",
+            remedy="world lengths have to be millimetres, as DTU's; this file may hold cameras in the unit sphere",
+        )
+    return world
+
+
+def _intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
+    width, height = size
+    if abs(K[0, 1]) > MAX_SKEW:
+        raise InputError(f"{path}: expected cameras without skew, got one of {K[0, 1]:.2f} px")
+    if not (0.2 < K[0, 2] / width < 0.8 and 0.2 < K[1, 2] / height < 0.8):
+        raise InputError(
+            f"{path}: principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not lie about the middle of an image of"
+            f" {width}x{height}",
+            remedy="the images have to have the size that the cameras were made for",
+        )
+    return Intrinsics(
+        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), width=width, height=height
+    )

@@ -1,0 +1,243 @@
+"""``score`` by named protocols, in both layouts of DTU, with masks, a cloud, and recordings that are others."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
+from splatctrl_cli.records import Float64
+from tests.io.make_idr import write_idr
+
+QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
+HOLDOUT = "holdout:every4"
+
+
+def half(view: DtuView) -> DtuView:
+    """The view at half the size, with the middle as its mask, for speed."""
+    k = view.intrinsics
+    mask = np.zeros((k.height // 2, k.width // 2), np.bool_)
+    mask[20:-20, 30:-30] = True
+    return replace(
+        view,
+        color=np.ascontiguousarray(view.color[::2, ::2]),
+        depth=np.ascontiguousarray(view.depth[::2, ::2]),
+        intrinsics=replace(
+            k, fx=k.fx / 2, fy=k.fy / 2, cx=k.cx / 2, cy=k.cy / 2, width=k.width // 2, height=k.height // 2
+        ),
+        mask=mask,
+    )
+
+
+@pytest.fixture(scope="module")
+def views(request: pytest.FixtureRequest) -> list[DtuView]:
+    sample_data: Path = request.getfixturevalue("sample_data")
+    return [half(view) for view in read_dtu(sample_data / "dtu").views]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory, views: list[DtuView]) -> Path:
+    """A scan in both layouts, and a scene of it by HOLDOUT."""
+    folder = tmp_path_factory.mktemp("protocol")
+    write_dtu(folder / "mvsnet", "scan1", views)
+    write_idr(folder / "idr", "scan1", views)
+    write_idr(folder / "blind", "scan1", views, with_depth=False)
+    for number, view in enumerate(views):
+        (folder / "masks").mkdir(exist_ok=True)
+        assert view.mask is not None
+        cv2.imwrite(str(folder / "masks" / f"{number:03d}.png"), np.where(view.mask, 255, 0).astype(np.uint8))
+    arguments = ["reconstruct", "--dtu", str(folder / "mvsnet"), "--protocol", HOLDOUT, "-o", str(folder / "scene")]
+    assert main([*arguments, *QUICK]) == 0
+    return folder
+
+
+def run(place: Path, layout: str, *arguments: object) -> int:
+    return main(["score", str(place / "scene"), "--dtu", str(place / layout), *map(str, arguments)])
+
+
+def scored(capsys: pytest.CaptureFixture[str], place: Path, layout: str, *arguments: object) -> Any:
+    capsys.readouterr()
+    assert run(place, layout, "--protocol", HOLDOUT, "--json", *arguments) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_scan_scores_the_same_through_both_layouts(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = scored(capsys, place, "mvsnet", "--masks", place / "masks")
+    other = scored(capsys, place, "idr")
+    assert (one["protocol"]["layout"], other["protocol"]["layout"]) == ("MVSNet's", "IDR's")
+    assert one["protocol"]["mask_rule"] == other["protocol"]["mask_rule"] == "object mask"
+    assert {view["view"] for view in one["views"]} == {"holdout-0000", "holdout-0004"}
+    assert one["metrics"].keys() == other["metrics"].keys()
+    for name, value in one["metrics"].items():
+        assert other["metrics"][name] == pytest.approx(value, rel=1e-4), name
+    assert 10 < one["metrics"]["psnr_masked"] < 60
+    assert one["recording"]["differences"] == other["recording"]["differences"] == []
+
+
+def test_without_depth_colours_are_scored_and_nothing_counts_as_seen(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = scored(capsys, place, "blind")
+    assert result["metrics"]["psnr_seen"] is None
+    assert result["metrics"]["depth_median_all"] is None
+    with_depth = scored(capsys, place, "idr")["metrics"]
+    for name in ("psnr_masked", "psnr_all", "ssim_published"):
+        assert result["metrics"][name] == pytest.approx(with_depth[name], abs=1e-9)
+
+
+def test_the_report_says_by_what_its_figures_came_about(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(place, "idr", "--protocol", HOLDOUT) == 0
+    out = capsys.readouterr().out
+    assert "\nprotocol: holdout:every4 (a rule given by hand)\n" in out
+    assert "\nsplit: train 1-3, 5-7; score 0, 4\n" in out
+    assert "mask rule: object mask; averaging: mean over the views of the scan; resolution: 128x104; backgr" in out
+    assert "dB mask" in out
+    assert "mask" in out.splitlines()[0]
+    protocol = scored(capsys, place, "idr")["protocol"]
+    assert (protocol["training_views"], protocol["scored_views"]) == ([1, 2, 3, 5, 6, 7], [0, 4])
+    assert len(protocol["background"]) == 3
+
+
+def test_a_scene_of_another_split_is_refused_with_the_views(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(place, "mvsnet", "--protocol", "dtu-train") == 2
+    said = capsys.readouterr().err
+    assert "protocol dtu-train trains on 8 views (train 0-7; score 0-7), of which 2 did not train the scene" in said
+    assert "and 0 others did; reconstruct with --protocol dtu-train" in said
+    assert run(place, "mvsnet", "--protocol", "holdout:2,6") == 2
+    assert "of which 2 did not train the scene, and 2 others did" in capsys.readouterr().err
+
+
+def test_a_protocol_whose_views_the_scan_lacks_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(place, "mvsnet", "--protocol", "regnerf-3") == 4
+    assert "the scan has views 0-7; give a protocol for it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--protocol", HOLDOUT, "--holdout", "1"], "--holdout: the protocol says what is held out"),
+        (["--protocol", "regnerf"], "did you mean regnerf-"),
+        (["--images", "all"], "--images all: expected a folder for them; give -o"),
+        (["--seed", "3"], "--seed: only with --fit"),
+        (["--fit-iterations", "3"], "--fit-iterations: only with --fit"),
+        (["--cloud-unit", "1"], "--cloud-unit: only with --cloud"),
+        (["--cloud", "a.ply", "--cloud-max", "0"], "--cloud-max: expected a length above 0, got 0"),
+    ],
+)
+def test_bad_usage_names_the_thing(
+    place: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert run(place, "mvsnet", *arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_pictures_of_every_view_of_the_extremes_or_none(place: Path, tmp_path: Path) -> None:
+    def names(images: str) -> set[str]:
+        out = tmp_path / images
+        assert run(place, "mvsnet", "--protocol", HOLDOUT, "--images", images, "-q", "-o", out) == 0
+        return {str(path.relative_to(out)) for path in out.rglob("*.png")}
+
+    assert names("all") == {"views/holdout-0000.png", "views/holdout-0004.png", "holdout_best_worst.png"}
+    assert names("best-worst") == {"holdout_best_worst.png"}
+    assert names("none") == set()
+
+
+def surface(views: list[DtuView]) -> Float64:
+    """What the views' depth measured [m], world."""
+    parts = []
+    for view in views:
+        k, (v, u) = view.intrinsics, np.mgrid[: view.intrinsics.height : 2, : view.intrinsics.width : 2]
+        z = view.depth[::2, ::2].astype(np.float64)
+        points = np.stack([(u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z], axis=-1)[z > 0]
+        parts.append(points @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3])
+    return np.concatenate(parts)
+
+
+def write_cloud(path: Path, points: Float64) -> Path:
+    rows = "\n".join(" ".join(f"{value:.6f}" for value in point) for point in points)
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    properties = "".join(f"property float {name}\n" for name in "xyz")
+    path.write_text(f"{header}{properties}end_header\n{rows}\n", encoding="ascii")
+    return path
+
+
+def test_the_surface_is_compared_with_a_cloud_in_millimetres(
+    place: Path, views: list[DtuView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = write_cloud(tmp_path / "cloud.ply", 1000 * surface(views[:3]))
+    given = ("--cloud", cloud, "--cloud-spacing", "0.004", "--require", "chamfer<=0.02", "--require", "accuracy>0")
+    metrics = scored(capsys, place, "mvsnet", *given)["metrics"]
+    assert 0.0005 < metrics["accuracy"] < 0.012
+    assert 0.0005 < metrics["completeness"] < 0.012
+    assert metrics["chamfer"] == pytest.approx((metrics["accuracy"] + metrics["completeness"]) / 2)
+    assert metrics["completeness_seen_beyond"] < metrics["completeness_beyond"] + 1e-9
+    assert run(place, "mvsnet", "--protocol", HOLDOUT, "--cloud", cloud, "--cloud-spacing", "0.004") == 0
+    out = capsys.readouterr().out
+    assert "surface: accuracy " in out
+    assert "1 unit = 0.001 m; points thinned to 4 mm; means below 20 mm" in out
+    moved = scored(capsys, place, "mvsnet", *given[:4], "--cloud-max", "0.004")["metrics"]
+    assert moved["accuracy"] < metrics["accuracy"]
+    assert moved["accuracy_beyond"] > metrics["accuracy_beyond"]
+
+
+def test_a_cloud_in_another_unit_is_refused_with_both_boxes(
+    place: Path, views: list[DtuView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = write_cloud(tmp_path / "cloud.ply", 1000 * surface(views[:1]))
+    arguments = ("--protocol", HOLDOUT, "--cloud", cloud, "--cloud-spacing", "0.01", "--cloud-unit", "1")
+    assert run(place, "mvsnet", *arguments) == 5
+    assert "give the cloud's unit as --cloud-unit" in capsys.readouterr().err
+
+
+def test_a_gate_on_what_was_not_scored_fails(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(place, "mvsnet", "--protocol", HOLDOUT, "--require", "psnr_masked>=1", "--require", "lpips<=1") == 1
+    assert "psnr_masked is unknown, required >= 1; lpips is unknown" in capsys.readouterr().err
+
+
+def test_another_scan_of_the_same_camera_names_is_refused_with_figures(
+    place: Path, views: list[DtuView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shift = np.eye(4)
+    shift[0, 3] = 0.02
+    moved = [replace(v, T_world_camera=shift @ v.T_world_camera) for v in views]
+    write_dtu(tmp_path / "other", "scan1", moved)
+    arguments = ["score", str(place / "scene"), "--dtu", str(tmp_path / "other"), "--protocol", HOLDOUT]
+    assert main(arguments) == 4
+    said = capsys.readouterr().err
+    assert f"not the recording that {place / 'scene'} was made from: camera: the pose differs by 20 mm and" in said
+    assert "--allow-other-recording" in said
+
+
+def test_another_recording_may_be_scored_and_is_named(
+    place: Path, views: list[DtuView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dark = [replace(view, color=view.color // 2) for view in views]
+    write_dtu(tmp_path / "other", "scan1", dark)
+    arguments = ["score", str(place / "scene"), "--dtu", str(tmp_path / "other"), "--protocol", HOLDOUT]
+    assert main(arguments) == 4
+    assert "camera: the picture differs by" in capsys.readouterr().err
+    assert main([*arguments, "--allow-other-recording"]) == 0
+    assert "warning: another recording: camera: the picture differs by" in capsys.readouterr().out
+
+
+def test_a_scene_without_first_frames_is_told_by_the_digests_of_its_files(
+    place: Path, views: list[DtuView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    shutil.copytree(place / "scene", tmp_path / "scene")
+    path = tmp_path / "scene" / "run.json"
+    old = json.loads(path.read_text())
+    del old["metrics"]["first_frames"]
+    path.write_text(json.dumps(old))
+    arguments = ["score", str(tmp_path / "scene"), "--protocol", HOLDOUT, "--json", "--dtu"]
+    assert main([*arguments, str(place / "mvsnet")]) == 0
+    assert json.loads(capsys.readouterr().out)["recording"]["basis"] == "digests of the files"
+    write_dtu(tmp_path / "other", "scan1", [replace(view, color=view.color // 2) for view in views])
+    assert main([*arguments, str(tmp_path / "other")]) == 4
+    assert "8 of 25 files that made it differ" in capsys.readouterr().err

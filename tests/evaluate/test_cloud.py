@@ -1,0 +1,78 @@
+"""Accuracy, completeness and Chamfer of point sets whose distances are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.cloud import cloud_score, points_on, thinned
+from splatctrl_cli.mesh_distance import TriangleMesh
+from splatctrl_cli.records import Float64
+
+
+def plane(z: float, size: float = 0.1, step: float = 0.005) -> Float64:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, size, step), np.arange(0, size, step)))
+    return np.column_stack([x, y, np.full(len(x), z)])
+
+
+def test_two_planes_are_as_far_apart_both_ways() -> None:
+    score = cloud_score(plane(0.003), plane(0.0), np.ones(400, np.bool_))
+    assert score.accuracy == score.completeness == score.completeness_seen == pytest.approx(0.003)
+    assert score.chamfer == pytest.approx(0.003)
+    assert score.accuracy_beyond == score.completeness_beyond == 0.0
+
+
+def test_half_a_surface_is_accurate_and_incomplete() -> None:
+    reference = plane(0.0, size=0.2, step=0.01)
+    half = reference[reference[:, 0] < 0.095]
+    score = cloud_score(half, reference, reference[:, 0] < 0.095)
+    assert score.accuracy == 0.0
+    assert score.completeness_beyond == pytest.approx(9 / 20), "columns 2 cm and farther away"
+    assert score.completeness == pytest.approx(0.01 * 1 / 11), "of 11 columns one is 1 cm off, the others are there"
+    assert score.completeness_seen == 0.0
+
+
+def test_what_is_farther_than_the_maximum_counts_in_a_share_only() -> None:
+    points = np.vstack([plane(0.001), plane(0.05)])
+    score = cloud_score(points, plane(0.0), np.ones(400, np.bool_), max_distance=0.02)
+    assert score.accuracy == pytest.approx(0.001)
+    assert score.accuracy_beyond == 0.5
+
+
+def test_where_nothing_was_seen_that_figure_does_not_exist() -> None:
+    assert math.isnan(cloud_score(plane(0.0), plane(0.0), np.zeros(400, np.bool_)).completeness_seen)
+
+
+def test_another_unit_or_frame_is_told_from_a_bad_surface() -> None:
+    with pytest.raises(NotEvaluableError, match=r"points within 20 mm of the scene's surface, got none; it spans"):
+        cloud_score(plane(0.0), 1000 * plane(1.0), np.ones(400, np.bool_))
+    with pytest.raises(UsageError, match="--cloud-max: expected a distance above 0 m, got 0"):
+        cloud_score(plane(0.0), plane(0.0), np.ones(400, np.bool_), max_distance=0.0)
+
+
+def test_rigid_motion_changes_no_figure() -> None:
+    rng = np.random.default_rng(1)
+    points, reference = rng.uniform(0, 0.03, (200, 3)), rng.uniform(0, 0.03, (300, 3))
+    Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    seen = rng.random(300) < 0.5
+    one = cloud_score(points, reference, seen).figures()
+    other = cloud_score(points @ Q.T + 0.4, reference @ Q.T + 0.4, seen).figures()
+    assert one == pytest.approx(other, abs=1e-12)
+
+
+def test_thinning_leaves_one_point_to_a_cube() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.0004, 0.0, 0.0], [0.0011, 0.0, 0.0], [0.0, 0.0, 0.0012]])
+    np.testing.assert_array_equal(thinned(points, 0.001), points[[0, 2, 3]])
+    assert len(thinned(np.empty((0, 3)), 0.001)) == 0
+
+
+def test_points_on_a_mesh_lie_on_it_evenly() -> None:
+    vertices = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5], [0.1, 0.1, 0.5], [0.0, 0.1, 0.5]])
+    mesh = TriangleMesh(vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]]), is_closed=False)
+    points = points_on(mesh, 0.002)
+    assert len(points) == pytest.approx(4 * 0.01 / 0.002**2, abs=1)
+    np.testing.assert_allclose(points[:, 2], 0.5)
+    assert points[:, :2].min() >= 0
+    assert points[:, :2].max() <= 0.1
+    assert abs(points[:, 0].mean() - 0.05) < 0.002
