@@ -14,7 +14,10 @@ from splatctrl_cli import __version__
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 
-COMMANDS = ("simulate", "ingest", "info", "reconstruct", "export", "sdf-bake", "score", "replay", "robot", "demo")
+COMMANDS = (
+    *("simulate", "ingest", "info", "check", "reconstruct", "export", "sdf-bake", "score", "replay", "robot"),
+    "demo",
+)
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was

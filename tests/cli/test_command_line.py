@@ -15,6 +15,7 @@ from splatctrl_cli.cli import demo
 from splatctrl_cli.cli.main import COMMANDS, main
 from tests.io.make_log import LogRecipe, make_log
 
+WRITERS = [command for command in COMMANDS if command not in {"info", "check"}]
 HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "mcap", "rosbags", "clarabel")
 QUICK = (
     *("--max-splats", "60", "--threads", "1", "--set", "scene.first_iterations=2"),
@@ -113,7 +114,7 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
     assert done.stderr == "[]\n"
 
 
-@pytest.mark.parametrize("command", [c for c in COMMANDS if c != "info"])
+@pytest.mark.parametrize("command", WRITERS)
 def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, command: str) -> None:
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--colour")
     action = " spheres" if command == "robot" else ""
@@ -167,7 +168,7 @@ def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_p
 
 
 @pytest.mark.parametrize(
-    "command", ["ingest", "info", "reconstruct", "export", "sdf-bake", "score", "replay", "demo"]
+    "command", ["ingest", "info", "check", "reconstruct", "export", "sdf-bake", "score", "replay", "demo"]
 )
 def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command: str) -> None:
     absent = tmp_path / "absent"
@@ -176,12 +177,11 @@ def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command
         "replay": (absent, "--scene", work.folder / "scene", "--urdf", work.folder / "robot.urdf"),
         "demo": ("--data", absent),
     }
-    output = () if command == "info" else ("-o", tmp_path / "out")
+    output = () if command not in WRITERS else ("-o", tmp_path / "out")
     assert_refused(splatctrl(command, *arguments.get(command, (absent,)), *output), 4, "absent: ", "; ")
     assert not list(tmp_path.iterdir())
 
 
-WRITERS = [command for command in COMMANDS if command != "info"]
 FILE_WRITERS = ("export", "robot")  # the others write a folder
 
 

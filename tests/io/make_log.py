@@ -61,7 +61,7 @@ def make_log(path: Path, recipe: LogRecipe | None = None) -> Path:
 def color_pixels(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """The RGB image of a frame: red grows with the frame, green with the column."""
     image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
-    image[..., 0] = 40 + 10 * index
+    image[..., 0] = (40 + 10 * index) % 256
     image[..., 1] = np.linspace(20, 200, WIDTH, dtype=np.uint8)
     image[..., 2] = 90
     return image

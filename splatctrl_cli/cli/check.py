@@ -1,0 +1,175 @@
+"""``splatctrl check``: what is wrong with a recording, before it costs an hour."""
+
+import argparse
+import textwrap
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
+from splatctrl_cli.cli.robot_options import add_lock, locked_joints
+from splatctrl_cli.cli.source_options import add_source, source_options
+from splatctrl_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.io.check_report import CheckReport
+    from splatctrl_cli.io.check_times import Rate
+    from splatctrl_cli.io.finding import Finding
+    from splatctrl_cli.robot.model import RobotModel
+
+QUICK = 30  # images of a topic
+WIDTH = 118  # columns of text
+RANGE = (0.2, 6.0)  # [m] of depth that is compared between views
+
+
+def register(subparsers: Subparsers) -> None:
+    """Add the subcommand to the parser."""
+    parser = add_command(subparsers, "check", run, summary="say what is wrong with a log, capture or image folder")
+    parser.add_argument("source", type=Path, help="log, ROS 2 bag folder, capture, or .toml of an image folder")
+    parser.add_argument(
+        "--fail-on",
+        choices=["error", "warning", "never"],
+        default="error",
+        help="exit with 1 where a finding is as bad as this (default: error)",
+    )
+    parser.add_argument(
+        "--quick",
+        type=int,
+        nargs="?",
+        const=QUICK,
+        metavar="N",
+        help=f"read the first N images of a topic only (default of N: {QUICK})",
+    )
+    parser.add_argument("--urdf", type=Path, metavar="FILE", help="compare joint states and depth with this robot")
+    parser.add_argument("--spheres", type=Path, metavar="FILE", help="its spheres (default: those of the URDF)")
+    parser.add_argument(
+        "--base", metavar="X,Y,Z,QX,QY,QZ,QW", help="pose of the URDF's root in the world (default: at its origin)"
+    )
+    add_lock(parser)
+    add_source(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the subcommand and return its exit code."""
+    from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
+    from splatctrl_cli.io.capture import is_capture
+    from splatctrl_cli.io.check_log import check_log
+    from splatctrl_cli.io.check_source import check_source
+
+    if args.quick is not None and args.quick < 1:
+        raise UsageError(f"--quick {args.quick}: expected 1 or more")
+    options, model, path = source_options(args), _robot(args), args.source
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if path.suffix == ".toml" or is_capture(path):
+        report = check_source(path, options, model=model, num_images=args.quick)
+    elif path.is_dir() and not is_bag_folder(path):
+        raise InputError(
+            f"{path}: a folder that is neither a capture nor a ROS 2 bag",
+            remedy="for images give the .toml that describes them",
+        )
+    else:
+        report = check_log(open_raw_log(path), options, model=model, num_images=args.quick)
+    report = replace(report, findings=[*report.findings, *_agreement(report)])
+    Console(args).result(report.as_dict(), list(_lines(report)))
+    return _exit_code(report, args.fail_on)
+
+
+def _exit_code(report: "CheckReport", fail_on: str) -> int:
+    counts = report.counts
+    failing = {"error": counts["error"], "warning": counts["error"] + counts["warning"], "never": 0}[fail_on]
+    return 1 if failing else 0
+
+
+def _robot(args: argparse.Namespace) -> "RobotModel | None":
+    if args.urdf is None:
+        given = [name for name in ("spheres", "base") if getattr(args, name) is not None]
+        if given or args.lock:
+            raise UsageError(f"--{(given or ['lock'])[0]}: expected --urdf beside it")
+        return None
+    from splatctrl_cli.geometry import transform_from
+    from splatctrl_cli.robot.model import RobotModel
+
+    base = None if args.base is None else _seven(args.base)
+    T_world_base = None if base is None else transform_from(base[:3], base[3:])
+    return RobotModel.from_urdf(args.urdf, args.spheres, T_world_base=T_world_base, locked=locked_joints(args.lock))
+
+
+def _seven(text: str) -> list[float]:
+    try:
+        values = [float(value) for value in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
+        raise UsageError(f"--base {text}: expected X,Y,Z,QX,QY,QZ,QW with a unit quaternion")
+    return values
+
+
+def _agreement(report: "CheckReport") -> list["Finding"]:
+    """Whether views agree on where the surfaces are that both see."""
+    from splatctrl_cli.io.finding import Finding, error, note
+    from splatctrl_cli.scene.consistency import agreements
+
+    findings: list[Finding] = []
+    good: list[float] = []
+    for pair in agreements(list(report.frames), *RANGE):
+        both = list(dict.fromkeys(pair.cameras))
+        where = f"camera {both[0]}" if len(both) == 1 else f"cameras {both[0]} and {both[1]}"
+        text = f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see)"
+        if pair.holds:
+            good.append(pair.median)
+            continue
+        text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
+        remedy = "calibrate the cameras' poses again (hand-eye)"
+        remedy += f", or keep one with --cameras {both[0]}" if len(both) > 1 else ": is it the pose of another frame?"
+        findings.append(error("agreement", where, text, remedy, value=round(1e3 * pair.median, 2), unit="mm"))
+    if good:
+        text = f"where two views see one surface their depths differ by {1e3 * max(good):.1f} mm at most"
+        text += f" (medians of {len(good)} pairs of cameras, each with itself included)"
+        findings.append(note("agreement", "cameras", text, value=round(1e3 * max(good), 2), unit="mm"))
+    return findings
+
+
+def _lines(report: "CheckReport") -> Iterator[str]:
+    counts = report.counts
+    span = f", {report.duration_s:.2f} s" if report.duration_s else ""
+    yield f"{report.path}: {report.kind}{span}, {report.num_messages} {report.unit}"
+    yield ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in counts.items())
+    for finding in report.sorted_findings:
+        yield ""
+        at = report.seconds(finding)
+        when = "" if at is None else f", at {at:.3f} s"
+        yield f"{finding.severity}: {finding.where}{when} [{finding.code}]"
+        yield from textwrap.wrap(finding.what, WIDTH, initial_indent="  ", subsequent_indent="  ")
+        if finding.remedy:
+            yield from textwrap.wrap(f"-> {finding.remedy}", WIDTH, initial_indent="  ", subsequent_indent="     ")
+    rates = [rate for rate in report.rates if rate.is_read]
+    if rates:
+        yield ""
+        yield from table(["topic", "messages", "hz", "longest gap s", "delay s"], [*map(_rate_row, rates)])
+    if len(rates) < len(report.rates):
+        yield f"{len(report.rates) - len(rates)} topics that no command reads"
+    yield ""
+    yield from _needs(report)
+
+
+def _needs(report: "CheckReport") -> Iterator[str]:
+    """Commands that can start, then each thing that is lacking with the commands that lack it."""
+    ready = [need.command for need in report.needs if not report.lacks(need)]
+    if ready:
+        yield f"can start: {', '.join(ready)}"
+    lacking: dict[str, list[str]] = {}
+    for need in report.needs:
+        for lack in report.lacks(need):
+            lacking.setdefault(lack, []).append(need.command)
+    for lack, commands in lacking.items():
+        yield from textwrap.wrap(f"missing for {', '.join(commands)}: {lack}", WIDTH, subsequent_indent="  ")
+
+
+def _rate_row(rate: "Rate") -> list[object]:
+    return [rate.topic, rate.messages, _shown(rate.hz, 2), _shown(rate.longest_s, 3), _shown(rate.delay_s, 3)]
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

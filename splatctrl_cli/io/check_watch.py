@@ -1,0 +1,126 @@
+"""One pass over a log for all that `check` asks: the survey's own, with every message watched on its way."""
+
+import re
+from collections.abc import Collection, Iterator
+
+from splatctrl_cli.io.check_images import ImageWatch
+from splatctrl_cli.io.check_times import TimesWatch
+from splatctrl_cli.io.decoder import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    TRANSFORMS,
+    MessageDecoder,
+    UndecodableMessageError,
+    header_stamp_ns,
+    is_ros,
+    stamp_ns,
+)
+from splatctrl_cli.io.messages import color_of, depth_of, num_invalid, read_image
+from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
+
+_HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu")
+_FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
+
+
+class LogWatch:
+    """A log whose messages are looked at while somebody else reads them; images are decoded here, once each.
+
+    num_images: reading ends once a topic has had as many images.
+    """
+
+    def __init__(self, log: RawLog, scale: float | None, num_images: int | None = None) -> None:
+        self._log, self._scale, self._num_images = log, scale, num_images
+        self.path, self.files, self.container = log.path, log.files, log.container
+        self.times: dict[str, TimesWatch] = {}
+        self.transforms: dict[str, TimesWatch] = {}
+        self.images: dict[str, ImageWatch] = {}
+        self.changed_infos: dict[str, int] = {}
+        self.is_whole = True
+        self._infos: dict[str, tuple[object, ...]] = {}
+        self._decoder = MessageDecoder()
+        self._headed: dict[Topic, bool] = {}
+
+    @property
+    def first_ns(self) -> int | None:
+        """The first log time or stamp."""
+        return min((t.first_ns for t in self.times.values() if t.first_ns), default=None)
+
+    def topics(self) -> tuple[Topic, ...]:
+        """Of the log."""
+        return self._log.topics()
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Those of the log, each watched."""
+        for message in self._log.messages(damage, names):
+            self._take(message)
+            yield message
+            images = self.images.get(message.topic.name)
+            if images is not None and images.count == self._num_images:
+                self.is_whole = False
+                return
+
+    def _take(self, message: RawMessage) -> None:
+        topic, name = message.topic, message.topic.name
+        has_stamps = self._is_headed(topic)
+        stamp = message.log_time_ns
+        if has_stamps:
+            try:
+                stamp = header_stamp_ns(message)
+            except UndecodableMessageError:
+                has_stamps = False
+        times = self.times.get(name)
+        if times is None:
+            times = self.times[name] = TimesWatch(name, has_stamps=has_stamps)
+        times.add(stamp, message.log_time_ns)
+        if not is_ros(topic):
+            return
+        try:
+            if topic.type_name in (IMAGE, COMPRESSED_IMAGE):
+                self._image(message, stamp)
+            elif topic.type_name == CAMERA_INFO and name not in self.changed_infos:
+                self._info(message, stamp)
+            elif topic.type_name in TRANSFORMS and not name.endswith("tf_static"):
+                self._transforms(message)
+        except UndecodableMessageError:
+            return  # the survey counts it
+
+    def _is_headed(self, topic: Topic) -> bool:
+        """Whether messages begin with a std_msgs/Header."""
+        if topic not in self._headed:
+            fields = [line.split("#")[0].strip() for line in topic.definition.splitlines()]
+            first = next((line for line in fields if line), "")
+            is_headed = bool(_FIRST_FIELD.match(first)) if topic.definition else topic.type_name in _HEADED
+            self._headed[topic] = is_ros(topic) and (is_headed or topic.type_name in _HEADED)
+        return self._headed[topic]
+
+    def _image(self, message: RawMessage, stamp: int) -> None:
+        name = message.topic.name
+        images = self.images.setdefault(name, ImageWatch(name, self._scale))
+        try:
+            image = read_image(self._decoder.decode(message), message.topic.type_name)
+        except (UndecodableMessageError, ValueError) as reason:
+            images.add_bad(stamp, str(reason))
+            return
+        if image.kind == "depth":
+            depth = depth_of(image, self._scale)
+            images.add_depth(stamp, depth, image.encoding, num_invalid(image.pixels))
+        elif image.kind == "color":
+            images.add_color(stamp, color_of(image), image.encoding)
+        else:
+            images.add_other(image.encoding, image.width, image.height)
+
+    def _info(self, message: RawMessage, stamp: int) -> None:
+        info = self._decoder.decode(message)
+        fields = {name.lower(): getattr(info, name) for name in ("K", "k", "D", "d") if hasattr(info, name)}
+        said = (info.width, info.height, tuple(fields["k"]), tuple(fields["d"]))
+        if self._infos.setdefault(message.topic.name, said) != said:
+            self.changed_infos[message.topic.name] = stamp
+
+    def _transforms(self, message: RawMessage) -> None:
+        for item in self._decoder.decode(message).transforms:
+            child = item.child_frame_id.strip("/")
+            edge = f"tf {item.header.frame_id.strip('/')} -> {child}"
+            if child not in self.transforms:
+                self.transforms[child] = TimesWatch(edge, has_stamps=True)
+            self.transforms[child].add(stamp_ns(item.header), message.log_time_ns)

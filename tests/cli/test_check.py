@@ -1,0 +1,117 @@
+"""``splatctrl check`` as a person meets it."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.io.check_report import BLOCKED
+from tests.cli.test_ingest import run
+from tests.io.make_log import LogRecipe, make_log
+
+GOOD = LogRecipe(num_frames=20)
+
+
+def test_a_good_log_is_exit_0_and_can_start_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, printed, error = run(capsys, "check", make_log(tmp_path / "log.mcap", GOOD), "--fail-on", "warning")
+    assert (code, error) == (0, "")
+    assert "0 errors, 0 warnings, " in printed
+    assert "can start: ingest, reconstruct, score, replay" in printed
+
+
+@pytest.mark.parametrize(("fail_on", "code"), [("error", 0), ("warning", 1), ("never", 0)])
+def test_a_warning_fails_where_it_is_asked_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fail_on: str, code: int
+) -> None:
+    log = make_log(tmp_path / "log.mcap", replace(GOOD, tf_frames=12))
+    found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on)
+    assert found == code
+    assert "warning: camera cam0, at " in printed
+    assert "[pose-missing]" in printed
+
+
+@pytest.mark.parametrize(("fail_on", "code"), [("error", 1), ("warning", 1), ("never", 0)])
+def test_an_error_fails_unless_never(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fail_on: str, code: int
+) -> None:
+    log = make_log(tmp_path / "log.mcap", replace(GOOD, depth_counts=1))
+    found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on, "--json")
+    assert found == code
+    result = json.loads(printed)
+    assert result["counts"]["error"] == 1
+    finding = result["findings"][0]
+    assert (finding["severity"], finding["code"], finding["where"]) == (
+        "error",
+        "depth-scale",
+        "/cam0/depth/image_raw",
+    )
+    assert finding["value"] == pytest.approx(0.001)
+    assert all("depth-scale" in result["commands"][name][-1] for name in BLOCKED["depth-scale"])
+
+
+def test_cameras_whose_poses_disagree_are_an_error_with_millimetres(
+    real_data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    description = Path(__file__).parents[2] / "docs/examples/arc_bin_2cam.toml"
+    code, printed, _ = run(capsys, "check", description, "--root", real_data / "arc_bin_2cam", "--json")
+    assert code == 1
+    finding = json.loads(printed)["findings"][0]
+    assert (finding["code"], finding["severity"], finding["unit"]) == ("agreement", "error", "mm")
+    assert finding["value"] == pytest.approx(99, abs=3)
+
+
+@pytest.mark.parametrize(
+    ("example", "folder"),
+    [
+        ("apc_shelf", "apc_shelf/scene-0000"),
+        ("open3d_rgbd", "open3d_rgbd/RGBD"),
+        ("livingroom1", "open3d_rgbd/livingroom1"),
+        ("tabletop_views", "tabletop_views"),
+    ],
+)
+def test_good_recordings_have_no_finding_above_a_note(
+    real_data: Path, capsys: pytest.CaptureFixture[str], example: str, folder: str
+) -> None:
+    description = Path(__file__).parents[2] / f"docs/examples/{example}.toml"
+    code, printed, _ = run(capsys, "check", description, "--root", real_data / folder, "--fail-on", "warning")
+    assert code == 0, printed
+
+
+def test_a_capture_is_checked_as_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, capture = make_log(tmp_path / "log.mcap", replace(GOOD, tf_frames=12)), tmp_path / "x.capture"
+    assert run(capsys, "ingest", log, "-o", capture, "-q")[0] == 0
+    code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning", "--json")
+    result = json.loads(printed)
+    assert (code, result["kind"]) == (1, "capture")
+    assert [f["code"] for f in result["findings"] if f["severity"] != "note"] == ["pose-missing"]
+    (capture / "depth/cam0/000003.png").write_bytes(b"")
+    code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning")
+    assert "depth/cam0/000003.png: its checksum differs" in printed
+
+
+def test_every_code_is_in_the_page() -> None:
+    root = Path(__file__).parents[2]
+    page = (root / "docs/check.md").read_text()
+    sources = [*(root / "splatctrl_cli/io").glob("check_*.py"), root / "splatctrl_cli/cli/check.py"]
+    text = "\n".join(path.read_text() for path in sources)
+    codes = set(re.findall(r'(?:error|warning|note|severity|make)\(\s*"([a-z-]+)"', text))
+    assert len(codes) > 30
+    assert {code for code in codes if f"`{code}`" not in page} == set()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--quick", "0"), 2, "--quick 0: expected 1 or more"),
+        (("--spheres", "x.yaml"), 2, "--spheres: expected --urdf beside it"),
+        (("--fail-on", "note"), 2, "invalid choice"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    found, printed, error = run(capsys, "check", make_log(tmp_path / "log.mcap"), *arguments)
+    assert (found, printed) == (code, "")
+    assert words in error
