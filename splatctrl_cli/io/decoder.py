@@ -6,6 +6,7 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
+from splatctrl_cli.io.foxglove import as_ros, read_foxglove
 from splatctrl_cli.io.raw_log import RawMessage, Topic
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -24,8 +25,13 @@ class UndecodableMessageError(ValueError):
 
 
 def is_ros(topic: Topic) -> bool:
-    """Whether the topic's messages are in a ROS encoding."""
-    return topic.encoding in {"cdr", "ros1"}
+    """Whether the topic's messages are in a ROS encoding, or stand for a ROS message in another."""
+    return topic.encoding in {"cdr", "ros1"} or is_foxglove(topic)
+
+
+def is_foxglove(topic: Topic) -> bool:
+    """Whether the topic's messages stand for ROS messages in protobuf or JSON."""
+    return topic.schema != "" and topic.encoding in {"protobuf", "json"}
 
 
 class MessageDecoder:
@@ -38,14 +44,16 @@ class MessageDecoder:
     def decode(self, message: RawMessage) -> Any:
         """The message as an object with its fields. Raises UndecodableMessageError."""
         topic = message.topic
-        store = self._store(topic)
+        store = None if is_foxglove(topic) else self._store(topic)
         try:
-            if topic.encoding == "ros1":
-                return store.deserialize_ros1(message.data, topic.type_name)
-            return store.deserialize_cdr(message.data, topic.type_name)
+            if store is None:
+                return read_foxglove(topic.schema, topic.encoding, topic.definition, message.data)
+            read = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
+            decoded = read(message.data, topic.schema or topic.type_name)
+            return as_ros(topic.schema, decoded) if topic.schema else decoded
         except Exception as error:  # generated code over foreign bytes: there is no list of what it raises
             raise UndecodableMessageError(
-                f"{topic.name}: a {topic.type_name} that does not decode: {error}"
+                f"{topic.name}: a {topic.schema or topic.type_name} that does not decode: {error}"
             ) from None
 
     def _store(self, topic: Topic) -> Any:
@@ -64,12 +72,15 @@ class MessageDecoder:
 def header_stamp_ns(message: RawMessage) -> int:
     """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
 
-    The stamp follows four bytes (CDR's encapsulation, or ROS 1's `seq`) as two 32-bit words. Raises
-    UndecodableMessageError for a message too short.
+    The stamp follows four bytes (CDR's encapsulation, or ROS 1's `seq`) as two 32-bit words. Foxglove's messages are
+    decoded. Raises UndecodableMessageError for a message too short.
     """
+    if is_foxglove(message.topic):
+        return stamp_ns(MessageDecoder().decode(message).header)
+    start = 0 if message.topic.schema and message.topic.encoding == "ros1" else 4  # foxglove_msgs have no `seq`
     is_little = message.topic.encoding == "ros1" or message.data[1:2] in {b"\x01", b"\x03", b"\x07", b"\x09"}
     try:
-        seconds, nanoseconds = struct.unpack_from("<iI" if is_little else ">iI", message.data, 4)
+        seconds, nanoseconds = struct.unpack_from("<iI" if is_little else ">iI", message.data, start)
     except struct.error:
         raise UndecodableMessageError(f"{message.topic.name}: a message of {len(message.data)} bytes") from None
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
@@ -92,7 +103,7 @@ def _type_store(topic: Topic) -> Any:
             body = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
             store.register(get_types_from_idl(body))
     else:
-        store.register(get_types_from_msg(topic.definition, topic.type_name))
+        store.register(get_types_from_msg(topic.definition, topic.schema or topic.type_name))
     return store
 
 

@@ -91,7 +91,7 @@ def _topic_row(entry: TopicSurvey) -> list[object]:
     rate = f"{(entry.count - 1) / span:.2f}" if entry.count > 1 and span > 0 else "-"
     return [
         entry.topic.name,
-        entry.topic.type_name or "-",
+        entry.topic.schema or entry.topic.type_name or "-",
         entry.topic.encoding or "-",
         entry.count,
         rate,

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from splatctrl_cli.io.foxglove import stands_for
 from splatctrl_cli.io.mcap_file import McapFile
 from splatctrl_cli.io.mcap_index import LogIndex, index_by_heads
 from splatctrl_cli.io.mcap_records import (
@@ -161,14 +162,22 @@ class McapLog:
 
     def _add_channel(self, channel: Channel) -> None:
         schema = self._schemas.get(channel.schema_id)
-        is_ros = schema is not None and schema.encoding in {"ros2msg", "ros2idl", "ros1msg"}
-        self._channels[channel.id] = Topic(
-            name=channel.topic,
-            type_name="" if schema is None else ros_type_name(schema.name) if is_ros else schema.name,
-            encoding=channel.message_encoding,
-            definition=schema.data.decode("utf-8", "replace") if schema is not None and is_ros else "",
-            definition_format="idl" if schema is not None and schema.encoding == "ros2idl" else "msg",
-        )
+        self._channels[channel.id] = _topic(channel, schema)
+
+
+def _topic(channel: Channel, schema: Schema | None) -> Topic:
+    if schema is None:
+        return Topic(name=channel.topic, type_name="", encoding=channel.message_encoding)
+    is_ros, is_protobuf = schema.encoding in {"ros2msg", "ros2idl", "ros1msg"}, schema.encoding == "protobuf"
+    type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, stands_for(schema.name)
+    return Topic(
+        name=channel.topic,
+        type_name=ros_type or type_name,
+        encoding=channel.message_encoding,
+        definition=schema.data.decode("utf-8" if is_ros else "latin-1", "replace") if is_ros or is_protobuf else "",
+        definition_format={"ros2idl": "idl", "protobuf": "protobuf"}.get(schema.encoding, "msg"),
+        schema=type_name if ros_type else "",
+    )
 
 
 def ros_type_name(name: str) -> str:

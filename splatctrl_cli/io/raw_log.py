@@ -14,7 +14,8 @@ class Topic:
 
     type_name is ``package/msg/Type`` for ROS messages; encoding is ``cdr``, ``ros1`` or what the file says (json,
     protobuf, ...); definition is the type's text as the file holds it ("" = none), in definition_format
-    ``msg`` or ``idl``.
+    ``msg``, ``idl`` or ``protobuf`` (a FileDescriptorSet, a byte a character). schema is the type's own name where
+    type_name is that of the ROS message that it stands for (Foxglove's schemas), else "".
     """
 
     name: str
@@ -22,6 +23,7 @@ class Topic:
     encoding: str
     definition: str = ""
     definition_format: str = "msg"
+    schema: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

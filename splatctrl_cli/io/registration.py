@@ -13,6 +13,7 @@ SAME_MODELS = {  # what others call them
     "Brown Conrady": "plumb_bob",
     "radtan": "plumb_bob",
     "Kannala Brandt4": "equidistant",
+    "kannala_brandt": "equidistant",
     "fisheye": "equidistant",
 }
 

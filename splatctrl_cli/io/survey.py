@@ -104,7 +104,8 @@ def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) ->
 def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: RawMessage) -> None:
     kind = message.topic.type_name
     if kind in {IMAGE, COMPRESSED_IMAGE}:
-        entry.stamps_ns.append(header_stamp_ns(message) if len(message.data) >= 12 else -1)
+        entry.stamps_ns.append(-1)  # every image has its place, also one that does not decode
+        entry.stamps_ns[-1] = header_stamp_ns(message)
         if entry.first_image is None:
             entry.first_image = read_image(decoder.decode(message), kind)
     elif kind == CAMERA_INFO and entry.calibration is None:
@@ -114,7 +115,9 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
     elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
         result.realsense.add(message.topic.name, decoder.decode(message))
     elif kind in TRANSFORMS:
-        _add_transforms(result.tf, decoder.decode(message), static=message.topic.name.endswith("tf_static"))
+        is_static = message.topic.name.endswith("tf_static")
+        holds = message.topic.schema != ""  # Foxglove has no static transforms: one that comes once holds always
+        _add_transforms(result.tf, decoder.decode(message), static=is_static, holds=holds)
 
 
 def _calibration(message: Any) -> Calibration | None:
@@ -133,7 +136,7 @@ def _calibration(message: Any) -> Calibration | None:
     )
 
 
-def _add_transforms(tree: TfTree, message: Any, *, static: bool) -> None:
+def _add_transforms(tree: TfTree, message: Any, *, static: bool, holds: bool) -> None:
     for item in message.transforms:
         t, r = item.transform.translation, item.transform.rotation
         tree.add(
@@ -143,4 +146,5 @@ def _add_transforms(tree: TfTree, message: Any, *, static: bool) -> None:
             np.array([t.x, t.y, t.z], dtype=np.float64),
             np.array([r.x, r.y, r.z, r.w], dtype=np.float64),
             static=static,
+            holds=holds,
         )

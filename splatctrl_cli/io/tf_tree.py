@@ -20,6 +20,7 @@ class _Edge:
         self.stamps: list[int] = []
         self.transforms: list[Float64] = []
         self.static: Float64 | None = None
+        self.holds = False
         self.is_sorted = True
 
     def add(self, stamp_ns: int, T: Float64) -> None:
@@ -30,6 +31,8 @@ class _Edge:
     def at(self, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
         if self.static is not None:
             return self.static
+        if self.holds and len(self.stamps) == 1:
+            return self.transforms[0]
         self._sort()
         after = bisect_left(self.stamps, stamp_ns)
         if after == len(self.stamps):
@@ -65,10 +68,19 @@ class TfTree:
         self.notes: list[str] = []
 
     def add(
-        self, parent: str, child: str, stamp_ns: int, position: Float64, quat_xyzw: Float64, *, static: bool
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        position: Float64,
+        quat_xyzw: Float64,
+        *,
+        static: bool,
+        holds: bool = False,
     ) -> None:
-        """Add T_parent_child at a time; a static one holds always. The first parent of a frame stays its parent.
+        """Add T_parent_child at a time; a static one holds always, one that `holds` as long as it is the only one.
 
+        The first parent of a frame stays its parent, the last of different static transforms holds; both are noted.
         Raises ValueError for a rotation or position that is none (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
@@ -77,15 +89,22 @@ class TfTree:
             raise ValueError(f"transform {parent} -> {child} is not a rigid transform")
         edge = self._edges.setdefault(child, _Edge(parent))
         if edge.parent != parent:
-            note = f"tf: frame {child} has parents {edge.parent} and {parent}; {edge.parent} is kept"
-            if note not in self.notes:
-                self.notes.append(note)
+            self._note(f"tf: frame {child} has parents {edge.parent} and {parent}; {edge.parent} is kept")
             return
         T = transform_from(position, quat_xyzw)
-        if static:
-            edge.static = T
-        else:
+        edge.holds = edge.holds or holds
+        if not static:
             edge.add(stamp_ns, T)
+        else:
+            if edge.static is not None and not _is_still(edge.static, T):
+                self._note(f"tf: {parent} -> {child} is static and changes; the last one holds")
+            edge.static = T
+        if edge.static is not None and edge.stamps:
+            self._note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
+
+    def _note(self, note: str) -> None:
+        if note not in self.notes:
+            self.notes.append(note)
 
     @property
     def frames(self) -> tuple[str, ...]:
