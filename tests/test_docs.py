@@ -6,16 +6,21 @@ import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from string import Template
 
 import pytest
 
-from splatctrl_cli.cli.main import COMMANDS, build_parser
+from splatctrl_cli.cli.common import check_gate_names
+from splatctrl_cli.cli.main import COMMANDS, build_parser, main
+from splatctrl_cli.cli.replay_baseline import read_baselines
+from splatctrl_cli.cli.replay_metrics import metric_names
 from splatctrl_cli.config import load_config
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])
 CODE = re.compile(r"`([^`\n]+)`")
 PLACE = re.compile(r"([\w/]+\.(?:py|h|cpp))(?:: (.+))?")
+EXAMPLE = ROOT / "docs" / "replay_example.md"
 SETTING = re.compile(r"((?:scene|gaussians|occupancy|field|control)\.\w+)(?: = (.+))?")
 
 
@@ -113,9 +118,13 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 
 
 def commands_on(page: Path) -> list[str]:
-    """Command lines of indented or fenced code, continuation lines joined."""
+    """Command lines of indented or fenced code, continuation lines joined, shell variables as the page sets them."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    return re.findall(r"^(?: {4}|\$ )?(?:\.venv/bin/)?splatctrl ([a-z].*)$", text, flags=re.MULTILINE)
+    variables: dict[str, str] = {}
+    for name, value in re.findall(r'^\$ ([A-Z]+)="(.*)"$', text, flags=re.MULTILINE):
+        variables[name] = Template(value).safe_substitute(variables)
+    lines = re.findall(r"^(?: {4}|\$ )?(?:\.venv/bin/)?splatctrl ([a-z].*)$", text, flags=re.MULTILINE)
+    return [Template(line).safe_substitute(variables) for line in lines]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -130,3 +139,42 @@ def test_the_readme_shows_every_step_and_names_every_command() -> None:
     assert shown >= {"ingest", "info", "reconstruct", "export", "sdf-bake", "score", "replay"}
     for command in COMMANDS:
         assert f"`{command}`" in readme.read_text(encoding="utf-8")
+
+
+def shown_after(page: Path) -> list[list[str]]:
+    """What a page shows that each of its fenced splatctrl commands printed."""
+    text = page.read_text(encoding="utf-8")
+    return [
+        lines.splitlines() for lines in re.findall(r"^\$ splatctrl .*\n((?:(?![$`]).*\n)*)", text, flags=re.MULTILINE)
+    ]
+
+
+def test_the_replay_example_knows_its_settings_gates_and_figures() -> None:
+    commands, shown = commands_on(EXAMPLE), shown_after(EXAMPLE)
+    assert len(commands) == len(shown)
+    num_figures = 0
+    for command, lines in zip(commands, shown, strict=True):
+        args = build_parser().parse_args(shlex.split(command))
+        if args.command != "replay":
+            continue
+        load_config(None, args.set)
+        baselines = read_baselines(args)
+        names = metric_names(args.mode, ("exact", "barrier"), has_truth=args.truth is not None, baselines=baselines)
+        check_gate_names(args.require, names)
+        for line in lines:
+            figure = re.fullmatch(r"([a-z]\w*) +-?[\d.]+(?:e-\d+)?", line)
+            if figure:
+                assert figure[1] in names, f"{command}: {line}"
+                num_figures += 1
+    assert num_figures > 15
+
+
+def test_the_replay_example_shows_what_info_prints(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    command, lines = commands_on(EXAMPLE)[0], shown_after(EXAMPLE)[0]
+    assert main(shlex.split(command)) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5
+    assert [line for line in lines if line not in printed] == []
