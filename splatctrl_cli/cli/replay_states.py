@@ -99,12 +99,12 @@ def read_states(args: argparse.Namespace, model: "RobotModel") -> LoggedStates:
 
 
 def _clock(model: "RobotModel", states: "StateColumns", motion: "ImageMotion") -> "ClockOffset":
-    """Of the states that an offset can bring to a frame."""
-    from splatctrl_cli.io.state_offset import RobotPoints, estimate_clock_offset, near_frames
+    """Of the states that it looks at."""
+    from splatctrl_cli.io.state_offset import RobotPoints, estimate_clock_offset, states_asked
 
-    near = near_frames(states.stamp_ns, motion)
-    centers = model.sphere_centers_batch(states.position[near])
+    asked = states.select(states_asked(states.stamp_ns, motion))
+    centers = model.sphere_centers_batch(asked.position[: len(asked)])
     moving = model.moving_spheres
     return estimate_clock_offset(
-        states[near], motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
+        asked, motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
     )

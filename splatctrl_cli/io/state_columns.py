@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.rows import BLOCK, RowFile, Rows, Table, of_columns, ranges
+from splatctrl_cli.io.rows import BLOCK, RowFile, Rows, Table, of_columns, ranges, selected
 from splatctrl_cli.records import Float64, JointState
 
 Stamps = NDArray[np.int64]
@@ -65,6 +65,18 @@ class StateColumns(Sequence[JointState]):
             )
             for i, stamp in enumerate(self.stamp_ns[first:last].tolist())
         ]
+
+    def select(self, index: NDArray[np.int64]) -> "StateColumns":
+        """The states of an index (K,), in its order."""
+        commanded, base, world = self.commanded_velocity, self.T_base_ee, self.T_world_ee
+        return StateColumns(
+            stamp_ns=self.stamp_ns[index],
+            position=selected(self.position, index),
+            velocity=selected(self.velocity, index),
+            commanded_velocity=None if commanded is None else selected(commanded, index),
+            T_base_ee=None if base is None else selected(base, index),
+            T_world_ee=None if world is None else selected(world, index),
+        )
 
     def of_joints(self, order: NDArray[np.int64]) -> "StateColumns":
         """The joints of an order (J,)."""

@@ -21,7 +21,9 @@ MAX_CAMERAS = 2  # that are compared pixel by pixel, those in which most changes
 PIXEL_ERROR = 0.15  # of the time between frames: found on the simulated log, per camera (docs/replay.md)
 SUM_ERROR = 1.0  # likewise
 Score = Callable[[float], float]
+FEW = 1000  # states by which a joint is seen to move
 Stamps = NDArray[np.int64]
+Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,64 +81,97 @@ def estimate_clock_offset(
     position = np.array([state.position for state in states])
     if np.ptp(position, axis=0).max() < MIN_MOTION:
         return _unknown(num, "no joint moves")
-    seconds = np.array([state.stamp_ns - states[0].stamp_ns for state in states]) * 1e-9
-    interval = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras)
-    step = interval / STEPS_PER_INTERVAL
-    count = int(min(MAX_OFFSET, MAX_SHARE * float(seconds[-1])) / step) if step > 0 else 0
-    if count < 2 * STEPS_PER_INTERVAL:
-        return _unknown(num, "the log is too short")
-    offsets = np.asarray(step * np.arange(-count, count + 1), dtype=np.float64)
-    fixed = sorted((c for c in cameras if c.is_fixed), key=lambda c: -float(np.sum(c.changes)))[:MAX_CAMERAS]
     start = states[0].stamp_ns
+    seconds = np.array([state.stamp_ns - start for state in states]) * 1e-9
+    offsets, step = _offsets(float(seconds[-1]), cameras)
+    if not len(offsets):
+        return _unknown(num, "the log is too short")
+    interval = step * STEPS_PER_INTERVAL
+    fixed = sorted((c for c in cameras if c.is_fixed), key=lambda c: -float(np.sum(c.changes)))[:MAX_CAMERAS]
     if robot is not None and fixed:
-        grid = _grid(seconds, robot, step)
-        scores = [_pixel_scores(grid, step, camera, start, offsets) for camera in fixed]
+        scores = [_pixel_scores(seconds, robot, step, camera, start, offsets) for camera in fixed]
         return _peak(offsets, np.array(scores), num, MIN_PIXEL_CORRELATION, PIXEL_ERROR * interval)
     scores = [_sum_scores(seconds, position, camera, start, offsets) for camera in cameras]
     return _peak(offsets, np.array(scores), num, MIN_CORRELATION, SUM_ERROR * interval)
 
 
-def near_frames(stamp_ns: Stamps, motion: ImageMotion) -> slice:
-    """The states of stamps (T,) that rise which an offset within `MAX_OFFSET` can bring to a frame."""
-    seen = [camera for camera in motion.cameras.values() if camera.stamps_ns]
-    first = min(camera.stamps_ns[0] for camera in seen) - round(MAX_OFFSET * 1e9)
-    last = max(camera.stamps_ns[-1] for camera in seen) + round(MAX_OFFSET * 1e9)
-    return slice(int(np.searchsorted(stamp_ns, first)), int(np.searchsorted(stamp_ns, last, side="right")))
+def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
+    """The states (K,) of stamps (T,) that rise which `estimate_clock_offset` looks at: it finds the same from them as
+    from all, and of a log that is longer or denser than its frames they are few.
+    """
+    cameras = [camera for camera in motion.cameras.values() if camera.changes]
+    if not cameras:
+        return np.zeros(0, dtype=np.int64)
+    first_ns, last_ns = _span(cameras)
+    first = int(np.searchsorted(stamp_ns, first_ns))
+    near = stamp_ns[first : int(np.searchsorted(stamp_ns, last_ns, side="right"))]
+    if len(near) < 3:
+        return np.arange(first, first + len(near))
+    seconds = np.asarray((near - near[0]) * 1e-9, dtype=np.float64)
+    offsets, step = _offsets(float(seconds[-1]), cameras)
+    is_asked = np.zeros(len(near), dtype=np.bool_)
+    is_asked[np.linspace(0, len(near) - 1, FEW).astype(np.int64)] = True  # whether a joint moves
+    for camera in cameras:
+        at = _since(camera, int(near[0]))
+        for offset in offsets:
+            for times in (at - offset, step * np.round((at - offset) / step)):
+                after = _after(seconds, times)
+                is_asked[after] = is_asked[after - 1] = True
+    return first + np.flatnonzero(is_asked)
+
+
+def _span(cameras: Sequence[CameraMotion]) -> tuple[int, int]:
+    """First and last stamp [ns] that an offset within `MAX_OFFSET` can bring to a frame."""
+    reach = round(MAX_OFFSET * 1e9)
+    return min(c.stamps_ns[0] for c in cameras) - reach, max(c.stamps_ns[-1] for c in cameras) + reach
+
+
+def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, float]:
+    """The offsets [s] to try over states of `span_s`, none where these are too few, and the step between them."""
+    step = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras) / STEPS_PER_INTERVAL
+    count = int(min(MAX_OFFSET, MAX_SHARE * span_s) / step) if step > 0 else 0
+    if count < 2 * STEPS_PER_INTERVAL:
+        return np.zeros(0), step
+    return np.asarray(step * np.arange(-count, count + 1), dtype=np.float64), step
+
+
+def _since(camera: CameraMotion, start: int) -> Float64:
+    """Seconds of its frames since a stamp [ns]."""
+    return np.array([stamp - start for stamp in camera.stamps_ns]) * 1e-9
 
 
 def _near(
     states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
 ) -> tuple[list[JointState], RobotPoints | None]:
     """The states, and the robot's points at them, that an offset within `MAX_OFFSET` can bring to a frame."""
-    first = min(camera.stamps_ns[0] for camera in cameras) - round(MAX_OFFSET * 1e9)
-    last = max(camera.stamps_ns[-1] for camera in cameras) + round(MAX_OFFSET * 1e9)
+    first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
     points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
     return [states[index] for index in near], points
 
 
-def _grid(seconds: Float64, robot: RobotPoints, step: float) -> RobotPoints:
-    """The robot at every `step` from the first state on, between states linearly."""
-    centers = _at(seconds, robot.centers.reshape(len(seconds), -1), np.arange(0.0, seconds[-1] + step / 2, step))
-    return RobotPoints(centers=centers.reshape(len(centers), -1, 3), radii=robot.radii)
-
-
-def _pixel_scores(robot: RobotPoints, step: float, camera: CameraMotion, start: int, offsets: Float64) -> Float64:
-    depth = silhouettes(robot.centers, robot.radii, camera)
-    at = np.array([stamp - start for stamp in camera.stamps_ns]) * 1e-9
+def _pixel_scores(
+    seconds: Float64, robot: RobotPoints, step: float, camera: CameraMotion, start: int, offsets: Float64
+) -> Float64:
+    """With the robot at every `step` from the first state on, between states linearly."""
+    number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
+    is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
+    wanted = np.unique(number[is_inside])
+    centers = _at(seconds, robot.centers.reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3)
+    depth = silhouettes(centers, robot.radii, camera)
     changes = np.array(camera.changes)
     scores = np.zeros(len(offsets))
-    for i, offset in enumerate(offsets):
-        number = np.round((at - offset) / step).astype(np.int64)
-        keep = _kept((number >= 0) & (number < len(depth)))
+    for i, inside in enumerate(is_inside):
+        keep = _kept(inside)
         if keep.any():
-            a, b = depth[number[:-1][keep]], depth[number[1:][keep]]
+            of = np.searchsorted(wanted, number[i])
+            a, b = depth[of[:-1][keep]], depth[of[1:][keep]]
             scores[i] = correlation(predicted_change(a, b), changes[keep])
     return scores
 
 
 def _sum_scores(seconds: Float64, position: Float64, camera: CameraMotion, start: int, offsets: Float64) -> Float64:
-    at = np.array([stamp - start for stamp in camera.stamps_ns]) * 1e-9
+    at = _since(camera, start)
     change = np.array([image.mean() for image in camera.changes])
     scores = np.zeros(len(offsets))
     for i, offset in enumerate(offsets):
@@ -155,10 +190,15 @@ def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarra
 
 def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
     """Rows (K, D) of a curve (T, D) at times (K,), linearly."""
-    after = np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
+    after = _after(seconds, at)
     before = after - 1
     share = np.clip((at - seconds[before]) / (seconds[after] - seconds[before]), 0.0, 1.0)[:, None]
     return np.asarray((1 - share) * curve[before] + share * curve[after])
+
+
+def _after(seconds: Float64, at: Float64) -> Index:
+    """The state (K,) that ends the interval in which each time lies, or the nearest interval."""
+    return np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
 
 
 def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: float) -> ClockOffset:
