@@ -1,6 +1,5 @@
 """``joints.npz`` of a capture: the joint states of one topic, cleaned."""
 
-import zipfile
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -9,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.npz_columns import NpzFile
+from splatctrl_cli.io.state_columns import StateColumns
 from splatctrl_cli.records import JointState
 
 NEEDED = ("stamp_ns", "position", "velocity")
@@ -35,21 +36,19 @@ def joints_file(joints: Sequence[JointState], num_joints: int) -> bytes:
     return stream.getvalue()
 
 
-def read_joints(path: Path) -> list[JointState]:
-    """The states of a capture folder's joints.npz. Raises InputError."""
+def read_joints(path: Path) -> StateColumns:
+    """The states of a capture folder's joints.npz, read a block at a time. Raises InputError."""
     file = path / "joints.npz"
     try:
-        with np.load(file, allow_pickle=False) as content:
-            columns = [content[name] for name in NEEDED]
-            beside = {name: content[name] for name in OPTIONAL if name in content.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
-    return [
-        JointState(
-            stamp_ns=int(stamp),
-            position=position,
-            velocity=velocity,
-            **{name: values[i] for name, values in beside.items() if np.isfinite(values[i]).all()},
+        content = NpzFile(file)
+        stamps = content.stamps("stamp_ns", 1, 0, least=0)
+        rows = {name: content.rows(name) for name in (*NEEDED[1:], *OPTIONAL) if name in (*NEEDED, *content.names)}
+    except InputError as error:
+        raise InputError(error.message, remedy="run `splatctrl ingest` again") from None
+    if any(len(values) != len(stamps) for values in rows.values()):
+        raise InputError(
+            f"{file}: expected {len(stamps)} states in every array, got "
+            + ", ".join(f"{name} {len(values)}" for name, values in rows.items()),
+            remedy="run `splatctrl ingest` again",
         )
-        for i, (stamp, position, velocity) in enumerate(zip(*columns, strict=True))
-    ]
+    return StateColumns(stamp_ns=stamps, **rows)

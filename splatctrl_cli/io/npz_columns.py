@@ -26,7 +26,7 @@ class NpzFile:
         self._path = path
         try:
             with zipfile.ZipFile(path) as archive:
-                self._names = [name.removesuffix(".npy") for name in archive.namelist()]
+                self.names = [name.removesuffix(".npy") for name in archive.namelist()]
         except _DAMAGE as error:
             raise self._unreadable(error) from None
 
@@ -44,10 +44,18 @@ class NpzFile:
             file.append(np.hstack([block.reshape(len(block), -1).astype(np.float64) for block in blocks]))
         return Rows(file)
 
-    def stamps(self, name: str, unit_ns: int, epoch_ns: int) -> Stamps:
+    def rows(self, name: str) -> Rows:
+        """An array (T, ...), each row in its shape; T may be 0. Raises InputError where it holds no numbers."""
+        shape, _ = self._header(name, least=0)
+        file = RowFile(shape[1:])
+        for block in self._blocks(name):
+            file.append(block.astype(np.float64))
+        return Rows(file)
+
+    def stamps(self, name: str, unit_ns: int, epoch_ns: int, *, least: int = 1) -> Stamps:
         """Stamps (T,) [ns] of an array of times in units of `unit_ns`."""
-        self._header(name)
-        times = np.concatenate([block.reshape(-1) for block in self._blocks(name)])
+        _, dtype = self._header(name, least=least)
+        times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
         if times.dtype.kind in "iu":
             return np.asarray(times.astype(np.int64) * unit_ns + epoch_ns)
         if not np.isfinite(times).all():
@@ -56,18 +64,18 @@ class NpzFile:
         parts = np.round((times - whole) * unit_ns).astype(np.int64)
         return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)
 
-    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-        """Shape and type of an array."""
+    def _header(self, name: str, *, least: int = 1) -> tuple[tuple[int, ...], np.dtype[Any]]:
+        """Shape and type of an array of `least` rows or more."""
         found = "none"
-        if name in self._names:
+        if name in self.names:
             with ExitStack() as stack:
                 shape, dtype, _, _ = self._opened(stack, name)
-                if dtype.kind in "iuf" and shape and shape[0]:
+                if dtype.kind in "iuf" and shape and shape[0] >= least:
                     return shape, dtype
                 found = f"{dtype} of shape {shape}"
         raise InputError(
             f"{self._path}: {name!r}: expected an array of numbers, got {found}",
-            remedy=f"arrays there: {', '.join(self._names)}",
+            remedy=f"arrays there: {', '.join(self.names)}",
         )
 
     def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
