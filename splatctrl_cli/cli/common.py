@@ -7,7 +7,7 @@ import math
 import operator
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,6 +80,9 @@ def configured(args: argparse.Namespace) -> "Config":
     return load_config(args.config, args.set)
 
 
+_NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
+
+
 class Console:
     """Results to stdout, as a table or one JSON object; log lines to stderr unless --quiet."""
 
@@ -92,25 +95,35 @@ class Console:
         if not self.is_quiet:
             print(line, file=sys.stderr, flush=True)
 
-    def result(self, result: Mapping[str, Any], lines: Sequence[str]) -> None:
+    def result(self, result: Mapping[str, Any], lines: Iterable[str]) -> None:
         """The command's result: `result` as JSON with --json, else `lines`."""
         if self.is_json:
             print(json.dumps(result, indent=2, allow_nan=False, default=_plain))
         else:
-            print("\n".join(lines))
+            for line in lines:
+                print(line)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
     """Aligned text columns; numbers to the right, words to the left."""
-    cells = [[str(cell) for cell in row] for row in rows]
-    widths = [max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))]
-    is_number = [all(re.match(r"^[-+]?[\d.]|^(nan|-)$", row[i]) for row in cells) for i in range(len(header))]
-    lines = []
-    for row in [list(header), *cells]:
-        padded = [c.rjust(w) if n else c.ljust(w) for c, w, n in zip(row, widths, is_number, strict=True)]
-        lines.append("  ".join(padded).rstrip())
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return lines
+    return list(long_table(header, lambda: rows))
+
+
+def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[object]]]) -> Iterator[str]:
+    """`table` of rows that are made twice, first for their widths, and never all held."""
+    widths, is_number = [len(name) for name in header], [True] * len(header)
+    for row in rows():
+        for i, cell in enumerate(map(str, row)):
+            widths[i] = max(widths[i], len(cell))
+            is_number[i] = is_number[i] and _NUMBER.match(cell) is not None
+
+    def line(row: Sequence[object]) -> str:
+        cells = zip(map(str, row), widths, is_number, strict=True)
+        return "  ".join(c.rjust(w) if n else c.ljust(w) for c, w, n in cells).rstrip()
+
+    yield line(header)
+    yield "  ".join("-" * width for width in widths)
+    yield from map(line, rows())
 
 
 FirstTime = Callable[[str, Callable[[float], bool]], float | None]

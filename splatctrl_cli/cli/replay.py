@@ -1,6 +1,7 @@
 """``splatctrl replay``: the clearance of logged motion, what a controller says of it, or what it does instead."""
 
 import argparse
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,8 +128,8 @@ def run(args: argparse.Namespace) -> int:
         write_json(folder / "states.json", logged.as_dict())
         write_replay(folder, replay, metrics, config=config, inputs=inputs.digests, stopwatch=stopwatch)
     lines = lines_of(replay, metrics, with_steps=args.steps or args.verbose > 0)
-    lines += [coverage_words(inputs.model, config.control), *unseen, *logged.lines()]
-    console.result({"out": str(out), **metrics}, lines)
+    more = [coverage_words(inputs.model, config.control), *unseen, *logged.lines()]
+    console.result({"out": str(out), **metrics}, chain(lines, more))
     return _verdict(args, replay, metrics, golden, inputs.source)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_modes import Replay
     from splatctrl_cli.control.explain import Event
-    from splatctrl_cli.records import Float64
+    from splatctrl_cli.records import Float64, FloatRows
 
 TITLES = {
     "audit": "Clearance of the logged motion",
@@ -32,7 +32,7 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
         open_loop_picture,
     )
 
-    curves = {name: clearance.distance for name, clearance in replay.audit.clearance.items()}
+    curves: dict[str, FloatRows] = {name: of.rows for name, of in replay.audit.clearance.items()}
     if replay.true_clearance is not None:
         curves["truth"] = replay.true_clearance
     happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in ("", "exact"))
@@ -41,11 +41,11 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
         commands_picture(
             folder / "commands.png",
             seconds,
-            np.asarray(replay.kept_steps.velocity),
+            replay.kept_steps.velocity,
             replay.model.joint_names,
             replay.model.velocity_limit,
             _intervals(replay, lambda event: event.kind in INTERVENTIONS, at_least=ROWS),
-            None if replay.open_loop is None else np.asarray(replay.open_loop.logged),
+            None if replay.open_loop is None else replay.open_loop.logged,
         )
     if replay.open_loop is not None:
         shaped = [(event.start_s, event.end_s) for event in replay.events if event.kind in ROWS]
@@ -54,10 +54,10 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
             seconds,
             replay.open_loop.difference,
             replay.model.joint_names,
-            replay.open_loop.figures["barrier"],
+            replay.open_loop.figures.rows("barrier"),
             shaped,
         )
-    if replay.divergence is not None and np.isfinite(replay.divergence.joints).any():
+    if replay.divergence is not None and np.isfinite(np.asarray(replay.divergence.joints)).any():
         of = replay.divergence
         divergence_picture(folder / "divergence.png", seconds, of.joints, of.position, of.rotation)
 

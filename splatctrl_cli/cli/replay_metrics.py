@@ -1,6 +1,7 @@
 """Every figure of a replay, by a name that is known before the work, and when a figure first broke a bound."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,7 +78,7 @@ def metrics_of(replay: "Replay") -> Metrics:
         "duration_s": float(audit.stamp_ns[-1] - audit.stamp_ns[0]) * 1e-9,
         "min_clearance": least(exact),
         **{f"min_clearance_{n}": least(c.distance) for n, c in audit.clearance.items() if n != "exact"},
-        "min_clearance_true": None if replay.true_clearance is None else least(replay.true_clearance),
+        "min_clearance_true": None if replay.true_clearance is None else least(np.asarray(replay.true_clearance)),
         "num_below_margin": int(np.sum(exact < replay.margin)),
         "num_in_collision": int(np.sum(exact < 0)),
         "min_self_clearance": least(audit.self_clearance),
@@ -85,7 +86,7 @@ def metrics_of(replay: "Replay") -> Metrics:
         "unknown_share": float(np.mean(audit.unknown_share)),
         "num_without_distance": int(np.sum(_is_blank(replay))),
         "num_static_violations": len(replay.static_violations),
-        "max_map_age_s": _largest(replay.map_age_s),
+        "max_map_age_s": _largest(np.asarray(replay.map_age_s)),
     }
     if replay.kept_steps is not None:
         metrics |= _step_metrics(replay, replay.kept_steps.figures)
@@ -126,56 +127,67 @@ def first_time(replay: "Replay", metric: str, holds: Callable[[float], bool]) ->
 
 def _running(replay: "Replay", metric: str) -> "tuple[float, Float64] | None":
     """What a metric is before the first state, and over the states up to each (T,)."""
-    audit = replay.audit
-    exact = audit.clearance["exact"].distance
-    lows = {
-        "min_clearance": exact,
-        **{f"min_clearance_{name}": of.distance for name, of in audit.clearance.items() if name != "exact"},
-        "min_clearance_true": replay.true_clearance,
-        "min_self_clearance": audit.self_clearance,
-        "min_limit_margin": audit.limit_margin,
-        "min_barrier_clearance": None if replay.kept_steps is None else replay.kept_steps.figures["clearance"],
-    }
-    if replay.open_loop is not None:
-        lows["min_barrier_margin_logged"] = replay.open_loop.figures["barrier"]
-        lows["min_velocity_margin_logged"] = replay.open_loop.figures["limit"]
-    low = lows.get(metric)
+    low, high, flags = _lows(replay).get(metric), _highs(replay).get(metric), _flags(replay).get(metric)
     if low is not None:
-        return np.inf, np.fmin.accumulate(low)
-    flags = _flags(replay)
-    if metric in flags:
-        return 0.0, np.cumsum(flags[metric]).astype(np.float64)
-    highs = {"max_map_age_s": replay.map_age_s}
-    if replay.divergence is not None:
-        of = replay.divergence
-        highs |= {
-            "max_divergence_joints": of.joints,
-            "max_divergence_position": of.position,
-            "max_divergence_rotation_deg": np.degrees(of.rotation),
-        }
-    if replay.open_loop is not None:
-        highs["max_velocity_difference"] = replay.open_loop.figures["largest"]
-    return (-np.inf, np.fmax.accumulate(highs[metric])) if metric in highs else None
+        return np.inf, np.fmin.accumulate(low())
+    if high is not None:
+        return -np.inf, np.fmax.accumulate(high())
+    return None if flags is None else (0.0, np.cumsum(flags()).astype(np.float64))
 
 
-def _flags(replay: "Replay") -> "dict[str, Bool]":
-    """The states (T,) that a count counts."""
+def _lows(replay: "Replay") -> "Mapping[str, Callable[[], Float64]]":
+    """Reads the states' values (T,) of which a metric is the least."""
+    audit, truth, steps, asked = replay.audit, replay.true_clearance, replay.kept_steps, replay.open_loop
+    lows: dict[str, Callable[[], Float64]] = {
+        f"min_clearance_{name}".removesuffix("_exact"): partial(getattr, of, "distance")
+        for name, of in audit.clearance.items()
+    }
+    lows["min_self_clearance"] = lambda: audit.self_clearance
+    lows["min_limit_margin"] = lambda: audit.limit_margin
+    if truth is not None:
+        lows["min_clearance_true"] = lambda: np.asarray(truth)
+    if steps is not None:
+        lows["min_barrier_clearance"] = lambda: steps.figures["clearance"]
+    if asked is not None:
+        lows["min_barrier_margin_logged"] = lambda: asked.figures["barrier"]
+        lows["min_velocity_margin_logged"] = lambda: asked.figures["limit"]
+    return lows
+
+
+def _highs(replay: "Replay") -> "Mapping[str, Callable[[], Float64]]":
+    """Reads the states' values (T,) of which a metric is the largest."""
+    of, asked = replay.divergence, replay.open_loop
+    highs: dict[str, Callable[[], Float64]] = {"max_map_age_s": lambda: np.asarray(replay.map_age_s)}
+    if of is not None:
+        highs["max_divergence_joints"] = lambda: np.asarray(of.joints)
+        highs["max_divergence_position"] = lambda: np.asarray(of.position)
+        highs["max_divergence_rotation_deg"] = lambda: np.degrees(np.asarray(of.rotation))
+    if asked is not None:
+        highs["max_velocity_difference"] = lambda: asked.figures["largest"]
+    return highs
+
+
+def _flags(replay: "Replay") -> "Mapping[str, Callable[[], Bool]]":
+    """Reads the states (T,) that a count counts."""
     from splatctrl_cli.cli.replay_store import RUNGS
     from splatctrl_cli.control.ladder import Rung
 
-    exact = replay.audit.clearance["exact"].distance
-    flags: dict[str, Bool] = {
-        "num_below_margin": exact < replay.margin,
-        "num_in_collision": exact < 0,
-        "num_without_distance": _is_blank(replay),
+    exact, steps, asked = replay.audit.clearance["exact"], replay.kept_steps, replay.open_loop
+    flags: dict[str, Callable[[], Bool]] = {
+        "num_below_margin": lambda: exact.distance < replay.margin,
+        "num_in_collision": lambda: exact.distance < 0,
+        "num_without_distance": lambda: _is_blank(replay),
     }
-    if replay.kept_steps is not None:
-        of_steps = replay.kept_steps.figures
+    if steps is not None:
+
+        def is_on(rung: Rung) -> "Bool":
+            return np.asarray(steps.figures["rung"] == RUNGS.index(rung))
+
         for rung in (Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD):
-            flags["num_" + rung.value.replace("-", "_")] = of_steps["rung"] == RUNGS.index(rung)
-        flags["num_scaled_back"] = of_steps["scale"] < 1
-    if replay.open_loop is not None:
-        flags["num_barrier_broken_logged"] = replay.open_loop.figures["barrier"] < 0
+            flags["num_" + rung.value.replace("-", "_")] = partial(is_on, rung)
+        flags["num_scaled_back"] = lambda: steps.figures["scale"] < 1
+    if asked is not None:
+        flags["num_barrier_broken_logged"] = lambda: asked.figures["barrier"] < 0
     return flags
 
 
@@ -223,7 +235,6 @@ def _closed_loop_metrics(replay: "Replay") -> Metrics:
     assert trace is not None
     assert of is not None
     last = trace.steps[-1]
-    ends = {"joints": of.joints, "position": of.position, "rotation_deg": np.degrees(of.rotation)}
     return {
         "goal_reached": int(trace.outcome is Outcome.GOAL_REACHED),
         "stalled": int(trace.outcome is Outcome.STALLED),
@@ -235,8 +246,12 @@ def _closed_loop_metrics(replay: "Replay") -> Metrics:
         "num_scene_hits": sum(change.is_hit for change in trace.scene_changes),
         "num_anchors": len(trace.anchored),
         "num_detours": len(trace.detours),
-        **{f"max_divergence_{name}": _largest(values) for name, values in ends.items()},
-        **{f"end_divergence_{name}": _last(values) for name, values in ends.items()},
+        "max_divergence_joints": _largest(np.asarray(of.joints)),
+        "max_divergence_position": _largest(np.asarray(of.position)),
+        "max_divergence_rotation_deg": _largest(np.degrees(np.asarray(of.rotation))),
+        "end_divergence_joints": _last(np.asarray(of.joints)),
+        "end_divergence_position": _last(np.asarray(of.position)),
+        "end_divergence_rotation_deg": _last(np.degrees(np.asarray(of.rotation))),
     }
 
 

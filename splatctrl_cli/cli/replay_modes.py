@@ -26,8 +26,9 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.clearance import clearance_agreement, mark_seen
+from splatctrl_cli.io.rows import RowFile, Rows, ranges
 from splatctrl_cli.io.state_columns import StateColumns
-from splatctrl_cli.records import Float64, RecordSource, RgbdFrame
+from splatctrl_cli.records import Float64, FloatRows, RecordSource, RgbdFrame
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,9 +56,9 @@ class ReplayInputs:
 class Divergence:
     """How far a closed loop is from the log at each of T states: joints (T,) [rad], position [m], rotation [rad]."""
 
-    joints: Float64
-    position: Float64
-    rotation: Float64
+    joints: FloatRows
+    position: FloatRows
+    rotation: FloatRows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,13 +78,13 @@ class Replay:
     median_radius: float
     static_violations: tuple[StaticViolation, ...]
     obstacles: Sequence[str]
-    map_age_s: Float64
+    map_age_s: FloatRows
     start_time_s: float
     open_loop: StoredOpenLoop | None = None
     closed_loop: ReplayTrace | None = None
     divergence: Divergence | None = None
     kept_steps: StoredSteps | None = None
-    true_clearance: Float64 | None = None
+    true_clearance: FloatRows | None = None
     agreement: "Mapping[str, ClearanceAgreement]" = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     separations: "Mapping[str, Separation]" = field(default_factory=dict)
@@ -123,20 +124,25 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
     model, trace = inputs.model, replay.audit
     moving = np.flatnonzero(model.moving_spheres)
     radii = model.sphere_set.radii[moving]
-    clearance, surface = np.zeros(len(trace.stamp_ns)), np.zeros((len(trace.stamp_ns), 3))
-    for index, (stamp, q) in enumerate(zip(trace.stamp_ns.tolist(), trace.position, strict=True)):
-        distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
-        nearest = int(np.argmin(distance - radii))
-        clearance[index], surface[index] = distance[nearest] - radii[nearest], points[nearest]
-    seen = np.zeros(len(clearance), dtype=np.bool_)
-    for record in inputs.source.records():
+    clearances, surfaces = RowFile(), RowFile((3,))
+    for first, last in ranges(len(trace.stamp_ns)):
+        clearance, surface = np.zeros(last - first), np.zeros((last - first, 3))
+        stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
+        for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
+            distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
+            nearest = int(np.argmin(distance - radii))
+            clearance[index], surface[index] = distance[nearest] - radii[nearest], points[nearest]
+        clearances.append(clearance)
+        surfaces.append(surface)
+    truth, seen = Rows(clearances), np.zeros(len(clearances), dtype=np.bool_)
+    for record in inputs.source.records() if inputs.source.cameras else ():
         if isinstance(record, RgbdFrame) and (inputs.scene.cameras is None or record.camera in inputs.scene.cameras):
-            mark_seen(seen, surface, trace.stamp_ns, record, has_clock=inputs.source.has_clock)
+            mark_seen(seen, Rows(surfaces), trace.stamp_ns, record, has_clock=inputs.source.has_clock)
     agreement = {
-        name: clearance_agreement(of.distance, clearance, seen, replay.median_radius)
+        name: clearance_agreement(of.distance, np.asarray(truth), seen, replay.median_radius)
         for name, of in trace.clearance.items()
     }
-    return replace(replay, true_clearance=clearance, agreement=agreement)
+    return replace(replay, true_clearance=truth, agreement=agreement)
 
 
 def _audited(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
@@ -207,7 +213,9 @@ def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", co
         _replay(inputs, config, record, trace.static_violations, num_before=0, radius_of=0),
         closed_loop=trace,
         kept_steps=loop.kept,
-        divergence=Divergence(joints=apart["joints"], position=apart["position"], rotation=apart["rotation"]),
+        divergence=Divergence(
+            joints=apart.rows("joints"), position=apart.rows("position"), rotation=apart.rows("rotation")
+        ),
         twist_figures=twist_figures(
             model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
         ),
@@ -251,7 +259,7 @@ def _replay(
         median_radius=inputs.scene.at(int(stamps[radius_of])).median_radius,
         static_violations=statics,
         obstacles=record.obstacles,
-        map_age_s=record.ages["map_age_s"],
+        map_age_s=record.ages.rows("map_age_s"),
         start_time_s=float(int(stamps[0]) - int(inputs.states.stamp_ns[0])) * 1e-9,
         events=record.events.events(),
     )

@@ -1,12 +1,12 @@
 """What ``splatctrl replay`` says: first when and why, then figures, tables, and the files of its output folder."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli import replay_compare
-from splatctrl_cli.cli.common import table
+from splatctrl_cli.cli.common import long_table, table
 from splatctrl_cli.cli.replay_baseline import FIGURES
 
 if TYPE_CHECKING:
@@ -107,10 +107,8 @@ def told(event: "Event") -> str:
     return f"{span}, {kind}{who}{more}, worst {worst} at {event.worst_s:.2f} s{near}"
 
 
-def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> list[str]:
+def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> Iterator[str]:
     """What goes to stdout: when and why, the metrics, and a row per step on request."""
-    from splatctrl_cli.cli.replay_columns import columns_of
-
     lines = when_and_why(replay)
     lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in metrics.items()])]
     if replay.separations:
@@ -122,12 +120,24 @@ def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> list[
     if replay.static_violations:
         rows = [(violation.sphere, f"{violation.clearance:.4f}") for violation in replay.static_violations]
         lines += ["", "Spheres that no joint moves, within the margin:", *table(("sphere", "clearance"), rows)]
+    yield from lines
     if with_steps:
-        columns = columns_of(replay)
-        wanted = [name for name in columns if name != "stamp_ns" and not name.startswith(("q_", "v_", "dv_"))]
-        rows_of_steps = list(zip(*(columns[name] for name in wanted), strict=True))
-        lines += ["", *table(wanted, [[_shown(value) for value in row] for row in rows_of_steps])]
-    return lines
+        yield ""
+        yield from _step_lines(replay)
+
+
+def _step_lines(replay: "Replay") -> Iterator[str]:
+    from splatctrl_cli.cli.replay_columns import chunks_of
+
+    def is_shown(name: str) -> bool:
+        return name != "stamp_ns" and not name.startswith(("q_", "v_", "dv_"))
+
+    def rows() -> Iterator[list[str]]:
+        for chunk in chunks_of(replay):
+            shown = [values for name, values in chunk.items() if is_shown(name)]
+            yield from ([_shown(value) for value in row] for row in zip(*shown, strict=True))
+
+    return long_table([name for name in next(chunks_of(replay)) if is_shown(name)], rows)
 
 
 def seconds_of(replay: "Replay") -> "Float64":

@@ -73,12 +73,22 @@ class StoredObjects(Sequence[T], Generic[T]):
     def __getitem__(self, index: slice) -> list[T]: ...
     def __getitem__(self, index: int | slice) -> T | list[T]:
         if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(self._num))]
+            first, last, step = index.indices(self._num)
+            return self._range(first, last) if step == 1 else [self[i] for i in range(first, last, step)]
         at = index + (self._num if index < 0 else 0)
         if not 0 <= at < self._num:
             raise IndexError(f"{index} of {self._num}")
         number = int(np.searchsorted(self._starts, at, side="right")) - 1
         return self._block(number)[at - self._starts[number]]
+
+    def _range(self, first: int, last: int) -> list[T]:
+        found: list[T] = []
+        while first + len(found) < last:
+            at = first + len(found)
+            number = int(np.searchsorted(self._starts, at, side="right")) - 1
+            start = self._starts[number]
+            found += self._block(number)[at - start : last - start]
+        return found
 
     def _block(self, number: int) -> list[T]:
         if self._read[0] != number:
@@ -102,6 +112,10 @@ class Figures:
         """A whole column (T,)."""
         return self._files[name].read(0, len(self._files[name]))
 
+    def rows(self, name: str) -> Rows:
+        """A column (T,) that is read as it is asked for."""
+        return Rows(self._files[name])
+
     def block(self, name: str, first: int, last: int) -> Float64:
         """Part of a column."""
         return self._files[name].read(first, last)
@@ -117,6 +131,11 @@ class StoredClearance:
     def distance(self) -> Float64:
         """(T,) [m]."""
         return self._figures[f"distance {self._name}"]
+
+    @property
+    def rows(self) -> Rows:
+        """The distance (T,) [m], read as it is asked for."""
+        return self._figures.rows(f"distance {self._name}")
 
     @property
     def sphere(self) -> NDArray[np.int64]:
@@ -298,6 +317,7 @@ class StoredOpenLoop:
         self.kept, self.figures = StoredSteps(), Figures()
         self.margins: StoredObjects[VelocityMargin | None] = StoredObjects()
         self._logged: RowFile | None = None
+        self._difference: RowFile | None = None
 
     @property
     def steps(self) -> Sequence[ControlStep | None]:
@@ -316,15 +336,18 @@ class StoredOpenLoop:
         return self.kept.velocity
 
     @property
-    def difference(self) -> Float64:
-        """(T, J) [rad/s] commanded less logged, in memory."""
-        return np.asarray(np.asarray(self.commanded) - np.asarray(self.logged))
+    def difference(self) -> Rows:
+        """(T, J) [rad/s] commanded less logged."""
+        assert self._difference is not None
+        return Rows(self._difference)
 
     def add(self, part: OpenLoopTrace) -> None:
         """The next states."""
         num_joints = part.logged.shape[1]
         self._logged = self._logged or RowFile((num_joints,))
         self._logged.append(part.logged)
+        self._difference = self._difference or RowFile((num_joints,))
+        self._difference.append(part.difference)
         self.kept.extend(part.steps, num_joints)
         self.margins.extend(part.margins)
         nothing = (np.nan, np.nan)

@@ -93,16 +93,18 @@ def twist_figures(
     if track is None:
         return {}
     is_known = track.is_known(stamp_ns, config.twist_timeout)
-    capped, linear, angular = [], [], []
-    for stamp, q, step, known in zip(stamp_ns, position, steps, is_known, strict=True):
+    num_known = num_capped = 0
+    linear, angular = np.full(len(stamp_ns), np.nan), np.full(len(stamp_ns), np.nan)
+    for i, (stamp, q, step, known) in enumerate(zip(stamp_ns, position, steps, is_known, strict=True)):
         reference = track.reference(model, config, q, int(stamp))
         if known:
-            capped.append(not np.array_equal(reference, track.asked(model, q, int(stamp), config.twist_timeout)))
+            num_known += 1
+            asked = track.asked(model, q, int(stamp), config.twist_timeout)
+            num_capped += not np.array_equal(reference, asked)
         if step is not None:
             missed = model.frame_jacobian(q, frame) @ step.velocity - reference
-            linear.append(np.linalg.norm(missed[:3]))
-            angular.append(np.linalg.norm(missed[3:]))
-    values = [float(is_known.mean()), float(np.mean(capped)) if capped else None]
-    for errors in (linear, angular):
-        values += [float(np.mean(errors)), float(np.max(errors))] if errors else [None, None]
+            linear[i], angular[i] = np.linalg.norm(missed[:3]), np.linalg.norm(missed[3:])
+    values = [float(is_known.mean()), num_capped / num_known if num_known else None]
+    for errors in (linear[~np.isnan(linear)], angular[~np.isnan(angular)]):
+        values += [float(np.mean(errors)), float(np.max(errors))] if len(errors) else [None, None]
     return dict(zip(FIGURES, values, strict=True))

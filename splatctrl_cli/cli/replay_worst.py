@@ -52,7 +52,8 @@ def draw_worst_frames(folder: Path, inputs: "ReplayInputs", replay: "Replay", nu
 def _frames(inputs: "ReplayInputs") -> "Iterator[RgbdFrame]":
     from splatctrl_cli.records import RgbdFrame
 
-    return (record for record in inputs.source.records() if isinstance(record, RgbdFrame))
+    records = inputs.source.records() if inputs.source.cameras else ()
+    return (record for record in records if isinstance(record, RgbdFrame))
 
 
 def _moment(inputs: "ReplayInputs", replay: "Replay", state: int) -> "Moment":

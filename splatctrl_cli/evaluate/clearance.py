@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.evaluate.visibility import seen_by
-from splatctrl_cli.records import Bool, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame
 
 NEAR = 0.10  # [m] true clearance below which a state takes part in the comparison
+BLOCK = 4096  # states at once
 ALLOWANCE = 0.01  # [m] the clearance may be off by this and the median splat radius
 
 
@@ -85,11 +86,17 @@ def clearance_agreement(
 
 
 def mark_seen(
-    seen: Bool, points_world: Float64, stamp_ns: NDArray[np.int64], frame: RgbdFrame, *, has_clock: bool = True
+    seen: Bool, points_world: FloatRows, stamp_ns: NDArray[np.int64], frame: RgbdFrame, *, has_clock: bool = True
 ) -> None:
-    """Set `seen` (T,) where a surface point (T, 3) [m], asked for at a stamp (T,), was seen in a frame not later."""
-    asked = np.flatnonzero(~seen & ((stamp_ns >= frame.stamp_ns) | (not has_clock)))
-    seen[asked] = seen_by(points_world[asked], [frame])
+    """Set `seen` (T,) where a surface point (T, 3) [m], asked for at a stamp (T,), was seen in a frame not later.
+
+    The points are read a block at a time, and only where some were not seen yet.
+    """
+    for first in range(0, len(seen), BLOCK):
+        part = slice(first, first + BLOCK)
+        asked = first + np.flatnonzero(~seen[part] & ((stamp_ns[part] >= frame.stamp_ns) | (not has_clock)))
+        if len(asked):
+            seen[asked] = seen_by(points_world[asked], [frame])
 
 
 def least(values: Float64) -> float | None:

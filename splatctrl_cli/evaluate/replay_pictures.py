@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.evaluate.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, span_of
-from splatctrl_cli.evaluate.time_axis import envelope, spans
-from splatctrl_cli.records import Float64
+from splatctrl_cli.evaluate.time_axis import column, envelope, spans
+from splatctrl_cli.records import Float64, FloatRows
 
 Intervals = Sequence[tuple[float, float]]
 """First and last time [s] of each interval."""
@@ -56,7 +55,7 @@ FIELD_NAMES = {
 def clearance_picture(
     path: Path,
     seconds: Float64,
-    curves: Mapping[str, NDArray[np.floating]],
+    curves: Mapping[str, FloatRows],
     margin: float,
     title: str,
     events: Mapping[str, Intervals],
@@ -69,9 +68,8 @@ def clearance_picture(
     shown = {kind: intervals for kind, intervals in events.items() if intervals}
     with drawn_figure(4.8 + _strip_height(shown)) as figure:
         axes, strip = _with_strip(figure, 4.4, shown)
-        lowest = min([0.0, *(float(np.nanmin(v)) for v in curves.values() if np.isfinite(v).any())]) * 100.0
-        for name, values in curves.items():
-            _clearance_curve(axes, seconds, 100.0 * np.asarray(values, dtype=np.float64), name)
+        found = [_clearance_curve(axes, seconds, values, name) for name, values in curves.items()]
+        lowest = min(0.0, *found)
         bottom = lowest * 1.15 - 0.2 if lowest < 0 else 0.0
         axes.axhspan(bottom, 100 * margin, color="#000000", alpha=0.06, linewidth=0)
         axes.axhline(100 * margin, color=INK, linewidth=1.0, linestyle=(0, (6, 3)))
@@ -100,11 +98,11 @@ def clearance_picture(
 def commands_picture(
     path: Path,
     seconds: Float64,
-    velocity: Float64,
+    velocity: FloatRows,
     joints: Sequence[str],
     limits: Float64,
     interventions: Mapping[str, Intervals],
-    logged: Float64 | None = None,
+    logged: FloatRows | None = None,
 ) -> None:
     """Write the commanded velocity of each joint (T, J) [rad/s] with its limit (J,), over a strip per kind of row
     that shaped it, or of step that was not plainly taken. logged (T, J): what was done there, drawn behind.
@@ -115,10 +113,11 @@ def commands_picture(
             len(joints) + 1, 1, sharex=True, height_ratios=[0.78] * len(joints) + [_strip_height(interventions)]
         )
         for j, (axes, joint) in enumerate(zip(rows, joints, strict=True)):
+            beneath = 0.0
             if logged is not None:
-                _curve(axes, seconds, logged[:, j], color=QUIET, width=2.6)
-            _curve(axes, seconds, velocity[:, j], color=CURVE_COLORS[0], width=1.5)
-            _limit_axis(axes, joint, velocity[:, j], float(limits[j]), logged if logged is None else logged[:, j])
+                beneath = _curve(axes, seconds, column(logged, j), color=QUIET, width=2.6)
+            peak = _curve(axes, seconds, column(velocity, j), color=CURVE_COLORS[0], width=1.5)
+            _limit_axis(axes, joint, float(limits[j]), peak, beneath)
             _tidy(axes, seconds)
         beside = "" if logged is None else "; grey: as logged"
         rows[0].set_title(
@@ -132,9 +131,9 @@ def commands_picture(
 def open_loop_picture(
     path: Path,
     seconds: Float64,
-    difference: Float64,
+    difference: FloatRows,
     joints: Sequence[str],
-    margin: Float64,
+    margin: FloatRows,
     shaped: Intervals,
 ) -> None:
     """Write commanded less logged velocity (T, J) [rad/s] over the room (T,) [m/s] that the logged velocity left.
@@ -143,17 +142,19 @@ def open_loop_picture(
     """
     with drawn_figure(7.2) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        for color, style, (joint, curve) in zip(
-            cycle(CURVE_COLORS), cycle(["-"] * 6 + ["--"] * 6), zip(joints, difference.T, strict=True), strict=False
+        largest = 0.0
+        for color, style, (j, joint) in zip(
+            cycle(CURVE_COLORS), cycle(["-"] * 6 + ["--"] * 6), enumerate(joints), strict=False
         ):
-            _curve(above, seconds, curve, color=color, width=1.5, style=style, label=joint)
+            peak = _curve(above, seconds, column(difference, j), color=color, width=1.5, style=style, label=joint)
+            largest = max(largest, peak)
         above.set_title("Commanded less logged joint velocity; shaded: a row shapes the command", pad=10)
         above.set_ylabel("difference [rad/s]")
-        largest = float(np.nanmax(np.abs(difference), initial=0.0))
         above.set_ylim(-max(1.1 * largest, SMALLEST), max(1.1 * largest, SMALLEST))
         above.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        low = envelope(seconds, margin)
-        _curve(below, seconds, margin, color=CURVE_COLORS[0], width=1.8)
+        room = np.asarray(margin)
+        low = envelope(seconds, room)
+        _curve(below, seconds, room, color=CURVE_COLORS[0], width=1.8)
         below.fill_between(
             low.seconds, low.lowest, 0.0, where=low.lowest < 0, color=CURVE_COLORS[1], alpha=0.35, linewidth=0
         )
@@ -169,18 +170,20 @@ def open_loop_picture(
         save_figure(figure, path)
 
 
-def divergence_picture(path: Path, seconds: Float64, joints: Float64, position: Float64, rotation: Float64) -> None:
+def divergence_picture(
+    path: Path, seconds: Float64, joints: FloatRows, position: FloatRows, rotation: FloatRows
+) -> None:
     """Write how far the arm is from the log (T,): joints [rad], its frame's position [m] and rotation [rad]."""
     curves = (
-        ("all joints [rad]", joints),
-        ("frame, position [cm]", 100.0 * position),
-        ("frame, rotation [degrees]", np.degrees(rotation)),
+        ("all joints [rad]", joints, 1.0),
+        ("frame, position [cm]", position, 100.0),
+        ("frame, rotation [degrees]", rotation, float(np.degrees(1.0))),
     )
     with drawn_figure(7.8) as figure:
-        for color, axes, (label, values) in zip(
+        for color, axes, (label, values, factor) in zip(
             CURVE_COLORS, figure.subplots(3, 1, sharex=True), curves, strict=False
         ):
-            _curve(axes, seconds, values, color=color, width=1.8)
+            _curve(axes, seconds, factor * np.asarray(values), color=color, width=1.8)
             axes.set_ylabel(label)
             axes.set_ylim(bottom=0.0)
             _tidy(axes, seconds)
@@ -191,8 +194,11 @@ def divergence_picture(path: Path, seconds: Float64, joints: Float64, position: 
 
 def _curve(
     axes: Any, seconds: Float64, values: Float64, *, color: str, width: float, style: Any = "-", label: str = ""
-) -> None:
-    """A curve; of one that is too long the band from its lowest to its highest values, on a line where it is thin."""
+) -> float:
+    """A curve; of one that is too long the band from its lowest to its highest values, on a line where it is thin.
+
+    Returns how far its values are from zero at most.
+    """
     of = envelope(seconds, values)
     there = np.isfinite(of.lowest)
     height = float(np.max(of.highest[there]) - np.min(of.lowest[there])) if there.any() else 0.0
@@ -202,25 +208,29 @@ def _curve(
     if not of.is_exact:
         name = "_" if is_thin else label or "_"
         axes.fill_between(of.seconds, of.lowest, of.highest, color=color, alpha=0.45, linewidth=0.7, label=name)
+    return float(np.nanmax(np.abs([of.lowest, of.highest]), initial=0.0))
 
 
-def _clearance_curve(axes: Any, seconds: Float64, centimetres: Float64, name: str) -> None:
+def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) -> float:
+    """Returns the least value [cm]; infinity where there is none."""
+    centimetres = 100.0 * np.asarray(metres, dtype=np.float64)
     color, style, width = FIELD_STYLES.get(name, (CURVE_COLORS[3], "-", 1.5))
     label = FIELD_NAMES.get(name, name)
     if not np.isfinite(centimetres).any():
         axes.plot([], [], color=color, label=f"{label}, no value")
-        return
+        return np.inf
     at = int(np.nanargmin(centimetres))
     label = f"{label}, least {centimetres[at]:.1f} cm"
     _curve(axes, seconds, centimetres, color=color, width=width, style=style, label=label)
     axes.plot(seconds[at], centimetres[at], "o", color=color, markersize=6, markeredgecolor="white", clip_on=False)
+    return float(centimetres[at])
 
 
-def _limit_axis(axes: Any, joint: str, velocity: Float64, limit: float, logged: Float64 | None) -> None:
-    """The axis of one joint: as high as its velocity needs, with the limit where it is in sight, and in words."""
-    peak = float(np.nanmax(np.abs(velocity), initial=0.0))
-    there = peak if logged is None else max(peak, float(np.nanmax(np.abs(logged), initial=0.0)))
-    height = max(1.25 * there, SMALLEST)
+def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float) -> None:
+    """The axis of one joint: as high as its velocity and what is drawn beneath it need, with the limit where it is in
+    sight, and in words.
+    """
+    height = max(1.25 * max(peak, beneath), SMALLEST)
     axes.set_ylim(-height, height)
     for side in (-limit, limit):
         if abs(side) <= height:

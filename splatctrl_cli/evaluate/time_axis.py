@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, FloatRows
 
 COLUMNS = 1000  # of a picture; more states than twice as many become ranges
+BLOCK = 4096  # rows at once
 SHORTEST = 1.0 / 400.0  # share of the axis: an interval is drawn no shorter
 
 
@@ -40,6 +41,12 @@ def envelope(seconds: Float64, values: Float64, columns: int = COLUMNS) -> Envel
     lowest, highest = np.full(columns, np.nan), np.full(columns, np.nan)
     lowest[is_filled], highest[is_filled] = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
     return Envelope(seconds=0.5 * (edges[:-1] + edges[1:]), lowest=lowest, highest=highest)
+
+
+def column(rows: FloatRows, number: int) -> Float64:
+    """A column (T,) of rows (T, K), which are read a block at a time."""
+    parts = [rows[first : first + BLOCK][:, number] for first in range(0, len(rows), BLOCK)]
+    return np.concatenate([np.zeros(0), *parts])
 
 
 def spans(intervals: Sequence[tuple[float, float]], span_s: tuple[float, float]) -> list[tuple[float, float]]:
