@@ -34,9 +34,12 @@ NAMES = tuple(f"joint{number}" for number in range(1, 8))
 
 @dataclass(frozen=True, kw_only=True)
 class Spent:
-    """What a process took: wall time [s], largest resident memory [MB], and its exit code."""
+    """What a process took: wall time [s], processor time [s] of it and the system for it, largest resident memory
+    [MB], and its exit code.
+    """
 
     seconds: float
+    processor_s: float
     megabytes: float
     code: int
 
@@ -63,16 +66,22 @@ _WAIT = """
 import resource, subprocess, sys, time
 start = time.perf_counter()
 code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
-print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, code)
+seconds, used = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+print(seconds, used.ru_utime + used.ru_stime, used.ru_maxrss, code)
 """
 
 
 def measured(command: Sequence[str]) -> Spent:
     """Run a command and wait for it, from a small process: a child's largest memory begins with its parent's."""
     answer = subprocess.run([sys.executable, "-c", _WAIT, *command], capture_output=True, text=True, check=True)
-    seconds, memory, code = answer.stdout.split()[-3:]
+    seconds, processor, memory, code = answer.stdout.split()[-4:]
     per_megabyte = 2**20 if sys.platform == "darwin" else 2**10
-    return Spent(seconds=float(seconds), megabytes=float(memory) / per_megabyte, code=int(code))
+    return Spent(
+        seconds=float(seconds),
+        processor_s=float(processor),
+        megabytes=float(memory) / per_megabyte,
+        code=int(code),
+    )
 
 
 def replay_command(log: Path, scene: Sequence[str], out: Path, *more: str) -> list[str]:
@@ -190,7 +199,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     spent, num = measured(command), round(args.seconds * RATE)
     print(
         f"{args.form} {args.mode}: {num} states in {spent.seconds:.1f} s ({num / spent.seconds:.0f} states/s), "
-        f"{spent.megabytes:.0f} MB, exit {spent.code}"
+        f"processor {spent.processor_s:.1f} s ({num / spent.processor_s:.0f} states/s), {spent.megabytes:.0f} MB, "
+        f"exit {spent.code}"
     )
     return spent.code
 
