@@ -135,7 +135,6 @@ class ControlConfig:
     coverage: str = "report"  # of the spheres: say what they leave uncovered; or margin: keep that much more, too
     period: float = 0.01  # [s] dt; the paper solves at more than 100 Hz
     barrier_gain: float = 10.0  # [1/s] alpha of every limit and barrier row; 1 (as printed) takes 1.4 times as long
-    recovery_speed: float = 0.25  # [m/s] at most that a row within its margin asks for to leave it; 0: no cap
     self_margin: float = 0.02  # [m] epsilon of the self-collision rows, III-E
     weight_linear: float = 10.0  # Q of III-E, linear part; III-E gives no weights
     weight_angular: float = 1.0  # Q of III-E, angular part
@@ -257,7 +256,6 @@ _AT_LEAST_ZERO = (
         "scene.noise",
         "control.stop_acceleration",
         "control.human_margin",
-        "control.recovery_speed",
         "control.max_cuts",
         "control.max_detours",
     ),

@@ -22,7 +22,7 @@ PAPER = "paper"
 
 def applied(config: ControlConfig) -> ControlConfig:
     """The configuration with the numbers that its preset fixes: as printed, every row has a gain of 1 per second."""
-    return replace(config, barrier_gain=1.0, recovery_speed=0.0) if config.preset == PAPER else config
+    return replace(config, barrier_gain=1.0) if config.preset == PAPER else config
 
 
 def with_preset(config: Config) -> Config:

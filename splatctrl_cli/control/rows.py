@@ -175,9 +175,7 @@ class RowBuilder:
         takes.
 
         A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it is counted on, for it changes on
-        the way and other rows want their part. A row within its margin asks to be left no faster than
-        `config.recovery_speed`: deep inside, ``alpha (d - epsilon)`` would ask for steps longer than what its
-        gradient holds for.
+        the way and other rows want their part.
         """
         config = self._config
         if self._acceleration is None or G is None:
@@ -185,8 +183,6 @@ class RowBuilder:
         else:
             deceleration = BRAKING_SHARE * (np.abs(G) @ self._acceleration)
             bound = braking_speed(distance - margin, config.barrier_gain, deceleration, config.period)
-        if config.recovery_speed > 0:
-            bound = np.maximum(bound, -config.recovery_speed)
         return np.asarray(bound + distance_rate)
 
     def _pair_rows(

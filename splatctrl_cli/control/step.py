@@ -235,7 +235,7 @@ class QpIkController:
             if choice.rung is Rung.HOLD:
                 break
             later = self._builder.distances(q + self._config.period * choice.velocity)
-            broken = ~(later >= self._floor(choice, rows))
+            broken = self._broken(choice, rows, later)
             if not np.any(broken):
                 return rows, choice, True
             can_be_cut = broken[:num_external] & np.isfinite(later[:num_external])
@@ -244,18 +244,24 @@ class QpIkController:
             rows = self._builder.cut(rows, q, choice.velocity, np.flatnonzero(can_be_cut), distance_rate)
         return rows, choice, False
 
-    def _floor(self, choice: Choice, rows: Rows) -> Float64:
-        """The distances (M,) after a period that the rows promise.
+    def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
+        """The rows (M,) whose distance after a period, `later` (M,), is worse than they promise.
 
         A row promises ``d(q + dt v) >= d - dt (h + s)``; a sphere on its way back out need only not lose ground.
         Beyond the margin the promise may be missed by `promise_tolerance`, within it, where that would add up from
-        step to step, by a hundredth of it.
+        step to step, by a hundredth of it. Rows within their margins may lose ground to one another where all of
+        them together lack less of their margins than before: between several surfaces there may be no other way out.
         """
         config = self._config
         promised = rows.distance - config.period * (rows.h + rows.spread(choice.slack))
         is_within = rows.distance < rows.margin
         tolerance = np.where(is_within, WITHIN_SHARE, 1.0) * config.promise_tolerance
-        return np.asarray(np.minimum(promised, rows.distance) - tolerance)
+        broken = ~(later >= np.minimum(promised, rows.distance) - tolerance)
+        if np.any(broken) and np.all(is_within[broken]):
+            lack, lack_later = (float(np.sum(np.maximum(rows.margin - d, 0.0))) for d in (rows.distance, later))
+            if lack_later < lack - WITHIN_SHARE * config.promise_tolerance:
+                return np.zeros_like(broken)
+        return np.asarray(broken)
 
     def _kept_scale(self, q: Float64, choice: Choice, rows: Rows, rest: Float64) -> float:
         """The largest of SCALES whose next distances are no worse than the rows promised, else 0: how much of a
@@ -263,10 +269,9 @@ class QpIkController:
         """
         if choice.rung is Rung.HOLD:
             return 0.0
-        floor = self._floor(choice, rows)
         for scale in SCALES:
-            later = q + self._config.period * _blend(choice.velocity, rest, scale)
-            if np.all(self._builder.distances(later) >= floor):
+            later = self._builder.distances(q + self._config.period * _blend(choice.velocity, rest, scale))
+            if not np.any(self._broken(choice, rows, later)):
                 return scale
         return 0.0
 

@@ -1,15 +1,18 @@
 """Rows against what a step would meet beside its own rows: corners and shells, where the nearest surface changes."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.ladder import Rung
-from splatctrl_cli.control.replay import ReplayTask, closed_loop
+from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
 from splatctrl_cli.control.rows import RowBuilder
 from splatctrl_cli.control.step import QpIkController
+from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.robot.model import RobotModel
 from tests.control.fakes import Balls, PlanarArm, far_away
 
 ARM = PlanarArm()
@@ -23,6 +26,12 @@ TASK = ReplayTask(
     frame="tip",
     home=np.array([1.6, 0.3]),
 )
+
+
+def sample_arm() -> RobotModel:
+    """The seven-joint arm of the sample data."""
+    folder = Path(__file__).parents[2] / "sample_data" / "tabletop"
+    return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
 
 
 def test_an_arm_pressed_against_a_row_of_balls_keeps_its_margin() -> None:
@@ -96,15 +105,33 @@ def test_a_corner_stops_an_arm_at_both_of_its_sides(max_cuts: int) -> None:
     assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
 
 
-@pytest.mark.parametrize("recovery_speed", [0.0, 0.05, 0.25])
-def test_a_row_deep_inside_asks_to_be_left_no_faster_than_the_recovery_speed(recovery_speed: float) -> None:
-    inside = Balls([ARM.sphere_centers(TASK.start)[TIP] + [0.0, 0.05, 0.0]], [0.06])
-    config = replace(CONFIG, recovery_speed=recovery_speed)
-    builder = RowBuilder(ARM, config, inside)
-    rows = builder.at(TASK.start, BOX, -0.3)
-    linear = config.barrier_gain * (rows.external.distance - config.margin)
-    assert linear[3] < -0.5
-    expected = np.maximum(linear, -recovery_speed) if recovery_speed else linear
-    np.testing.assert_allclose(rows.external.h, expected - 0.3)
-    room = builder.room(TASK.start, np.zeros(2), -0.3)
-    np.testing.assert_allclose(room[:4], expected - 0.3)
+def test_an_arm_inside_a_shell_of_balls_gets_out() -> None:
+    """A cylinder of splats appears around the hand: every motion brings some sphere of it nearer to one of them."""
+    arm, q = sample_arm(), np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
+    T_world_goal = arm.frame_pose(np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 1.6]), "hand")
+    turn, height = np.meshgrid(np.arange(0.0, 2 * np.pi, 0.5), np.arange(-0.12, 0.12, 0.03), indexing="ij")
+    shell = np.stack([0.06 * np.cos(turn), 0.06 * np.sin(turn), height], axis=-1).reshape(-1, 3)
+    around_hand = arm.frame_pose(q, "hand")[:3, 3] + np.array([0.05, 0.03, 0.0])
+    cylinder = SphereField((shell + around_hand).astype(np.float32), np.full(len(shell), 0.02, np.float32))
+    nothing = SphereField(np.full((1, 3), 50.0, np.float32), np.full(1, 0.01, np.float32))
+    task = ReplayTask(start=q, T_world_goal=T_world_goal, frame="hand")
+    trace = closed_loop(arm, CONFIG, task, lambda t: cylinder if t >= 50_000_000 else nothing)
+    clearance = np.array([step.clearance for step in trace.steps])
+    assert clearance[5] < -0.05 and trace.outcome is Outcome.GOAL_REACHED
+    assert np.all(clearance[60:] >= CONFIG.margin - CONFIG.promise_tolerance)
+
+
+def distances(q: np.ndarray, field: Balls) -> np.ndarray:
+    return field.query(ARM.sphere_centers(q)[1:])[0] - ARM.sphere_set.radii[1:]
+
+
+def test_a_sphere_outside_its_margin_does_not_give_way_to_those_within() -> None:
+    """The forearm's middle is within its margin, and the way out of it leads the tip into another ball."""
+    q = np.array([0.2, 0.3])
+    centers, side = ARM.sphere_centers(q), np.array([-np.sin(0.5), np.cos(0.5), 0.0])
+    below = centers[3] - (0.04 + 0.03 + 0.01) * side
+    above = centers[TIP] + (0.04 + 0.03 + CONFIG.margin + 1e-4) * side
+    field = Balls([below, above], [0.03, 0.03])
+    step = QpIkController(ARM, CONFIG, field, frame="tip").step(q, ARM.frame_pose(q, "tip"))
+    later = distances(q + CONFIG.period * step.velocity, field)
+    assert later[3] >= CONFIG.margin - CONFIG.promise_tolerance

@@ -27,8 +27,8 @@ def both(field: DistanceField, q: Float64, goal: Float64, **changes: float) -> t
     return tuple(QpIkController(arm, config, field, frame="tip").step(q, T) for config in configs)
 
 
-def test_the_preset_fixes_the_gain_uncapped_and_nothing_else() -> None:
-    assert replace(ControlConfig(), preset="paper", barrier_gain=1.0, recovery_speed=0.0) == PAPER
+def test_the_preset_fixes_the_gain_and_nothing_else() -> None:
+    assert replace(ControlConfig(), preset="paper", barrier_gain=1.0) == PAPER
     assert applied(ControlConfig()) == ControlConfig()
     assert load_config(None, ["control.preset=paper"]).control.preset == "paper"
     with pytest.raises(UsageError, match=r"control\.preset: expected reduced or paper"):
