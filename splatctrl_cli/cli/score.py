@@ -131,7 +131,8 @@ def score_scene(
     reference = open_reference(args, console)
     cameras = cameras_to_score(args, reference, scene.cameras)
     check_training(args, reference, scene)
-    recording = recording_check(args, reference, scene)
+    digests = reference.source.digests()
+    recording = recording_check(args, reference, scene, digests)
     draw = view_drawer(folder / "views") if folder and args.images == "all" else None
     scorer = Scorer(args=args, scene=scene, reference=reference, cameras=cameras, perceptual=lpips, draw=draw)
     scores = scorer.run(console, stopwatch)
@@ -141,5 +142,5 @@ def score_scene(
             surface = (cloud, cloud_figures(cloud, scene, scores.training, args.threads))
     result = result_of(args, scene, reference, cameras, scores, recording=recording, cloud=surface, lpips=lpips)
     if folder:
-        write_scores(folder, args, reference, result, scores, stopwatch)
+        write_scores(folder, args, digests, result, scores, stopwatch)
     return result, reference.source

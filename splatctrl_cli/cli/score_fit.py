@@ -166,7 +166,7 @@ def _reconstruct(args: argparse.Namespace, scene: Path, scan: str, settings: lis
     command = [sys.executable, "-m", "splatctrl_cli", "reconstruct", *source, "-q", "-o", str(scene), *settings]
     command += ["--seed", str(args.seed), "--threads", str(args.threads)]
     command += [word for setting in args.set for word in ("--set", setting)]
-    for name in ("config", "depths", "protocol", "root", "holdout", "depth_scale"):
+    for name in ("config", "depths", "downscale", "protocol", "root", "holdout", "depth_scale"):
         if getattr(args, name) is not None:
             command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     launcher = [sys.executable, "-S", str(Path(launch.__file__))]
@@ -219,7 +219,7 @@ def _result(args: argparse.Namespace, fits: Sequence[Fitted], iterations: int, s
     metrics["psnr_gain"] = None if ours is None or theirs is None else ours - theirs
     first = fits[0].score["protocol"]
     scans = list(dict.fromkeys(fit.scan for fit in fits))
-    averaging = "mean over the views of a scan" + (", then over the scans" if len(scans) > 1 else "")
+    averaging = "mean over the views" + (" of a scan, then over the scans" if len(scans) > 1 else "")
     return {
         "source": str(args.dtu or args.reference),
         "scans": scans,

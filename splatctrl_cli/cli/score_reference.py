@@ -1,7 +1,7 @@
 """What `score` compares with: the recording, which of its views are scored by which protocol, and their masks."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,6 +52,12 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depths", type=Path, metavar="DIR", help="depth_map_0000.pfm and so on of a scan in IDR's layout"
     )
+    parser.add_argument(
+        "--downscale",
+        type=int,
+        metavar="N",
+        help="make images of --dtu N times smaller (default: down to the size of the protocol, if a whole factor)",
+    )
 
 
 def open_dtu(args: argparse.Namespace, masks: Path | None = None) -> "DtuSource":
@@ -61,7 +67,9 @@ def open_dtu(args: argparse.Namespace, masks: Path | None = None) -> "DtuSource"
 
     protocol = None if args.protocol is None else score_protocol(args.protocol)
     holdout = view_numbers(words(args.holdout or ""))
-    return DtuSource(args.dtu, args.scan, holdout, protocol=protocol, masks=masks, depths=args.depths)
+    return DtuSource(
+        args.dtu, args.scan, holdout, protocol=protocol, masks=masks, depths=args.depths, downscale=args.downscale
+    )
 
 
 def open_held_out(args: argparse.Namespace, path: Path) -> tuple["RecordSource", "ScoreProtocol", "Split"]:
@@ -85,7 +93,7 @@ def open_held_out(args: argparse.Namespace, path: Path) -> tuple["RecordSource",
 
 def refuse_scan_options(args: argparse.Namespace) -> None:
     """Raise UsageError for what belongs to --dtu where there is none."""
-    for name in ("scan", "depths"):
+    for name in ("scan", "depths", "downscale"):
         if getattr(args, name):
             raise UsageError(f"--{name} {getattr(args, name)}: only with --dtu", remedy="leave it out")
 
@@ -194,27 +202,27 @@ def check_training(args: argparse.Namespace, reference: Reference, scene: "Scene
     )
 
 
-def recording_check(args: argparse.Namespace, reference: Reference, scene: "SceneFolder") -> dict[str, Any]:
+def recording_check(
+    args: argparse.Namespace, reference: Reference, scene: "SceneFolder", digests: Mapping[str, str]
+) -> dict[str, Any]:
     """What the recording has in common with the one that made the scene. Raises InputError where they differ.
 
-    By the first frame of each camera that trained; for a scene of an older version, by the digests of the files.
+    By the first frame of each camera that trained (not kept by an older version), and the digests of files of the
+    same names.
     """
-    from splatctrl_cli.evaluate.recording import differences
+    from splatctrl_cli.evaluate.recording import changed_files, differences
 
-    recorded = scene.run["metrics"].get("first_frames") if "metrics" in scene.run else None
-    where = args.reference or args.dtu
+    recorded = scene.run.get("metrics", {}).get("first_frames")
+    then = scene.run.get("inputs", {})
+    compared = [name for name in then if name in digests]
+    basis = [f"digests of {len(compared)} files of the same names"] if compared else []
+    lines = changed_files(then, digests)
     if recorded:
-        basis = "intrinsics, stamp, pose and picture of each training camera's first frame"
-        lines = differences(recorded, reference.source.records())
-    elif scene.run.get("inputs"):
-        basis = "digests of the files"
-        then, now = set(scene.run["inputs"].values()), set(reference.source.digests().values())
-        lines = [] if then <= now or now <= then else [f"{len(then - now)} of {len(then)} files that made it differ"]
-    else:
-        return {"basis": "nothing was recorded that could be compared", "differences": []}
+        basis.append("intrinsics, stamp, pose and picture of each training camera's first frame")
+        lines += differences(recorded, reference.source.records())
     if lines and not args.allow_other_recording:
         raise InputError(
-            f"{where}: not the recording that {args.scene} was made from: {'; '.join(lines)}",
+            f"{args.reference or args.dtu}: not the recording that {args.scene} was made from: {'; '.join(lines)}",
             remedy="give that recording, or --allow-other-recording to score against this one",
         )
     return {"basis": basis, "differences": lines}

@@ -1,6 +1,7 @@
 """What `score` prints and writes: the protocol it went by, a row per view, the mean."""
 
 import argparse
+from collections.abc import Mapping
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,7 +67,7 @@ def _protocol(reference: Reference, scene: "SceneFolder", scores: Scores, lpips:
         "resolution": [f"{width}x{height}" for width, height in sizes],
         "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
         "background": [round(value, 4) for value in scene.background],
-        "averaging": "mean over the views of the scan",
+        "averaging": "mean over the views",
         "lpips": None if lpips is None else lpips.name,
     }
 
@@ -83,7 +84,7 @@ def _free_mass(path: Path, scene: "SceneFolder") -> float:
 def write_scores(
     folder: Path,
     args: argparse.Namespace,
-    reference: Reference,
+    digests: Mapping[str, str],
     result: dict[str, Any],
     scores: Scores,
     stopwatch: "Stopwatch",
@@ -109,7 +110,7 @@ def write_scores(
         folder,
         command="score",
         config={"cameras": result["cameras"], "snapshots": result["snapshots"], "protocol": protocol},
-        inputs={**reference.source.digests(), "scene/splats.ply": sha256(args.scene / "splats.ply")},
+        inputs={**digests, "scene/splats.ply": sha256(args.scene / "splats.ply")},
         metrics=result["metrics"],
         stopwatch=stopwatch,
     )

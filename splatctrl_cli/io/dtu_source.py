@@ -3,12 +3,15 @@
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.io.dtu import DtuScan, read_dtu
+from splatctrl_cli.io.dtu import DtuScan, DtuView, read_dtu
 from splatctrl_cli.io.idr import idr_scans, read_idr
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.protocols import ScoreProtocol, Split
-from splatctrl_cli.records import Bool, LossReport, Record, RgbdFrame
+from splatctrl_cli.records import Bool, Intrinsics, LossReport, Record, RgbdFrame
 
 TRAINING_CAMERA = "camera"
 HOLDOUT_CAMERA = "holdout"
@@ -27,7 +30,8 @@ class DtuSource:
 
     The scene does not move, so there is no clock. Views whose number is in `holdout` belong to camera ``holdout``,
     the others to ``camera``; a `protocol` says instead which train, are held out, and are left out. masks, depths:
-    folders with what the layout itself lacks.
+    folders with what the layout itself lacks. downscale: the factor by which images are made smaller; None: down to
+    the protocol's size, where that is a whole factor of theirs.
     """
 
     def __init__(
@@ -39,12 +43,14 @@ class DtuSource:
         protocol: ScoreProtocol | None = None,
         masks: Path | None = None,
         depths: Path | None = None,
+        downscale: int | None = None,
     ) -> None:
         self._root = root
         self._layout = "IDR" if not (root / "Rectified").is_dir() and idr_scans(root) else "MVSNet"
         found = self._read(scan, masks, depths)
         self._name, self._files = found.name, found.files
-        self._views = dict(zip(found.numbers, found.views, strict=True))
+        factor = _factor(found.views[0], protocol) if downscale is None else downscale
+        self._views = {n: shrunk(view, factor) for n, view in zip(found.numbers, found.views, strict=True)}
         numbers = tuple(self._views)
         if protocol is not None:
             if holdout:
@@ -123,6 +129,47 @@ class DtuSource:
 
     def digests(self) -> dict[str, str]:
         return {_relative(path, self._root): sha256(path) for path in sorted(set(self._files))}
+
+
+def shrunk(view: DtuView, factor: int) -> DtuView:
+    """The view with every `factor` x `factor` pixels as one: mean colour, and the depth and mask of one of them.
+
+    As RegNeRF does it (regnerf/internal/datasets.py, downsample, cv2.INTER_AREA). Pixel (0, 0) has its centre at
+    (0, 0), so that u becomes (u + 0.5) / factor - 0.5. Raises UsageError for a factor that does not divide the size.
+    """
+    k = view.intrinsics
+    if factor < 1 or k.width % factor or k.height % factor:
+        raise UsageError(f"--downscale {factor}: expected a whole factor of {k.width}x{k.height}")
+    if factor == 1:
+        return view
+    size = (k.width // factor, k.height // factor)
+    intrinsics = Intrinsics(
+        fx=k.fx / factor,
+        fy=k.fy / factor,
+        cx=(k.cx + 0.5) / factor - 0.5,
+        cy=(k.cy + 0.5) / factor - 0.5,
+        width=size[0],
+        height=size[1],
+    )
+    sample = slice(factor // 2, None, factor)
+    return DtuView(
+        name=view.name,
+        color=np.asarray(cv2.resize(view.color, size, interpolation=cv2.INTER_AREA), np.uint8),
+        depth=np.ascontiguousarray(view.depth[sample, sample]),
+        intrinsics=intrinsics,
+        T_world_camera=view.T_world_camera,
+        mask=None if view.mask is None else np.ascontiguousarray(view.mask[sample, sample]),
+    )
+
+
+def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
+    """By how much to shrink for the protocol's published size; 1 where that is none or no whole factor away."""
+    if protocol is None or protocol.size is None:
+        return 1
+    width, height = protocol.size
+    factor = view.intrinsics.width // width
+    is_whole = factor >= 1 and (view.intrinsics.width, view.intrinsics.height) == (factor * width, factor * height)
+    return factor if is_whole else 1
 
 
 def _relative(path: Path, root: Path) -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.recording import differences, first_frame
+from splatctrl_cli.evaluate.recording import changed_files, differences, first_frame
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 
@@ -69,7 +69,7 @@ def test_the_picture_saved_anew_is_the_same() -> None:
         (replace(frame(), T_world_camera=turned(frame().T_world_camera, 5.0)), "by 0 mm and 5.0 degrees"),
         (frame(second=4.5), "cam0: its nearest frame is 3.5 s after the one that trained"),
         (frame(second=0.5), "cam0: its nearest frame is 0.5 s before the one that trained"),
-        (replace(frame(), color=255 - frame().color), "cam0: the picture differs by"),
+        (replace(frame(), color=255 - frame().color), "cam0: the picture differs by up to "),
         (replace(frame(), camera="cam7"), "has no camera cam0"),
     ],
 )
@@ -85,3 +85,18 @@ def test_images_of_another_size_say_so_and_nothing_else() -> None:
         intrinsics=Intrinsics(fx=30.0, fy=30.0, cx=15.5, cy=11.5, width=32, height=24),
     )
     assert differences(kept(frame()), iter([small])) == ["cam0: images of 32x24, not 64x48"]
+
+
+def test_one_thing_moved_is_another_picture() -> None:
+    color = frame().color.copy()
+    color[8:16, 8:16] = 0
+    (found,) = differences(kept(frame()), iter([replace(frame(), color=color)]))
+    assert "the picture differs by up to" in found
+
+
+def test_files_of_the_same_name_and_another_digest_are_counted() -> None:
+    assert changed_files({"log.mcap": "1"}, {"log.mcap": "2"}) == ["log.mcap has other contents"]
+    assert changed_files({"log.mcap": "1"}, {"desk.capture": "2"}) == []
+    assert changed_files({"a.toml": "1", "b": "2"}, {"a.toml": "3", "b": "2"}) == []
+    (line,) = changed_files({"a": "1", "b": "2", "c": "3"}, {"a": "1", "b": "0", "c": "0", "d": "4"})
+    assert line == "2 of 3 files have other contents, such as b"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.points import read_points
+from splatctrl_cli.io.points import is_mesh, read_points, read_positions
 
 HEADER = """ply
 format ascii 1.0
@@ -45,3 +45,24 @@ def test_points_are_read_in_metres_with_colours_from_0_to_1(tmp_path: Path) -> N
 def test_what_is_no_coloured_point_cloud_is_refused(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         read_points(written(tmp_path, text))
+
+
+def test_positions_need_no_colours_and_keep_their_unit(tmp_path: Path) -> None:
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    path = written(tmp_path, header + "1000 2 3\n4 5 6\n")
+    assert read_positions(path).tolist() == [[1000, 2, 3], [4, 5, 6]]
+    assert not is_mesh(path)
+    with pytest.raises(InputError, match="no point cloud: missing properties z"):
+        read_positions(written(tmp_path, header.replace("property float z\n", "") + "1 2\n3 4\n"))
+    with pytest.raises(InputError, match="has no points"):
+        read_positions(written(tmp_path, header.replace("vertex 2", "vertex 0")))
+
+
+def test_a_file_with_faces_is_a_mesh(tmp_path: Path) -> None:
+    assert is_mesh(written(tmp_path, HEADER.replace("end_header", "element face 3\nend_header")))
+    assert not is_mesh(written(tmp_path, HEADER.replace("end_header", "element face 0\nend_header")))
+    assert is_mesh(tmp_path / "a.obj")
+    with pytest.raises(InputError, match=r"none.ply: cannot be read: No such file"):
+        is_mesh(tmp_path / "none.ply")
