@@ -1,75 +1,20 @@
-"""Opens a recorded log by its content; ROS 2 sqlite3 bags and compressed bag folders are read through rosbags."""
+"""Opens a recorded log by its content: one file, or the folder of a ROS 2 bag."""
 
 import re
 from collections.abc import Collection, Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import yaml
-from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag2 import Reader as Bag2Reader
-from rosbags.rosbag2 import ReaderError as Bag2Error
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag1_log import Bag1Log
+from splatctrl_cli.io.compressed_log import UnpackedFile, UnpackedFileLog, UnpackedMessagesLog, check_compression
+from splatctrl_cli.io.db3_log import Db3Log
 from splatctrl_cli.io.mcap_log import McapLog
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
 
-_UNREADABLE = (Bag2Error, ValueError, RuntimeError, KeyError, EOFError, AssertionError, OSError)
-
-
-class BagLog:
-    """A log that one rosbags reader reads: one sqlite3 file, or a compressed ROS 2 bag folder."""
-
-    def __init__(self, path: Path, reader_type: Any, container: str) -> None:
-        self.path = path
-        self.files = (path,) if path.is_file() else tuple(sorted(p for p in path.iterdir() if p.is_file()))
-        self.container = container
-        self._reader_type = reader_type
-        with closing(self._opened()) as reader:
-            self._topics = {connection.id: self._topic(connection) for connection in reader.connections}
-
-    def topics(self) -> tuple[Topic, ...]:
-        """The connections of the bag's index."""
-        return tuple(self._topics.values())
-
-    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages by log time; reading stops at the first damaged place."""
-        with closing(self._opened()) as reader:
-            wanted = [c for c in reader.connections if names is None or c.topic in names]
-            if not wanted:
-                return
-            messages = iter(reader.messages(connections=wanted))
-            while True:
-                try:
-                    connection, log_time_ns, data = next(messages)
-                except StopIteration:
-                    return
-                except Exception as error:  # the readers let errors of sqlite, bz2 and lz4 through as they are
-                    damage.add(f"{self.path.name}: unreadable from here on: {error}")
-                    return
-                yield RawMessage(topic=self._topics[connection.id], log_time_ns=log_time_ns, data=bytes(data))
-
-    def _opened(self) -> Any:
-        reader = self._reader_type(self.path)
-        try:
-            reader.open()
-        except _UNREADABLE as error:
-            raise InputError(
-                f"{self.path}: not a readable {self.container}: {error}", remedy="try 'ros2 bag reindex'"
-            ) from None
-        return reader
-
-    def _topic(self, connection: Any) -> Topic:
-        return Topic(
-            name=connection.topic,
-            type_name=connection.msgtype,
-            encoding=connection.ext.serialization_format,
-            definition=connection.msgdef.data,
-            definition_format="idl" if connection.msgdef.format == MessageDefinitionFormat.IDL else "msg",
-        )
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 class SplitLog:
@@ -107,7 +52,9 @@ def open_raw_log(path: Path) -> RawLog:
     if magic.startswith(b"#ROSBAG V"):
         return Bag1Log(path)
     if magic.startswith(b"SQLite format 3"):
-        return BagLog(path, Sqlite3Reader, "ROS 2 bag (sqlite3)")
+        return Db3Log(path)
+    if magic.startswith(_ZSTD):
+        return _open_compressed(path)
     if path.suffix in {".mcap", ".bag", ".db3"}:
         raise InputError(
             f"{path}: does not begin like a {path.suffix} file (first bytes {magic[:8]!r})",
@@ -130,11 +77,28 @@ def _open_folder(path: Path) -> RawLog:
         raise InputError(f"{path}: metadata.yaml names {missing[0]}, which is not there", remedy="copy the whole bag")
     if not files:
         raise InputError(f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
-    if any(file.suffix == ".zstd" for file in files) or _metadata(path).get("compression_mode"):
-        return BagLog(path, Bag2Reader, "ROS 2 bag (compressed)")
+    told = _metadata(path)
+    if told.get("compression_mode"):
+        check_compression(path, str(told.get("compression_format")))
     parts = tuple(open_raw_log(file) for file in files)
-    kind = "mcap" if files[0].suffix == ".mcap" else "sqlite3"
-    return SplitLog(path, parts, f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})")
+    kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
+    log = SplitLog(path, parts, f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})")
+    is_by_message = str(told.get("compression_mode", "")).lower() == "message"
+    return UnpackedMessagesLog(log) if is_by_message else log
+
+
+def _open_compressed(path: Path) -> RawLog:
+    file = UnpackedFile(path)
+    if file.unpacked.stat().st_size == 0:
+        raise InputError(f"{path}: {file.note or 'holds nothing'}", remedy="copy it again")
+    with file.unpacked.open("rb") as stream:
+        if stream.read(4) == _ZSTD:
+            raise InputError(f"{path}: compressed twice", remedy="unpack it with zstd -d")
+    try:
+        return UnpackedFileLog(file, open_raw_log(file.unpacked))
+    except InputError as error:
+        message = error.message.removeprefix(f"{file.unpacked}: ")
+        raise InputError(f"{path}: {message}", remedy=error.remedy) from None
 
 
 def _ordered_files(path: Path) -> list[Path]:

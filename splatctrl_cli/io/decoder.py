@@ -4,6 +4,7 @@ import re
 import struct
 from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from splatctrl_cli.io.foxglove import as_ros, read_foxglove
@@ -15,6 +16,14 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
+_KNOWN = frozenset(  # what is read by its fields
+    {
+        *(IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, JOINT_STATE, TRANSFORMS[0], "std_msgs/msg/Header"),
+        *("builtin_interfaces/msg/Time", "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/Transform"),
+        *("geometry_msgs/msg/Vector3", "geometry_msgs/msg/Quaternion", "geometry_msgs/msg/Twist"),
+        *("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Pose", "geometry_msgs/msg/Point"),
+    }
+)
 _MOST_TEXT = 1 << 20  # characters of a definition
 _MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is no number
 _ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
@@ -104,7 +113,26 @@ def _type_store(topic: Topic) -> Any:
             store.register(get_types_from_idl(body))
     else:
         store.register(get_types_from_msg(topic.definition, topic.schema or topic.type_name))
+    _check_fields(store)
     return store
+
+
+def _check_fields(store: Any) -> None:
+    """Raise ValueError where a type with a standard name lacks a standard field; cases, lengths and more are free."""
+    standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    for name in sorted(_KNOWN & store.fielddefs.keys()):
+        there = {field.lower(): _kind(description) for field, description in store.fielddefs[name][1]}
+        for field, description in standard[name][1]:
+            if there.get(field) != _kind(description):
+                raise ValueError(f"{name} has not the field {field} of the standard")
+
+
+def _kind(description: Any) -> object:
+    """What a field holds, without the lengths of arrays, sequences and strings."""
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return detail
+    return detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
 
 
 def _check_definition(text: str) -> None:

@@ -91,9 +91,12 @@ class CsvTable:
 
     def _stamp(self, row: list[str], number: int, column: int, unit_ns: int) -> int:
         try:
-            return round(Decimal(row[column].strip()) * unit_ns)
+            stamp = Decimal(row[column].strip()) * unit_ns
+            if abs(stamp) < 1 << 62:  # rounding a large exponent would write out its digits
+                return round(stamp)
         except (InvalidOperation, ValueError, OverflowError):
-            raise self._no_number(row, number, column) from None
+            pass
+        raise self._no_number(row, number, column)
 
     def _no_number(self, row: list[str], number: int, column: int) -> InputError:
         return InputError(

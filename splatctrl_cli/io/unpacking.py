@@ -8,7 +8,7 @@ import zstandard
 MAX_BLOCK = 128 << 20  # bytes; of one chunk or record, as stored and as unpacked
 FREE_BYTES = 256 << 20  # that the blocks of any file may unpack to, and beside it:
 MOST_RATIO = 1000  # times the file's size; colour and depth as recorded compress 2 to 20 times
-_MAX_WINDOW = 1 << 27  # bytes a zstd frame may refer back to: what its own command line accepts
+MAX_WINDOW = 1 << 27  # bytes a zstd frame may refer back to: what its own command line accepts
 _PLAIN = ("", "none")
 _FAILURES = (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError)
 
@@ -73,7 +73,7 @@ def _unpacked_up_to(data: bytes, compression: str, most: int) -> bytes:
 
 
 def _of_zstd(data: bytes, most: int) -> bytes:
-    decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
     with decompressor.stream_reader(data, read_across_frames=True) as stream:
         return stream.read(most)
 

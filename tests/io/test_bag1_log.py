@@ -8,6 +8,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.typesys import Stores, get_typestore
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag1_log import Bag1Log
 from splatctrl_cli.io.bag_file import BagFile
 from splatctrl_cli.io.bag_log import open_raw_log
@@ -77,7 +78,11 @@ def test_every_cut_gives_a_beginning_and_says_so(
     data, most = whole.read_bytes(), 0
     for length in range(13, len(data), 37):
         (tmp_path / "cut.bag").write_bytes(data[:length])
-        found, damage = read(tmp_path / "cut.bag")
+        try:
+            found, damage = read(tmp_path / "cut.bag")
+        except InputError:
+            assert length < 4200, "the bag's header ends there"
+            continue
         assert plain(found) == expected[: len(found)]
         assert damage.count >= 1, length
         most = max(most, len(found))

@@ -30,6 +30,9 @@ HOSTILE = {
 }
 
 
+T_TEXT = STORE.generate_msgdef("sensor_msgs/msg/JointState", ros_version=2)[0]
+
+
 def message(definition: str, data: bytes = bytes(64), type_name: str = "a/msg/B") -> RawMessage:
     topic = Topic(name="/x", type_name=type_name, encoding="cdr", definition=definition)
     return RawMessage(topic=topic, log_time_ns=0, data=data)
@@ -39,6 +42,23 @@ def message(definition: str, data: bytes = bytes(64), type_name: str = "a/msg/B"
 def test_a_definition_that_cannot_be_used_is_refused(name: str) -> None:
     with pytest.raises(UndecodableMessageError, match="/x: "):
         MessageDecoder().decode(message(HOSTILE[name]))
+
+
+def test_a_known_name_with_other_fields_is_refused() -> None:
+    text = T_TEXT.replace("Time stamp", "Time sent")
+    assert text != T_TEXT
+    with pytest.raises(UndecodableMessageError, match="std_msgs/msg/Header has not the field stamp of the standard"):
+        MessageDecoder().decode(message(text, type_name="sensor_msgs/msg/JointState"))
+    content = bytes(STORE.serialize_cdr(joint_state(), "sensor_msgs/msg/JointState"))
+    good = MessageDecoder().decode(message(T_TEXT, content, "sensor_msgs/msg/JointState"))
+    assert good.name == ["a"]
+
+
+def joint_state() -> Any:
+    empty = np.zeros(0)
+    return T["sensor_msgs/msg/JointState"](
+        header=header(START_NS, ""), name=["a"], position=np.zeros(1), velocity=empty, effort=empty
+    )
 
 
 def test_a_refused_definition_is_not_compiled_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,14 +1,10 @@
 """`info` describes every file of the real recordings without a fault, and says what a log lacks."""
 
-import itertools
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
@@ -285,22 +281,6 @@ def test_every_ros2_test_bag_is_described(real_data: Path) -> None:
             pytest.fail(f"{bag}: {error}")
         assert summary.kind.startswith("ROS 2 bag")
         assert summary.grids[0].rows
-
-
-def test_a_sqlite_bag_that_breaks_while_read_keeps_what_came_before(
-    real_data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bag = real_data / "rosbag2_testbags/rosbag2_py/test/resources/sqlite3/wbag/wbag_0.db3"
-    read = Sqlite3Reader.messages
-
-    def breaking(*arguments: Any, **options: Any) -> Iterator[Any]:
-        yield from itertools.islice(read(*arguments, **options), 100)
-        raise OSError("database disk image is malformed")
-
-    monkeypatch.setattr(Sqlite3Reader, "messages", breaking)
-    summary = describe(bag)
-    assert (summary.facts["messages"], summary.damaged) == (100, 1)
-    assert "unreadable from here on: database disk image is malformed" in summary.notes[0]
 
 
 def test_a_real_robot_is_described(real_data: Path) -> None:
