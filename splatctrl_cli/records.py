@@ -109,7 +109,9 @@ Record = RgbdFrame | JointState
 class LossReport:
     """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted.
 
-    invalid_depth: pixels whose depth is NaN, infinite or negative, which count as having none.
+    duplicate_images: images of a stamp that their topic had before; dropped_images: how many are missing where a
+    topic of a steady rate has gaps; invalid_depth: pixels whose depth is NaN, infinite or negative, which count as
+    having none.
     differentiated_velocities: joint states with a velocity that is the change of the positions; unsorted_states,
     duplicate_states: stamps that went back, or came again; state_gaps: times without joint states.
     """
@@ -118,6 +120,8 @@ class LossReport:
     unpaired_depth: int = 0
     without_pose: int = 0
     without_intrinsics: int = 0
+    duplicate_images: int = 0
+    dropped_images: int = 0
     damaged: int = 0
     invalid_depth: int = 0
     differentiated_velocities: int = 0

@@ -12,7 +12,13 @@ from splatctrl_cli.errors import UsageError
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
     parser = add_command(subparsers, "ingest", run, summary="turn a log or image folder into a capture folder")
-    parser.add_argument("source", type=Path, help=".mcap, .bag, .db3, ROS 2 bag folder, or .toml of an image folder")
+    parser.add_argument(
+        "source",
+        type=Path,
+        nargs="+",
+        help=".mcap, .bag, .db3, ROS 2 bag folder, folder of a dataset, or .toml of an image folder;"
+        " several logs of one session are read as one",
+    )
     add_output(parser, default="SOURCE.capture", what="capture folder")
     add_source(parser)
 
@@ -23,14 +29,14 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.io.image_folder import HOLDOUT
     from splatctrl_cli.io.output import Stopwatch, output_path, write_run
     from splatctrl_cli.io.ros_log import RosLogSource
-    from splatctrl_cli.io.source import open_source
+    from splatctrl_cli.io.source import open_session
     from splatctrl_cli.io.state_watch import WatchedSource
 
     console, stopwatch = Console(args), Stopwatch()
     options = source_options(args)
-    out = args.out or Path(args.source.stem + ".capture")
+    out = args.out or Path(args.source[0].stem + ".capture")
     with stopwatch.stage("survey"):
-        opened = open_source(args.source, options)
+        opened = open_session(args.source, options)
         source = WatchedSource(opened)
         topics = opened.joint_topics if isinstance(opened, RosLogSource | CaptureSource) else None
     if set(source.cameras) == {HOLDOUT}:

@@ -48,6 +48,12 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--pairing-tolerance", type=float, default=0.02, metavar="S", help="colour to depth, seconds (default: 0.02)"
     )
+    group.add_argument(
+        "--stamps",
+        choices=["header", "log"],
+        default="header",
+        help="a log's times: those of the headers, or of logging (default: header)",
+    )
     group.add_argument("--joint-topic", metavar="TOPIC", help="JointState topic (default: /joint_states)")
     group.add_argument("--root", type=Path, metavar="DIR", help="folder of the images that a .toml describes")
     group.add_argument(
@@ -78,6 +84,7 @@ def source_options(args: argparse.Namespace) -> "SourceOptions":
         joint_topic=args.joint_topic,
         root=args.root,
         holdout=_names(args.holdout),
+        stamps=args.stamps,
     )
 
 

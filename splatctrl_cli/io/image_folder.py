@@ -24,7 +24,7 @@ from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, Loss
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
 
-_NOT_FOR_FOLDERS = ("world_frame", "camera_topics", "human_topics", "joint_topic")
+_NOT_FOR_FOLDERS = ("world_frame", "camera_topics", "human_topics", "joint_topic", "stamps")
 
 
 @dataclass(frozen=True, kw_only=True)

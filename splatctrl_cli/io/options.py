@@ -27,7 +27,7 @@ class SourceOptions:
     x, y, z, qx, qy, qz, qw, instead of those recorded. human_topics: image topics by camera name, not 0 where a
     pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, where the input has none. depth_scale:
     [m per count] of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an
-    image folder that become camera `holdout`.
+    image folder that become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging.
     """
 
     world_frame: str | None = None
@@ -42,6 +42,7 @@ class SourceOptions:
     joint_topic: str | None = None
     root: Path | None = None
     holdout: tuple[str, ...] | None = None
+    stamps: str = "header"
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
         """Raise InputError where a person gave an option that means nothing for this kind of input."""

@@ -10,6 +10,7 @@ from functools import cached_property
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.io.image_rate import dropped, first_of_each
 from splatctrl_cli.io.joint_topics import topics_of, with_joints
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.masks import human_mask, mask_by_color
@@ -48,7 +49,7 @@ class RosLogSource:
         self.name = log.path.name
         self._log = log
         self._options = options
-        found = survey(log)
+        found = survey(log, by_log_time=options.stamps == "log")
         _check_not_empty(log, found)
         self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
         self._rig = build_cameras(log, found, options)
@@ -93,15 +94,19 @@ class RosLogSource:
 
     @cached_property
     def _digests(self) -> dict[str, str]:
-        return {file.name: sha256(file) for file in self._log.files}
+        names = [file.name for file in self._log.files]
+        is_unique = len(set(names)) == len(names)
+        return {
+            file.name if is_unique else f"{file.parent.name}/{file.name}": sha256(file) for file in self._log.files
+        }
 
     def _planned(self, found: Survey) -> list[_Planned]:
         plan: list[_Planned] = []
         for camera in self._rig:
-            color_ns = found.topics[camera.color_topic].stamps_ns
-            depth_ns = found.topics[camera.depth_topic].stamps_ns
+            colors, depths = self._images(found, camera.color_topic), self._images(found, camera.depth_topic)
+            color_ns, depth_ns = [stamp for _, stamp in colors], [stamp for _, stamp in depths]
             tolerance_ns = round(self._options.pairing_tolerance_s * _SECOND)
-            pairs = pair_by_stamp(color_ns, depth_ns, tolerance_ns)
+            pairs = [(colors[i][0], depths[j][0]) for i, j in pair_by_stamp(color_ns, depth_ns, tolerance_ns)]
             if not pairs:
                 gap = nearest_gap_ns(color_ns, depth_ns) / _SECOND
                 raise InputError(
@@ -113,6 +118,25 @@ class RosLogSource:
             self._loss.unpaired_depth += len(depth_ns) - len(pairs)
             plan.extend(self._with_pose(found, camera, pairs))
         return sorted(plan, key=lambda planned: (planned.stamp_ns, planned.camera.name, planned.color_index))
+
+    def _images(self, found: Survey, topic: str) -> list[tuple[int, int]]:
+        """Number and stamp of each image but those that came again; these and missing ones are counted."""
+        stamps = found.topics[topic].stamps_ns
+        if len(stamps) > 1 and not any(stamps):
+            raise InputError(
+                f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
+                remedy="give --stamps log to take the times of logging",
+            )
+        kept = first_of_each(stamps)
+        drops = dropped(stamps)
+        self._loss.duplicate_images += len(stamps) - len(kept)
+        self._loss.dropped_images += drops.num_images
+        if drops.num_images:
+            self._loss.notes.append(
+                f"{topic}: about {drops.num_images} images were dropped in {drops.num_gaps} gaps of a period of"
+                f" {drops.period_ns / 1e6:.4g} ms"
+            )
+        return [(index, stamps[index]) for index in kept]
 
     def _with_pose(self, found: Survey, camera: Camera, pairs: list[tuple[int, int]]) -> list[_Planned]:
         tolerance_ns = round(self._options.pose_tolerance_s * _SECOND)

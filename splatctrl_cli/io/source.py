@@ -1,5 +1,6 @@
 """Opens any recorded input as records in time order."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError
@@ -9,9 +10,10 @@ from splatctrl_cli.io.layouts import open_layout
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
 from splatctrl_cli.io.rig_folder import open_image_folder
 from splatctrl_cli.io.ros_log import RosLogSource
+from splatctrl_cli.io.session_log import SessionLog
 from splatctrl_cli.io.shot import ShotSource
 
-__all__ = ["CameraTopics", "SourceOptions", "open_source"]
+__all__ = ["CameraTopics", "SourceOptions", "open_session", "open_source"]
 
 
 def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
@@ -30,3 +32,18 @@ def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
     if path.is_dir() and not is_bag_folder(path):
         return open_layout(path, options)
     return RosLogSource(open_raw_log(path), options)
+
+
+def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> ShotSource:
+    """The records of one input, or of several logs that were recorded at the same time.
+
+    Raises InputError as `open_source`, and where one of several is no log.
+    """
+    if len(paths) == 1:
+        return open_source(paths[0], options)
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+        if path.suffix == ".toml" or is_capture(path) or (path.is_dir() and not is_bag_folder(path)):
+            raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")
+    return RosLogSource(SessionLog(tuple(open_raw_log(path) for path in paths)), options or SourceOptions())

@@ -85,7 +85,7 @@ def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[st
         if any(getattr(options, name) != getattr(default, name) for name in _FOR_CAMERAS):
             raise  # somebody asked for these cameras
         reason = error
-    found = survey(log)
+    found = survey(log, by_log_time=options.stamps == "log")
     if not found.num_messages:
         raise reason
     loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, f"no camera is used: {reason.message}"])

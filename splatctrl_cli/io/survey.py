@@ -1,6 +1,6 @@
 """A first pass over a log: topics, stamps, frames, calibrations, joints; of images the first of each topic."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from splatctrl_cli.io.joint_log import JointLog
 from splatctrl_cli.io.messages import ImageMessage, read_image
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.io.realsense import OPTION, TRANSFORM, RealSense
-from splatctrl_cli.io.state_messages import STANDARD_TYPES, STATE_TYPES, read_states
+from splatctrl_cli.io.state_messages import STANDARD_TYPES, STATE_TYPES, RawJoints, read_states
 from splatctrl_cli.io.tf_tree import TfTree
 from splatctrl_cli.records import Float64
 
@@ -56,8 +56,9 @@ class TopicSurvey:
 
 @dataclass(kw_only=True)
 class Survey:
-    """Everything of a log but its images."""
+    """Everything of a log but its images; by_log_time: stamps are the times of logging, not those of headers."""
 
+    by_log_time: bool = False
     topics: dict[str, TopicSurvey] = field(default_factory=dict)
     tf: TfTree = field(default_factory=TfTree)
     realsense: RealSense = field(default_factory=RealSense)
@@ -74,9 +75,12 @@ class Survey:
         return sorted(found, key=lambda t: t.topic.name)
 
 
-def survey(log: RawLog) -> Survey:
-    """Read `log` once; a message that does not decode is counted as damage."""
-    result = Survey()
+def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
+    """Read `log` once; a message that does not decode is counted as damage.
+
+    by_log_time: take the times of logging for the stamps of images, transforms and joint states.
+    """
+    result = Survey(by_log_time=by_log_time)
     decoder = MessageDecoder()
     for topic in log.topics():
         result.topics.setdefault(topic.name, TopicSurvey(topic=topic))
@@ -99,25 +103,28 @@ def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) ->
             _take(result, entry, decoder, message)
         except (UndecodableMessageError, ValueError) as error:
             result.damage.add(str(error))
+        except AttributeError as error:  # a definition of a known name with other fields
+            result.damage.add(f"{message.topic.name}: a {message.topic.type_name} of another definition: {error}")
 
 
 def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: RawMessage) -> None:
     kind = message.topic.type_name
     if kind in {IMAGE, COMPRESSED_IMAGE}:
         entry.stamps_ns.append(-1)  # every image has its place, also one that does not decode
-        entry.stamps_ns[-1] = header_stamp_ns(message)
+        entry.stamps_ns[-1] = message.log_time_ns if result.by_log_time else header_stamp_ns(message)
         if entry.first_image is None:
             entry.first_image = read_image(decoder.decode(message), kind)
     elif kind == CAMERA_INFO and entry.calibration is None:
         entry.calibration = _calibration(decoder.decode(message))
     elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
-        entry.joints.extend(read_states(decoder.decode(message), kind, message.log_time_ns))
+        entry.joints.extend(_states(result, decoder.decode(message), message))
     elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
         result.realsense.add(message.topic.name, decoder.decode(message))
     elif kind in TRANSFORMS:
         is_static = message.topic.name.endswith("tf_static")
         holds = message.topic.schema != ""  # Foxglove has no static transforms: one that comes once holds always
-        _add_transforms(result.tf, decoder.decode(message), static=is_static, holds=holds)
+        log_time_ns = message.log_time_ns if result.by_log_time else None
+        _add_transforms(result.tf, decoder.decode(message), log_time_ns, static=is_static, holds=holds)
 
 
 def _calibration(message: Any) -> Calibration | None:
@@ -136,13 +143,22 @@ def _calibration(message: Any) -> Calibration | None:
     )
 
 
-def _add_transforms(tree: TfTree, message: Any, *, static: bool, holds: bool) -> None:
+def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
+    """Joint states; by log time all of a message move with its stamp."""
+    states = read_states(decoded, message.topic.type_name, message.log_time_ns)
+    if not result.by_log_time:
+        return states
+    late_ns = message.log_time_ns - stamp_ns(decoded.header)
+    return [replace(state, stamp_ns=state.stamp_ns + late_ns) for state in states]
+
+
+def _add_transforms(tree: TfTree, message: Any, log_time_ns: int | None, *, static: bool, holds: bool) -> None:
     for item in message.transforms:
         t, r = item.transform.translation, item.transform.rotation
         tree.add(
             item.header.frame_id,
             item.child_frame_id,
-            stamp_ns(item.header),
+            stamp_ns(item.header) if log_time_ns is None else log_time_ns,
             np.array([t.x, t.y, t.z], dtype=np.float64),
             np.array([r.x, r.y, r.z, r.w], dtype=np.float64),
             static=static,

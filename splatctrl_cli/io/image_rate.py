@@ -1,0 +1,43 @@
+"""Images of one topic that came twice, or did not come, by their stamps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+STEADY = 0.25  # largest departure from the period, in periods, of an interval that counts as steady
+GAP = 1.5  # [periods] from which on an interval is a gap
+FEWEST = 5  # intervals that a rate is judged by
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drops:
+    """Gaps of a topic of steady rate: how many, the images missing in them, and the period [ns]."""
+
+    num_gaps: int
+    num_images: int
+    period_ns: float
+
+
+def first_of_each(stamps_ns: Sequence[int]) -> list[int]:
+    """Numbers of the images whose stamp none before them has."""
+    first: dict[int, int] = {}
+    for index, stamp in enumerate(stamps_ns):
+        first.setdefault(stamp, index)
+    return list(first.values())
+
+
+def dropped(stamps_ns: Sequence[int]) -> Drops:
+    """What is missing between different stamps; nothing where there are few, or most intervals are no steady rate.
+
+    The period is the median interval, and steady within a quarter of it must be three intervals of four.
+    """
+    intervals = np.diff(np.array(sorted(set(stamps_ns)), dtype=np.int64)).astype(np.float64)
+    if len(intervals) < FEWEST:
+        return Drops(num_gaps=0, num_images=0, period_ns=0.0)
+    period = float(np.median(intervals))
+    is_steady = np.abs(intervals - period) <= STEADY * period
+    gaps = intervals[intervals > GAP * period]
+    if is_steady.mean() < 0.75:
+        gaps = gaps[:0]
+    return Drops(num_gaps=len(gaps), num_images=int((np.rint(gaps / period) - 1).sum()), period_ns=period)
