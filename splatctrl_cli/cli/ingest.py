@@ -1,12 +1,22 @@
 """``splatctrl ingest``: any recorded input into a capture folder."""
 
 import argparse
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
+from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from splatctrl_cli import __version__
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
+from splatctrl_cli.cli.resume import check_same_run
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from splatctrl_cli.io.options import SourceOptions
 
 
 def register(subparsers: Subparsers) -> None:
@@ -20,12 +30,16 @@ def register(subparsers: Subparsers) -> None:
         " several logs of one session are read as one",
     )
     add_output(parser, default="SOURCE.capture", what="capture folder")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with an interrupted run (to the same bytes) if it left one"
+    )
     add_source(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.io.capture import CaptureSource, write_capture
+    from splatctrl_cli.io.capture_journal import JOURNAL, read_identity
     from splatctrl_cli.io.image_folder import HOLDOUT
     from splatctrl_cli.io.output import Stopwatch, output_path, write_run
     from splatctrl_cli.io.ros_log import RosLogSource
@@ -49,9 +63,18 @@ def run(args: argparse.Namespace) -> int:
         if num_frames % 100 == 0:
             console.log(f"{num_frames} frames")
 
-    with output_path(out, force=args.force, is_folder=True) as partial:
+    identity = _identity(options, source.digests())
+    with (
+        _told_how_to_go_on(out),
+        output_path(out, force=args.force, is_folder=True, checkpoint=JOURNAL, resume=args.resume) as partial,
+    ):
+        before = read_identity(partial)
+        if before is not None:
+            check_same_run(partial, before, identity)
         with stopwatch.stage("write"):
-            summary = write_capture(partial, source, topics=topics, progress=progress)
+            summary = write_capture(partial, source, topics=topics, progress=progress, identity=identity)
+        if summary.num_resumed:
+            console.log(f"{summary.num_resumed} frames were there already")
         metrics = {
             "frames": summary.num_frames,
             "joint_states": summary.num_joint_states,
@@ -76,3 +99,26 @@ def run(args: argparse.Namespace) -> int:
         {"capture": str(out), **metrics}, [*lines, f"joint states: {summary.num_joint_states}", f"wrote {out}"]
     )
     return 3 if summary.loss.damaged else 0
+
+
+def _identity(options: "SourceOptions", inputs: Mapping[str, str]) -> dict[str, Any]:
+    """Everything that decides the bytes of a capture, as plain values; inputs: sha256 by name."""
+    versions = {name: metadata.version(name) for name in ("numpy", "opencv-python-headless")}
+    values = {"splatctrl": __version__, **versions, "options": asdict(options), "sha256": dict(inputs)}
+    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    return plain
+
+
+@contextmanager
+def _told_how_to_go_on(out: Path) -> Iterator[None]:
+    """Says after Ctrl-C what was kept."""
+    from splatctrl_cli.io.capture_journal import JOURNAL
+    from splatctrl_cli.io.output import partial_path
+
+    try:
+        yield
+    except KeyboardInterrupt:
+        partial = partial_path(out)
+        if not (partial / JOURNAL).is_file():
+            raise
+        raise KeyboardInterrupt(f"interrupted: {partial} is kept; go on with the same command and --resume") from None

@@ -71,7 +71,13 @@ def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> "Checkpoin
     from splatctrl_cli.io.scene_writer import read_checkpoint
 
     checkpoint = read_checkpoint(folder)
-    before, after = dict(_flat(checkpoint.progress["run"])), dict(_flat(now))
+    check_same_run(folder, checkpoint.progress["run"], now)
+    return checkpoint
+
+
+def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise UsageError naming what differs `now` from what decided the bytes of an interrupted run."""
+    before, after = dict(_flat(run)), dict(_flat(now))
     differing = [name for name in {**before, **after} if before.get(name) != after.get(name)]
     if differing:
         said = ", ".join(f"{n} was {_shown(before.get(n))}, is {_shown(after.get(n))}" for n in differing[:3])
@@ -80,7 +86,6 @@ def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> "Checkpoin
             f"{folder}: --resume: the run that was interrupted differs: {said}{more}",
             remedy="give what it was given, or start over without --resume",
         )
-    return checkpoint
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

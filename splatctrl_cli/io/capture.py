@@ -4,123 +4,40 @@ import csv
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from io import BytesIO, StringIO
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from splatctrl_cli.errors import InputError, WriteError
-from splatctrl_cli.geometry import quat_from_rotation, transform_from
-from splatctrl_cli.io.capture_joints import joints_file, read_joints
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.io.arrays import npy_of
+from splatctrl_cli.io.capture_joints import read_joints
+from splatctrl_cli.io.capture_writer import COLUMNS, FORMAT, MASKED_COLUMNS, VERSION, write_capture
 from splatctrl_cli.io.joint_topics import (
-    JointTopics,
     joints_again,
     read_topics,
     with_joints,
     without_joints,
-    write_topics,
 )
 from splatctrl_cli.io.masks import human_mask
 from splatctrl_cli.io.messages import decode_file, metres
 from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.output import sha256, write_json
-from splatctrl_cli.io.shot import Shot, ShotSource, merged
+from splatctrl_cli.io.output import sha256
+from splatctrl_cli.io.shot import Shot, merged
 from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
-FORMAT, VERSION = "splatctrl-capture", 1
+__all__ = ["CaptureSource", "is_capture", "read_capture_header", "write_capture"]
+
 INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
-COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
-MASKED_COLUMNS = (*COLUMNS, "human")  # where the recording has masks
-FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
-FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
 _NOT_FOR_CAPTURES = (
     *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
-    *("depth_scale", "root", "holdout"),
+    *("depth_scale", "root", "holdout", "stamps"),
 )
 _AGAIN = "run `splatctrl ingest` again"
-PNG_LEVEL = 3  # zlib; 3 is half the time of OpenCV's default 6 and 5 % larger on apc_shelf depth
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaptureSummary:
-    """What was written."""
-
-    num_frames: dict[str, int]
-    num_joint_states: int
-    loss: LossReport
-
-
-@dataclass(kw_only=True)
-class _Sums:
-    """sha256 of each file as it is written."""
-
-    lines: list[str] = field(default_factory=list)
-
-    def write(self, folder: Path, name: str, data: bytes) -> None:
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-        self.lines.append(f"{hashlib.sha256(data).hexdigest()}  {name}\n")
-
-    def add(self, folder: Path, name: str) -> None:
-        """Of a file that is there."""
-        self.lines.append(f"{sha256(folder / name)}  {name}\n")
-
-
-def write_capture(
-    folder: Path,
-    source: ShotSource,
-    *,
-    topics: JointTopics | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> CaptureSummary:
-    """Write all of `source` into the empty `folder`; the same input gives the same bytes.
-
-    JPEG and PNG colour is kept byte for byte where its pixels are the frame's; depth becomes 16-bit PNG in the unit
-    it was recorded in, or .npy [m] where no unit holds it. topics: the joint states as they were recorded, beside
-    those of `source`, which are of one topic. Raises InputError when the source yields no frame.
-    """
-    sums, rows, joints = _Sums(), [], []
-    cameras: dict[str, dict[str, Any]] = {}
-    for item in source.shots():
-        if isinstance(item, JointState):
-            joints.append(item)
-            continue
-        rows.append(_write_shot(folder, item, cameras, sums))
-        if progress is not None:
-            progress(len(rows))
-    if not rows:
-        raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
-    sums.write(folder, "joints.npz", joints_file(joints, len(source.joint_names)))
-    _write_frames(folder, rows, sums)
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "name": source.name,
-        "world_frame": source.world_frame,
-        "units": {"length": "m", "time": "ns", "angle": "rad"},
-        "pose": "T_world_camera, optical frame (x right, y down, z forward), quaternion x y z w",
-        "pixels": "pixel (0, 0) is centred at u = v = 0",
-        "has_clock": source.has_clock,
-        "cameras": cameras,
-        "joint_names": list(source.joint_names),
-        "sources": source.digests(),
-        "loss": asdict(source.loss),
-    }
-    if topics is not None and topics.topics:
-        header["joint_topics"] = write_topics(folder, topics, lambda name: sums.add(folder, name))
-    write_json(folder / "capture.json", header)
-    sums.add(folder, "capture.json")
-    (folder / "SHA256SUMS").write_text("".join(sorted(sums.lines, key=lambda line: line[66:])), encoding="ascii")
-    return CaptureSummary(
-        num_frames={name: camera["num_frames"] for name, camera in cameras.items()},
-        num_joint_states=len(joints),
-        loss=source.loss,
-    )
 
 
 class CaptureSource:
@@ -183,32 +100,46 @@ class CaptureSource:
         """sha256 of SHA256SUMS, which covers every file."""
         return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS")}
 
+    def __len__(self) -> int:
+        """Frames that `shot_at` knows."""
+        return len(self._rows)
+
+    def shot_at(self, number: int) -> Shot | None:
+        """A frame by its number among those of `cameras`, without reading others; None where it is damaged."""
+        return self._shot(self._rows[number])
+
     def _shots(self) -> Iterator[Shot]:
         for row in self._rows:
-            color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
-            human_bytes = self._read(row["human"]) if row.get("human") else None
-            if color_bytes is None or depth_bytes is None:
-                continue
-            camera = self._cameras[row["camera"]]
-            bgr, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
-            if bgr is None or depth is None:
-                self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
-                continue
-            intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
-            yield Shot(
-                frame=RgbdFrame(
-                    stamp_ns=int(row["stamp_ns"]),
-                    camera=row["camera"],
-                    color=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8),
-                    depth=depth,
-                    intrinsics=intrinsics,
-                    T_world_camera=_pose(row),
-                    human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
-                ),
-                color_file=color_bytes,
-                depth_unit=camera["depth_scale"] if row["depth"].endswith(".png") else None,
-                origin=row["source"],
-            )
+            shot = self._shot(row)
+            if shot is not None:
+                yield shot
+
+    def _shot(self, row: dict[str, str]) -> Shot | None:
+        """The frame of a row; None, and counted, where an image is not as it was written."""
+        color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
+        human_bytes = self._read(row["human"]) if row.get("human") else None
+        if color_bytes is None or depth_bytes is None:
+            return None
+        camera = self._cameras[row["camera"]]
+        bgr, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
+        if bgr is None or depth is None:
+            self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
+            return None
+        intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
+        return Shot(
+            frame=RgbdFrame(
+                stamp_ns=int(row["stamp_ns"]),
+                camera=row["camera"],
+                color=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8),
+                depth=depth,
+                intrinsics=intrinsics,
+                T_world_camera=_pose(row),
+                human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
+            ),
+            color_file=color_bytes,
+            depth_unit=camera["depth_scale"] if row["depth"].endswith(".png") else None,
+            origin=row["source"],
+        )
 
     def _human(self, name: str, data: bytes, intrinsics: Intrinsics) -> UInt8 | None:
         pixels = decode_file(data, color=False)
@@ -278,73 +209,11 @@ def _check_index(path: Path) -> None:
             )
 
 
-def _write_shot(folder: Path, shot: Shot, cameras: dict[str, dict[str, Any]], sums: _Sums) -> dict[str, str]:
-    frame = shot.frame
-    unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
-    camera = cameras.setdefault(frame.camera, {**asdict(frame.intrinsics), "depth_scale": unit, "num_frames": 0})
-    if any(camera[name] != value for name, value in asdict(frame.intrinsics).items()):
-        raise InputError(
-            f"{shot.origin}: camera {frame.camera} changes its lens, and a capture holds one of each camera",
-            remedy="leave --holdout to `reconstruct` and `score`",
-        )
-    stem = f"{camera['num_frames']:06d}"
-    camera["num_frames"] += 1
-    color = shot.color_file
-    if color is None:
-        color = _encoded(cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
-    is_png = color.startswith(b"\x89PNG")
-    color_name = f"color/{frame.camera}/{stem}.{'png' if is_png else 'jpg'}"
-    sums.write(folder, color_name, color)
-    counts = _counts(frame.depth, unit, is_exact=shot.depth_unit is not None)
-    depth_name = f"depth/{frame.camera}/{stem}.{'npy' if counts is None else 'png'}"
-    sums.write(folder, depth_name, _npy(frame.depth) if counts is None else _encoded(counts))
-    T = frame.T_world_camera
-    pose = [*T[:3, 3], *quat_from_rotation(T[:3, :3])]
-    values = [frame.camera, frame.stamp_ns, color_name, depth_name, *(repr(float(v)) for v in pose), shot.origin]
-    row = dict(zip(COLUMNS, map(str, values), strict=True))
-    if frame.human is None:
-        return row
-    human_name = f"human/{frame.camera}/{stem}.png"
-    sums.write(folder, human_name, _encoded(frame.human * np.uint8(255)))
-    return row | {"human": human_name}
-
-
-def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
-    """Depth as uint16 counts of `unit`; None where they would not give the depth back."""
-    if depth.max(initial=0.0) / unit > 65535.5:
-        return None
-    counts = np.round(depth / np.float32(unit)).astype(np.uint16)
-    error = np.abs(metres(counts, unit) - depth).max(initial=0.0)
-    return counts if error <= (0.0 if is_exact else FLOAT_DEPTH_ERROR) else None
-
-
 def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | None:
     if name.endswith(".npy"):
-        return np.asarray(np.load(BytesIO(data), allow_pickle=False), dtype=np.float32)
+        return np.asarray(npy_of(data), dtype=np.float32)
     counts = decode_file(data, color=False)
     return None if counts is None else metres(counts, camera["depth_scale"])
-
-
-def _encoded(pixels: np.ndarray[Any, Any]) -> bytes:
-    is_written, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
-    if not is_written:
-        raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
-    return bytes(data)
-
-
-def _npy(depth: Float32) -> bytes:
-    stream = BytesIO()
-    np.save(stream, np.ascontiguousarray(depth, dtype="<f4"), allow_pickle=False)
-    return stream.getvalue()
-
-
-def _write_frames(folder: Path, rows: list[dict[str, str]], sums: _Sums) -> None:
-    stream = StringIO()
-    columns = MASKED_COLUMNS if any("human" in row for row in rows) else COLUMNS
-    writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    sums.write(folder, "frames.csv", stream.getvalue().encode())
 
 
 def _read_frames(path: Path) -> list[dict[str, str]]:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from splatctrl_cli.io.shot import Shot, ShotSource
+from splatctrl_cli.io.state_columns import StateCollector
 from splatctrl_cli.io.state_motion import ImageMotion
 from splatctrl_cli.io.state_offset import ClockOffset, estimate_clock_offset
 from splatctrl_cli.records import Float64, JointState, LossReport, Record
@@ -13,7 +14,7 @@ class WatchedSource:
 
     def __init__(self, source: ShotSource) -> None:
         self._source = source
-        self._states: list[JointState] = []
+        self._states = StateCollector(len(source.joint_names))
         self._motion = ImageMotion()
         self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
         self.has_clock, self.world_frame = source.has_clock, source.world_frame
@@ -30,12 +31,12 @@ class WatchedSource:
 
     def shots(self) -> Iterator[Shot | JointState]:
         """Those of the source."""
-        self._states, self._motion = [], ImageMotion()
+        self._states, self._motion = StateCollector(len(self.joint_names)), ImageMotion()
         for item in self._source.shots():
             if isinstance(item, Shot):
                 self._motion.add(item.frame)
             else:
-                self._states.append(item)
+                self._states.add(item)
             yield item
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
@@ -48,6 +49,7 @@ class WatchedSource:
 
     def clock_offset(self) -> ClockOffset | None:
         """Of frames against joint states, once the shots were read; None where there are no states or no clock."""
-        if not self._states or not self.has_clock:
+        states = self._states.columns()
+        if not len(states) or not self.has_clock:
             return None
-        return estimate_clock_offset(self._states, self._motion)
+        return estimate_clock_offset(states, self._motion)
