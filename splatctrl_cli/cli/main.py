@@ -5,6 +5,7 @@ Nothing heavy is imported here or at the top of a subcommand's file: ``splatctrl
 
 import argparse
 import importlib
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -16,8 +17,10 @@ from splatctrl_cli.errors import SplatCtrlError, UsageError
 
 COMMANDS = (
     *("simulate", "ingest", "info", "check", "reconstruct", "export", "sdf-bake", "score", "replay", "robot"),
-    "demo",
+    *("demo", "capture"),
 )
+
+MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
@@ -44,6 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     verbose = 0
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
     try:
         args = build_parser().parse_args(argv)
         verbose = args.verbose
@@ -60,6 +64,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:
         return _fail_to_read_or_write(error, verbose)
+    except MemoryError as error:
+        line = "input: asks for more memory than there is; is it damaged, or too large for this machine"
+        return _fail(error, line, 4, verbose)
+    except RecursionError as error:
+        return _fail(error, "input: nested too deeply to be read; is it damaged", 4, verbose)
     except Exception as error:
         return _fail(error, f"internal error: {type(error).__name__}: {error}; please report it", 70, verbose)
 

@@ -5,6 +5,8 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from io import BytesIO
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -41,3 +43,21 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, lev
                         stream.write(piece.tobytes())
                 else:
                     np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
+
+
+def npy_of(data: bytes) -> NDArray[np.generic]:
+    """The array of a ``.npy`` file's bytes. Raises ValueError for one that announces more than there is, or objects.
+
+    `np.load` allocates what the header announces before it looks.
+    """
+    stream = BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, is_fortran, dtype = read(stream)
+    if dtype.hasobject:
+        raise ValueError("objects, expected numbers")
+    size = prod(shape) * dtype.itemsize
+    if size != len(data) - stream.tell():
+        raise ValueError(f"announces {size} bytes, holds {len(data) - stream.tell()}")
+    values = np.frombuffer(data, dtype, offset=stream.tell()) if size else np.zeros(0, dtype)
+    return values.reshape(shape, order="F" if is_fortran else "C")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import ParseError
 
-import cv2
 import numpy as np
 import yaml
 from defusedxml import ElementTree
@@ -27,6 +26,7 @@ from splatctrl_cli.io.describe_grid import (
 )
 from splatctrl_cli.io.describe_splats import describe_splats
 from splatctrl_cli.io.grid import is_grid_npz
+from splatctrl_cli.io.messages import decode_file
 from splatctrl_cli.io.summary import Grid, Summary
 from splatctrl_cli.io.vdb import MAGIC
 
@@ -187,7 +187,7 @@ def _yaml(path: Path, _head: bytes) -> Summary:
 
 
 def _image(path: Path, _head: bytes) -> Summary:
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    pixels = decode_file(path.read_bytes(), color=False)
     if pixels is None:
         raise InputError(f"{path}: not an image that can be read", remedy="the file is damaged")
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]

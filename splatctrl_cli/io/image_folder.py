@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.arrays import DAMAGE, npy_of
 from splatctrl_cli.io.folder_description import CameraTable, Description, read_description
 from splatctrl_cli.io.folder_views import HOLDOUT, View, find_files, views_of
 from splatctrl_cli.io.layout_nerfstudio import with_transforms
@@ -157,18 +158,17 @@ class ImageFolderSource:
         """That of a view's camera, made once."""
         table = view.lens
         if table.name not in self._lenses:
-            depth_camera = self._description.depth_camera
+            depth_camera, intrinsics, undistortion = self._description.depth_camera, table.intrinsics, None
+            if np.any(table.distortion):
+                undistortion = Undistortion(intrinsics, table.distortion_model, np.array(table.distortion))
+                intrinsics = undistortion.intrinsics
             self._lenses[table.name] = _Lens(
-                intrinsics=table.intrinsics,
-                undistortion=(
-                    Undistortion(table.intrinsics, table.distortion_model, np.array(table.distortion))
-                    if np.any(table.distortion)
-                    else None
-                ),
+                intrinsics=intrinsics,
+                undistortion=undistortion,
                 registration=(
                     DepthToColor(
                         depth_intrinsics=depth_camera.intrinsics,
-                        color_intrinsics=table.intrinsics,
+                        color_intrinsics=intrinsics,
                         T_color_depth=self._description.T_color_depth,
                     )
                     if depth_camera is not None
@@ -216,8 +216,8 @@ def _check_names(path: Path, lenses: set[str], options: SourceOptions) -> None:
 def _float_pixels(path: Path) -> NDArray[np.float32] | None:
     if path.suffix == ".npy":
         try:
-            return np.asarray(np.load(path, allow_pickle=False), dtype=np.float32)
-        except (ValueError, EOFError):
+            return np.asarray(npy_of(path.read_bytes()), dtype=np.float32)
+        except DAMAGE:
             return None
     pixels = decode_file(path.read_bytes(), color=False)
     return None if pixels is None else pixels.astype(np.float32)

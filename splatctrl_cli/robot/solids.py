@@ -79,6 +79,10 @@ def mesh_path(urdf: Path, mesh: MeshShape, folders: Iterable[Path] = ()) -> Path
     above = [Path(urdf).resolve().parent, *Path(urdf).resolve().parent.parents]
     if name.startswith("package://"):
         parts = Path(name.removeprefix("package://")).parts
+        if ".." in parts or name.startswith("package:///"):
+            raise InputError(
+                f"{urdf}: link '{mesh.link}': mesh {name} lies outside its package", remedy="correct the path"
+            )
         roots = [*folders, *above]
         tried = [root.joinpath(*parts) for root in roots]
         tried += [root.joinpath(*parts[1:]) for root in roots if parts and root.name == parts[0]]

@@ -1,0 +1,147 @@
+"""Files made to take memory or time, or to reach outside: each is refused in one line, within 1 GiB and seconds."""
+
+import io
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.arrays import npy_of
+from splatctrl_cli.robot.solids import mesh_path
+from splatctrl_cli.robot.urdf import MeshShape
+
+CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
+LAUGHS = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
+HUGE = (1 << 40,)
+
+
+def npy(shape: tuple[int, ...], dtype: str = "<f4", data: bytes = bytes(64)) -> bytes:
+    """A .npy file whose header announces any shape."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return stream.getvalue() + data
+
+
+def npz(path: Path, **members: bytes) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return path
+
+
+def png(width: int, height: int) -> bytes:
+    def part(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = part(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + part(b"IDAT", zlib.compress(bytes(1 << 20))) + part(b"IEND", b"")
+
+
+def xml(folder: Path, text: str) -> list[str]:
+    (folder / "x.urdf").write_text(text)
+    return ["robot", "info", "--urdf", str(folder / "x.urdf")]
+
+
+def images(folder: Path, name: str, depth: bytes) -> list[str]:
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir()
+    (folder / "rgb/0.png").write_bytes(png(8, 6))
+    (folder / f"depth/0.{name}").write_bytes(depth)
+    (folder / "t.log").write_text("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    frames = f'[frames]\ncolor = "rgb/*.png"\ndepth = "depth/*.{name}"\n[depth]\nscale = 1e-3\n'
+    poses = '[poses]\nformat = "trajectory-log"\nfile = "t.log"\n'
+    (folder / "x.toml").write_text(f'root = "."\n{CAMERA}{frames}{poses}')
+    return ["ingest", str(folder / "x.toml"), "-o", str(folder / "x.capture")]
+
+
+def saved(path: Path, data: bytes) -> list[str]:
+    path.write_bytes(data)
+    return ["info", str(path)]
+
+
+PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
+CASES: dict[str, Callable[[Path], list[str]]] = {
+    "billion laughs": lambda d: xml(d, f'<!DOCTYPE robot [<!ENTITY a0 "ha">{LAUGHS}]><robot name="&a11;"/>'),
+    "outer entity": lambda d: xml(d, '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="&x;"/>'),
+    "info of laughs": lambda d: ["info", xml(d, f'<!DOCTYPE r [<!ENTITY a0 "h">{LAUGHS}]><robot name="&a11;"/>')[3]],
+    "depth announced": lambda d: images(d, "npy", npy(HUGE)),
+    "depth of objects": lambda d: images(d, "npy", npy((4,), "|O", pickle.dumps([1]))),
+    "depth of a thousand million pixels": lambda d: images(d, "png", png(32767, 32767)),
+    "image": lambda d: saved(d / "x.png", png(32767, 32767)),
+    "array announced": lambda d: saved(d / "x.npy", npy(HUGE)),
+    "pickled array": lambda d: saved(d / "x.npy", npy((4,), "|O", pickle.dumps([1]))),
+    "text announced": lambda d: ["info", str(npz(d / "x.npz", header=npy((), f"<U{1 << 28}")))],
+    "grid announced": lambda d: ["info", str(npz(d / "x.npz", header=npy((), "<U2"), sdf=npy((1 << 13,) * 3)))],
+    "deep JSON": lambda d: saved(d / "x.json", b"[" * 100_000),
+    "deep YAML": lambda d: saved(d / "x.yaml", b"[" * 100_000),
+    "deep TOML": lambda d: saved(d / "x.toml", b"a = " + b"[" * 100_000),
+    "splats announced": lambda d: saved(d / "x.ply", PLY),
+}
+
+RUN = """
+import resource, sys
+from splatctrl_cli.cli.main import main
+import splatctrl_cli.cli.ingest, cv2, numpy, splatctrl_cli.io.source, splatctrl_cli.io.describe
+pages = int(open("/proc/self/statm").read().split()[0])
+limit = pages * resource.getpagesize() + 2**30
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_hostile_file_is_refused_or_described_within_bounds(tmp_path: Path, name: str) -> None:
+    arguments = CASES[name](tmp_path)
+    there = set(tmp_path.rglob("*"))
+    environment = os.environ | {"OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=environment,
+    )
+    assert done.returncode in ({0, 4} if name in {"grid announced", "splats announced"} else {4}), done.stderr
+    assert "Traceback" not in done.stderr
+    assert "internal error" not in done.stderr
+    assert set(tmp_path.rglob("*")) == there
+
+
+def test_a_package_path_that_leaves_its_package_is_refused(tmp_path: Path) -> None:
+    package = tmp_path / "arm" / "urdf"
+    package.mkdir(parents=True)
+    for file in (tmp_path / "secret.stl", tmp_path / "arm" / "own.stl"):
+        file.write_text("solid x")
+    mesh = MeshShape(link="a", filename="package://arm/own.stl", scale=(1.0, 1.0, 1.0), T_link_mesh=np.eye(4))
+    assert mesh_path(package / "x.urdf", mesh) == tmp_path / "arm" / "own.stl"
+    for name in ("package://arm/../secret.stl", "package://../secret.stl", "package:///etc/passwd"):
+        with pytest.raises(InputError, match="lies outside its package"):
+            mesh_path(package / "x.urdf", replace(mesh, filename=name))
+
+
+def test_a_npy_file_is_read_as_numpy_reads_it_and_no_further() -> None:
+    for array in (
+        np.arange(6, dtype="<f4").reshape(2, 3),
+        np.asfortranarray(np.arange(6).reshape(2, 3)),
+        np.zeros(0),
+    ):
+        stream = io.BytesIO()
+        np.save(stream, array)
+        assert np.array_equal(npy_of(stream.getvalue()), array)
+        with pytest.raises(ValueError, match="announces"):
+            npy_of(stream.getvalue() + b"x")
+    with pytest.raises(ValueError, match="announces 4398046511104 bytes, holds 64"):
+        npy_of(npy(HUGE))
+    with pytest.raises(ValueError, match="objects"):
+        npy_of(npy((1,), "|O"))
