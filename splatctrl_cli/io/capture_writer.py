@@ -126,6 +126,11 @@ def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
     frame = shot.frame
     unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
     camera = cameras.setdefault(frame.camera, {**asdict(frame.intrinsics), "depth_scale": unit, "num_frames": 0})
+    if any(camera[name] != value for name, value in asdict(frame.intrinsics).items()):
+        raise InputError(
+            f"{shot.origin}: camera {frame.camera} changes its lens, and a capture holds one of each camera",
+            remedy="leave --holdout to `reconstruct` and `score`",
+        )
     camera["num_frames"] += 1
     T = frame.T_world_camera
     pose = [repr(float(value)) for value in (*T[:3, 3], *quat_from_rotation(T[:3, :3]))]

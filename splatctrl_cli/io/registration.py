@@ -1,14 +1,16 @@
 """Depth seen from the colour camera, and images without lens distortion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+STEP, MOST_STEPS = 1.01, 240  # of the focal length of an undistorted image, up to ten times
 SAME_MODELS = {  # what others call them
     "Brown Conrady": "plumb_bob",
     "radtan": "plumb_bob",
@@ -61,25 +63,44 @@ class DepthToColor:
 
 
 class Undistortion:
-    """Removes a lens distortion; the camera matrix stays the same."""
+    """Removes a lens distortion, so that the lens saw every pixel of the result.
+
+    intrinsics: those of the result. They are the lens's own where these leave no pixel unseen (barrel distortion);
+    else the focal lengths grow by steps of 1 % until they do: black corners would be taken for the scene's colour.
+    """
 
     def __init__(self, intrinsics: Intrinsics, model: str, coefficients: Float64) -> None:
-        K = np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]])
-        size = (intrinsics.width, intrinsics.height)
-        if model == "equidistant":
-            maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], np.eye(3), K, size, cv2.CV_32FC1)
-        else:
-            maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
-        self._map_u, self._map_v = maps
+        for step in range(MOST_STEPS):
+            growth = STEP**step
+            self.intrinsics = replace(intrinsics, fx=intrinsics.fx * growth, fy=intrinsics.fy * growth)
+            self._map_u, self._map_v = _maps(intrinsics, self.intrinsics, model, coefficients)
+            inside_u = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
+            if (inside_u & (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)).all():
+                return
+        raise InputError(
+            f"distortion {model} {np.round(coefficients, 6).tolist()}: no part of the image is seen whole",
+            remedy="correct the calibration, or undistort the images first",
+        )
 
     def color(self, image: UInt8) -> UInt8:
-        """Colour (H, W, 3), interpolated; black where the lens saw nothing."""
+        """Colour (H, W, 3), interpolated."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def labels(self, image: UInt8) -> UInt8:
-        """Labels (H, W), nearest pixel; 0 where the lens saw nothing."""
+        """Labels (H, W), nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.uint8)
 
     def depth(self, image: Float32) -> Float32:
-        """Depth (H, W) [m], nearest pixel; 0 where the lens saw nothing."""
+        """Depth (H, W) [m], nearest pixel."""
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
+
+
+def _maps(lens: Intrinsics, result: Intrinsics, model: str, coefficients: Float64) -> tuple[Float32, Float32]:
+    """Column and row in the distorted image of each pixel of the result."""
+    K, K_new = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]]) for k in (lens, result))
+    size = (lens.width, lens.height)
+    if model == "equidistant":
+        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], np.eye(3), K_new, size, cv2.CV_32FC1)
+    else:
+        maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), K_new, size, cv2.CV_32FC1)
+    return np.asarray(maps[0]), np.asarray(maps[1])

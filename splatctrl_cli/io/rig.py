@@ -8,10 +8,10 @@ import numpy as np
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.io.cameras import find_cameras, find_info, image_topics, is_registered
-from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, is_ros
 from splatctrl_cli.io.masks import check_mask_topics
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
-from splatctrl_cli.io.raw_log import RawLog
+from splatctrl_cli.io.raw_log import RawLog, Topic
 from splatctrl_cli.io.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
 from splatctrl_cli.io.survey import Calibration, Survey
 from splatctrl_cli.io.tf_tree import TfTree
@@ -143,6 +143,8 @@ class _Builder:
         topics = self._topics
         calibration = self._calibration(topics.info, topics.color)
         intrinsics = intrinsics_of(calibration)
+        undistortion = self._undistortion(calibration, intrinsics)
+        intrinsics = intrinsics if undistortion is None else undistortion.intrinsics
         fixed = self._options.camera_poses.get(topics.name)
         world = self._check_world()
         return Camera(
@@ -152,7 +154,7 @@ class _Builder:
             frame_id=self._frame_id,
             world_frame=world,
             intrinsics=intrinsics,
-            undistortion=self._undistortion(calibration, intrinsics),
+            undistortion=undistortion,
             depth_to_color=None if self._is_registered else self._registration(intrinsics),
             fixed_pose=None if fixed is None else transform_from(fixed[:3], fixed[3:]),
             depth_scale=self._depth_scale,
@@ -337,7 +339,7 @@ def _no_camera(log: RawLog, survey: Survey) -> InputError:
         return InputError(
             f"{log.path}: no colour topic; depth topics there: {_listed(depths)}", remedy="record the colour images"
         )
-    kinds = sorted({t.topic.type_name or t.topic.encoding for t in survey.topics.values() if t.count})
+    kinds = sorted({_kind(t.topic) for t in survey.topics.values() if t.count})
     return InputError(
         f"{log.path}: no image topics; message types there: {_listed(kinds)}",
         remedy="expected sensor_msgs Image or CompressedImage",
@@ -348,3 +350,9 @@ def _listed(names: Sequence[str]) -> str:
     """Up to eight names, then how many more."""
     shown = ", ".join(names[:8]) or "none"
     return f"{shown} and {len(names) - 8} more" if len(names) > 8 else shown
+
+
+def _kind(topic: Topic) -> str:
+    """The type of a topic's messages, and their encoding where it is none of ROS."""
+    name = topic.schema or topic.type_name
+    return name if is_ros(topic) and name else f"{name} ({topic.encoding})".strip()

@@ -10,7 +10,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
-from splatctrl_cli.io.capture import write_capture
+from splatctrl_cli.io.capture_writer import write_capture
 from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.layouts import LAYOUTS, layout_of
 from splatctrl_cli.io.options import SourceOptions
