@@ -224,7 +224,13 @@ def _open(args: argparse.Namespace) -> "RecordSource":
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
     if args.dtu is not None:
-        return open_dtu(args)
+        scan = open_dtu(args)
+        if not scan.has_depth and args.points is None:
+            raise InputError(
+                f"{args.dtu}: scan '{scan.name}' has no depth",
+                remedy="give --depths DIR, or --points FILE.ply instead",
+            )
+        return scan
     refuse_scan_options(args)
     if args.protocol is not None:
         return open_held_out(args, args.source)[0]

@@ -75,6 +75,10 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
 def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
     """Fit, score, print the table, and return the exit code."""
     _refuse(args)
+    if args.lpips is not None:
+        from splatctrl_cli.evaluate.perceptual import Lpips
+
+        Lpips(args.lpips)  # better refused now than after the fits
     config = configured(args)
     iterations, splats = args.fit_iterations, NUM_SPLATS if args.fit_splats is None else args.fit_splats
     if iterations is None:
@@ -174,7 +178,8 @@ def _reconstruct(args: argparse.Namespace, scene: Path, scan: str, settings: lis
     said = done.stderr.strip().splitlines()
     _, peak, code = done.stdout.split() if done.stdout else ("", "0", "-1")
     if code != "0":
-        raise InputError(f"{scan}: reconstruct ended with {code}: {said[-1] if said else 'it said nothing'}")
+        line = said[-1].removeprefix("splatctrl: ") if said else "it said nothing"
+        raise InputError(f"{scan}: reconstruct ended with {code}: {line}")
     return scene, float(peak) / 1024
 
 

@@ -117,7 +117,7 @@ class Scorer:
         rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
         row = ComparisonRow(
             title=view.name,
-            figures=f"{score.seen.psnr:.1f} dB where seen, {score.all.psnr:.1f} dB in all",
+            figures=_figures(score),
             photo=frame.color,
             render=rendering.color,
             photo_depth=frame.depth,
@@ -129,6 +129,12 @@ class Scorer:
             scores.best[frame.camera] = (rank, row)
         if frame.camera not in scores.worst or rank < scores.worst[frame.camera][0]:
             scores.worst[frame.camera] = (rank, row)
+
+
+def _figures(score: "ViewScore") -> str:
+    parts = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} dB where seen"]
+    parts += [f"{score.masked.psnr:.1f} dB in the mask"] if score.masked is not None else []
+    return ", ".join([*parts, f"{score.all.psnr:.1f} dB in all"])
 
 
 def rendered(

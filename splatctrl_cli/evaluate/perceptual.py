@@ -79,6 +79,8 @@ def _read(path: Path) -> dict[str, Float32]:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name], np.float32) for name in archive.files}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # numpy raises many kinds for a file that is no archive
         raise InputError(
             f"{path}: expected LPIPS weights as .npz, got: {error}", remedy="docs/score.md says how to make them"

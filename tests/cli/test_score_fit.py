@@ -45,6 +45,7 @@ def test_both_methods_are_fitted_scored_and_printed_beside_the_paper(
         (["--scan", "scan1,scan9"], 4, "no scan 'scan9'; scans: scan1"),
         (["--require", "psnr_all>=1"], 2, "unknown metric"),
         (["--cloud", "x.ply"], 2, "--fit: compares with no cloud"),
+        (["--lpips", "x.npz"], 4, "x.npz: cannot be read: No such file"),
         (["--set", "scene.nothing=1"], 2, "scene.nothing"),
     ],
 )
@@ -65,5 +66,5 @@ def test_what_reconstruct_refuses_is_passed_on(
 ) -> None:
     assert main(["score", "--dtu", str(sample_data / "dtu"), *QUICK, "--protocol", "regnerf-3"]) == 4
     said = capsys.readouterr().err
-    assert "scan1: reconstruct ended with 4: splatctrl: " in said
+    assert "scan1: reconstruct ended with 4: " in said
     assert "no view 9-12" in said

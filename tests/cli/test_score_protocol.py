@@ -90,6 +90,15 @@ def test_without_depth_colours_are_scored_and_nothing_counts_as_seen(
         assert result["metrics"][name] == pytest.approx(with_depth[name], abs=1e-9)
 
 
+def test_a_scan_without_depth_is_not_reconstructed_without_points(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["reconstruct", "--dtu", str(place / "blind"), "-o", str(tmp_path / "scene"), *QUICK]) == 4
+    assert "has no depth; give --depths DIR, or --points FILE.ply instead" in capsys.readouterr().err
+    depths = ["--depths", str(place / "mvsnet" / "Depths_raw" / "scan1")]
+    assert main(["reconstruct", "--dtu", str(place / "blind"), *depths, "-o", str(tmp_path / "scene"), *QUICK]) == 0
+
+
 def test_the_report_says_by_what_its_figures_came_about(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(place, "idr", "--protocol", HOLDOUT) == 0
     out = capsys.readouterr().out
