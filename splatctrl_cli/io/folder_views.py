@@ -7,7 +7,7 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.io.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.options import SourceOptions, still_note
 from splatctrl_cli.io.poses import (
     READERS,
     Trajectory,
@@ -68,6 +68,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
     loss.unpaired_color += description.unpaired[0]
     loss.unpaired_depth += description.unpaired[1]
     loss.notes.extend(description.notes)
+    loss.notes.extend(still_note(name) for name in options.camera_poses if any(v.lens.name == name for v in views))
     if not views:
         file = "" if description.poses is None else description.poses.file
         raise InputError(

@@ -52,3 +52,8 @@ class SourceOptions:
             if getattr(self, name) != getattr(default, name):
                 flag = flags.get(name, name.replace("_", "-"))
                 raise InputError(f"{path}: --{flag} does not apply to {kind}", remedy="leave it out")
+
+
+def still_note(camera: str) -> str:
+    """What a report says of a camera whose pose a person gave."""
+    return f"camera {camera}: stands still where --camera-pose puts it, not where the recording may say"

@@ -15,7 +15,7 @@ from splatctrl_cli.io.joint_topics import topics_of, with_joints
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.masks import human_mask, mask_by_color
 from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid, read_image
-from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.options import SourceOptions, still_note
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.pairing import pair_by_stamp
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
@@ -54,6 +54,7 @@ class RosLogSource:
         self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
         self._rig = build_cameras(log, found, options)
         self.cameras = tuple(camera.name for camera in self._rig)
+        self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
         self.world_frame = self._rig[0].world_frame
         loss, first_note = LossReport(), len(self._loss.notes)
         self.joint_names, self._joints = joint_records(found, options, loss, joints)

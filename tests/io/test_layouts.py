@@ -260,6 +260,7 @@ def test_a_bop_scene_without_poses_needs_a_camera_that_stands_still(tmp_path: Pa
         open_source(folder)
     still = SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)})
     assert [frame.T_world_camera[:3, 3].tolist() for frame in frames_of(folder, still)] == [[1.0, 2.0, 3.0]] * 3
+    assert "camera camera: stands still where --camera-pose puts it" in open_source(folder, still).loss.notes[0]
 
 
 def test_a_nerfstudio_folder_needs_no_description(tmp_path: Path) -> None:

@@ -112,6 +112,9 @@ def test_depth_is_registered_by_the_extrinsics_and_counted_in_its_own_unit(tmp_p
     assert (near[0], near[-1]) == (30 + shift / 0.6, 33 + shift / 0.6)
     assert frames[0].T_world_camera.tolist() == np.eye(4).tolist()
     assert source.loss.damaged == 0
+    assert source.loss.notes == [
+        "camera device_0: stands still where --camera-pose puts it, not where the recording may say"
+    ]
 
 
 def test_without_a_pose_the_camera_that_stands_still_is_asked_for(tmp_path: Path) -> None:
