@@ -18,7 +18,7 @@ from splatctrl_cli.cli.common import (
 )
 from splatctrl_cli.cli.lockstep import add_lockstep, check_lockstep
 from splatctrl_cli.cli.replay_baseline import add_baseline, read_baselines, read_zone
-from splatctrl_cli.cli.replay_goal import POSE, add_goal, pose, seconds
+from splatctrl_cli.cli.replay_goal import POSE, add_goal, check_goal, pose, seconds
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, doubts_of, read_robot
 from splatctrl_cli.cli.replay_twists import check_twists
@@ -111,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
     read_zone(args)
     check_lockstep(args)
     check_twists(args)
+    check_goal(args)
     out = args.out or Path("replay")
     with output_path(out, force=args.force, is_folder=True) as folder:
         with stopwatch.stage("read"):

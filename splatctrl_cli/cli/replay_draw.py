@@ -36,7 +36,10 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
     if replay.true_clearance is not None:
         curves["truth"] = replay.true_clearance
     happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in ("", "exact"))
-    clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, TITLES[replay.mode], happened)
+    title = TITLES[replay.mode]
+    if replay.closed_loop is not None and replay.start_time_s > 0:
+        title += f", from {replay.start_time_s:.2f} s of the log"
+    clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, title, happened)
     if replay.kept_steps is not None:
         commands_picture(
             folder / "commands.png",

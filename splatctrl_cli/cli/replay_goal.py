@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.replay_twists import add_twists
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.control.replay import Waypoint
@@ -40,6 +40,20 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--re-anchor", type=seconds, metavar="S", help="put the arm back into the logged posture every S seconds"
     )
+
+
+def check_goal(args: argparse.Namespace) -> None:
+    """Raise UsageError where a mode has no use for an option that is given."""
+    asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
+    modes: dict[str, tuple[str, ...]] = {"start_time": driven, "re_anchor": driven}
+    modes |= dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)
+    for option, wanted in modes.items():
+        given = getattr(args, option)
+        if given is not None and given is not False and args.mode not in wanted:
+            name = "--" + option.replace("_", "-")
+            raise UsageError(
+                f"{name}: expected --mode {' or '.join(wanted)}, got {args.mode}", remedy=f"leave out {name}"
+            )
 
 
 def goal_waypoints(

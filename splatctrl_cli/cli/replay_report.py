@@ -90,21 +90,24 @@ def when_and_why(replay: "Replay") -> list[str]:
     troubles = [event for event in replay.events if event.kind not in INTERVENTIONS and event.source in ("", "exact")]
     for event in list({event.kind: event for event in reversed(troubles)}.values())[::-1]:
         count = sum(other.kind == event.kind and other.source == event.source for other in troubles)
-        lines.append(f"{event.kind}: {told(event)}" + (f"; {count} such intervals" if count > 1 else ""))
+        told_once = told(event, with_kind=False)
+        lines.append(f"{event.kind}: {told_once}" + (f"; {count} such intervals" if count > 1 else ""))
+    if replay.closed_loop is not None and replay.start_time_s > 0:
+        lines.append(f"times count from the start, at {replay.start_time_s:.2f} s of the log")
     return lines or ["no event: no state is below the margin, outside its limits or in space that is not known"]
 
 
-def told(event: "Event") -> str:
-    """An event as a sentence: when, who, by how much, and what was near."""
+def told(event: "Event", *, with_kind: bool = True) -> str:
+    """An event as a sentence: when, what and who, by how much, and what was near."""
     unit = UNITS.get(event.kind, "")
     span = f"{event.start_s:.2f} to {event.end_s:.2f} s"
-    who = f" {event.worst_name}" if event.worst_name else ""
     more = f" and {event.num_names - 1} more" if event.num_names > 1 else ""
     near = "" if event.obstacle is None else f", near {event.obstacle}"
     is_row = event.kind in ("scene", "self", "limit")
-    kind = f"{event.kind} row" if is_row else event.kind
+    kind = f"{event.kind} row" if is_row else event.kind if with_kind else ""
+    who = " ".join(filter(None, (kind, event.worst_name)))
     worst = f"{'multiplier ' if is_row else ''}{event.worst:.4g} {unit}".rstrip()
-    return f"{span}, {kind}{who}{more}, worst {worst} at {event.worst_s:.2f} s{near}"
+    return ", ".join(filter(None, (span, f"{who}{more}", f"worst {worst} at {event.worst_s:.2f} s{near}")))
 
 
 def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> Iterator[str]:

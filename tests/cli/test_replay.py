@@ -150,6 +150,10 @@ def test_the_truth_is_reported_beside_the_scene(
         (["--lock", "nose=0"], 4, "no joint 'nose' to lock"),
         (["--truth", "nowhere.json"], 4, "nowhere.json"),
         (["--require", "clearence>=1"], 2, "unknown metric"),
+        (["--start-time", "0"], 2, "--start-time: expected --mode closed-loop, got audit"),
+        (["--mode", "open-loop", "--re-anchor", "1"], 2, "--re-anchor: expected --mode closed-loop, got open-loop"),
+        (["--goal", "0,0,1,0,0,0,1"], 2, "--goal: expected --mode open-loop or closed-loop, got audit"),
+        (["--follow"], 2, "--follow: expected --mode open-loop or closed-loop, got audit"),
     ],
 )
 def test_bad_input_is_one_line_with_its_code(

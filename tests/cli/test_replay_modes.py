@@ -84,7 +84,9 @@ def test_open_loop_may_ask_for_a_goal_instead_of_the_log(desk: Desk) -> None:
     assert float(desk.rows()[-1]["v_joint1"]) < 0 and desk.metrics()["max_velocity_difference"] > 0.5
 
 
-def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(desk: Desk, arm: RobotModel) -> None:
+def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(
+    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
     moving(desk)
     scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05), ball_ahead(arm, -0.01))))
     assert desk.replay("--scene", str(scene), "-q") == 0
@@ -93,6 +95,8 @@ def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(desk: De
     assert below["end_s"] == hit["end_s"] == 1.0 and below["start_s"] < hit["start_s"]
     assert below["worst"] == pytest.approx(desk.metrics()["min_clearance"]) and below["unit"] == "m"
     assert below["obstacle"]["splat"] == 1  # type: ignore[index]
+    words = f"below-margin: {below['start_s']:.2f} to 1.00 s, {below['worst_name']}"
+    assert any(line.startswith(words) for line in capsys.readouterr().out.splitlines())
 
 
 def test_an_old_scene_is_stale(desk: Desk) -> None:
@@ -191,6 +195,17 @@ def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk)
     assert metrics["max_divergence_joints"] < 0.01 and metrics["max_divergence_position"] < 0.005
     assert float(desk.rows()[-1]["divergence_joints"]) == pytest.approx(metrics["end_divergence_joints"])
     assert (desk.folder / "out" / "divergence.png").is_file()
+
+
+def test_a_later_start_says_what_its_times_count_from(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    moving(desk)
+    scene = str(write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05)))))
+    drive = ("--scene", scene, "-q", "--mode", "closed-loop", "--follow")
+    assert desk.replay(*drive, "--start-time", "0.9") == 0
+    assert "times count from the start, at 0.90 s of the log" in capsys.readouterr().out.splitlines()
+    assert desk.rows()[0]["time_s"] == "0"
+    assert desk.replay(*drive, "--force") == 0
+    assert "times count from" not in capsys.readouterr().out
 
 
 def test_an_anchor_puts_the_arm_back_into_the_log(desk: Desk) -> None:
