@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.io.arrays import npy_of
+from splatctrl_cli.io.arrays import DAMAGE, npy_of
 from splatctrl_cli.io.capture_joints import read_joints
 from splatctrl_cli.io.capture_writer import COLUMNS, FORMAT, MASKED_COLUMNS, VERSION, write_capture
 from splatctrl_cli.io.joint_topics import (
@@ -107,6 +107,14 @@ class CaptureSource:
     def shot_at(self, number: int) -> Shot | None:
         """A frame by its number among those of `cameras`, without reading others; None where it is damaged."""
         return self._shot(self._rows[number])
+
+    def row(self, number: int) -> Mapping[str, str]:
+        """What frames.csv says of a frame, by its number."""
+        return self._rows[number]
+
+    def states(self) -> Sequence[JointState]:
+        """The joint states, by stamp."""
+        return self._joints
 
     def _shots(self) -> Iterator[Shot]:
         for row in self._rows:
@@ -211,7 +219,10 @@ def _check_index(path: Path) -> None:
 
 def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | None:
     if name.endswith(".npy"):
-        return np.asarray(npy_of(data), dtype=np.float32)
+        try:
+            return np.asarray(npy_of(data), dtype=np.float32)
+        except DAMAGE:
+            return None
     counts = decode_file(data, color=False)
     return None if counts is None else metres(counts, camera["depth_scale"])
 

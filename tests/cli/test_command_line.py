@@ -13,6 +13,8 @@ import pytest
 
 from splatctrl_cli.cli import demo
 from splatctrl_cli.cli.main import COMMANDS, main
+from splatctrl_cli.io.capture import write_capture
+from splatctrl_cli.io.source import open_source
 from tests.io.make_log import LogRecipe, make_log
 
 WRITERS = [command for command in COMMANDS if command not in {"info", "check"}]
@@ -58,6 +60,7 @@ class Work:
             "robot": ["spheres", "--urdf", urdf],
             "replay": [self.log, "--scene", scene, "--urdf", urdf, "--max-unknown", "1"],
             "demo": [],
+            "capture": ["pack", self.folder / "x.capture"],
         }
         return [command, *given[command], "-o", out]
 
@@ -66,7 +69,7 @@ class Work:
 def work(tmp_path_factory: pytest.TempPathFactory) -> Work:
     """A log of two cameras, its scene, and a two-joint arm whose joints are in the log."""
     work = Work(tmp_path_factory.mktemp("work"))
-    make_log(work.log, LogRecipe(cameras=("cam0", "cam1")))
+    write_capture(work.folder / "x.capture", open_source(make_log(work.log, LogRecipe(cameras=("cam0", "cam1")))))
     (work.folder / "robot.urdf").write_text(ARM.format("joint_a", "joint_b"))
     done = splatctrl(*work.arguments("reconstruct", work.folder / "scene"), "-q")
     assert done.returncode == 0, done.stderr
@@ -117,7 +120,7 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 @pytest.mark.parametrize("command", WRITERS)
 def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, command: str) -> None:
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--colour")
-    action = " spheres" if command == "robot" else ""
+    action = {"robot": " spheres", "capture": " pack"}.get(command, "")
     assert_refused(done, 2, f"{command}{action}: unrecognized arguments: --colour; ")
     assert not list(tmp_path.iterdir())
 
@@ -182,7 +185,7 @@ def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command
     assert not list(tmp_path.iterdir())
 
 
-FILE_WRITERS = ("export", "robot")  # the others write a folder
+FILE_WRITERS = ("export", "robot", "capture")  # the others write a folder
 
 
 @pytest.mark.parametrize("command", WRITERS)
