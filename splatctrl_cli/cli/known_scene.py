@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.control.explain import Obstacle
     from splatctrl_cli.control.rates import SceneStep
     from splatctrl_cli.field.grid import GridField
-    from splatctrl_cli.records import DistanceField, DistanceGrid, Float64, OccupancyGrid, SplatSet
+    from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, OccupancyGrid, SplatSet
 
     Index = NDArray[np.int64]
 
@@ -53,6 +53,7 @@ class KnownScene:
     cameras: the cameras that made it, None where that is not recorded. stamps_ns: of the scenes that are there one
     after the other (so far, where they are made on the way: `advance` to a stamp makes those known then), empty for
     one scene for all times; each is known `latency_ns` after its stamp. finish: to be called when the replay is done.
+    box: of the centres of a grid's cells, None for splats.
     """
 
     at: Callable[[int], KnownFields]
@@ -64,6 +65,7 @@ class KnownScene:
     latency_ns: int = 0
     advance: Callable[[int], None] = _nothing
     finish: Callable[[], None] = lambda: None
+    box: "Box | None" = None
 
     def age_s(self, stamp_ns: int) -> float:
         """How old [s] the scene in use at a stamp is; NaN where scenes have no times."""
@@ -107,10 +109,13 @@ def fields_at(
 
 def from_grid(path: Path) -> KnownScene:
     """The scene of a baked grid: one field for all times. `path` is a field folder or a ``field.npz``."""
+    import numpy as np
+
     from splatctrl_cli.control.audit import observed_lookup
     from splatctrl_cli.field.grid import GridField, exact_channel
     from splatctrl_cli.io.grid import read_npz
     from splatctrl_cli.io.output import sha256
+    from splatctrl_cli.records import Box
 
     file = path / "field.npz" if path.is_dir() else path
     grid = read_npz(file)
@@ -131,6 +136,7 @@ def from_grid(path: Path) -> KnownScene:
         first_ns=None,
         cameras=None,
         digests={file.name: sha256(file)},
+        box=Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["observed"].shape) - 1)),
     )
 
 

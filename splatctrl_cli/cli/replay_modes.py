@@ -13,10 +13,11 @@ from splatctrl_cli.cli.replay_baseline import read_baselines, read_zone, separat
 from splatctrl_cli.cli.replay_compare import Comparison, compared, planned_ways_out
 from splatctrl_cli.cli.replay_goal import goal_waypoints
 from splatctrl_cli.cli.replay_record import ReplayRecord
+from splatctrl_cli.cli.replay_states import check_inside
 from splatctrl_cli.cli.replay_store import Figures, StoredAudit, StoredLoop, StoredOpenLoop, StoredSteps
 from splatctrl_cli.cli.replay_twists import twist_figures, twist_track
 from splatctrl_cli.control.audit import Stamps
-from splatctrl_cli.control.checks import StaticViolation, static_violations
+from splatctrl_cli.control.checks import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.explain import Event
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
@@ -106,6 +107,8 @@ class Replay:
 
 def replayed(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
     """The replay that --mode asks for, with its events."""
+    if inputs.scene.box is not None:
+        check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
     mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[args.mode]
     zone = read_zone(args)
     replay = mode(args, inputs, config, console)
@@ -189,7 +192,8 @@ def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", co
     """The closed loop, the audit of the states it went through, and how far they are from the log."""
     scene, model, record = inputs.scene, inputs.model, _record(args, inputs, config)
     motion = logged_motion(inputs)
-    task = _task(args, inputs, motion, twist_track(args, model, _span(inputs), console))
+    twists = twist_track(args, model, _span(inputs), console)
+    task = _task(args, inputs, motion, twists, config.control.limit_tolerance)
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
@@ -288,7 +292,7 @@ def _span(inputs: ReplayInputs) -> tuple[int, int]:
 
 
 def _task(
-    args: argparse.Namespace, inputs: ReplayInputs, motion: LoggedMotion, twists: TwistTrack | None
+    args: argparse.Namespace, inputs: ReplayInputs, motion: LoggedMotion, twists: TwistTrack | None, tolerance: float
 ) -> ReplayTask:
     """The start (logged, and not before the scene is known) and the goal (given, or the logged end)."""
     stamps, positions = motion.stamp_ns, motion.position
@@ -305,6 +309,9 @@ def _task(
     frame = args.frame or inputs.model.frame_names[-1]
     end = positions[-1] if twists is None else positions[start]
     *via, goal = goal_waypoints(args, inputs.model, frame, end)
+    for waypoint in (*via, goal):
+        if waypoint.posture is not None:
+            check_within_limits(inputs.model, waypoint.posture, tolerance, what="goal")
     return ReplayTask(
         start=positions[start],
         T_world_goal=goal.T_world_goal,

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.source_options import source_options
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.errors import InputError, NotEvaluableError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.io.state_columns import StateColumns
     from splatctrl_cli.io.state_motion import ImageMotion
     from splatctrl_cli.io.state_offset import ClockOffset
-    from splatctrl_cli.records import RecordSource
+    from splatctrl_cli.records import Box, Float64, RecordSource
     from splatctrl_cli.robot.model import RobotModel
 
 MAX_NOTES = 10  # printed
@@ -96,6 +96,22 @@ def read_states(args: argparse.Namespace, model: "RobotModel") -> LoggedStates:
     check_angles(model, states, source.name)
     clock = _clock(model, states, motion) if motion.cameras and source.has_clock and len(states) else None
     return LoggedStates(source=source, states=states, poses=pose_agreement(model, states), clock=clock)
+
+
+def check_inside(model: "RobotModel", q: "Float64", box: "Box") -> None:
+    """Raise NotEvaluableError for a posture (J,) of which no moving sphere is in the box of a baked field."""
+    import numpy as np
+
+    centers = model.sphere_centers(q)[np.flatnonzero(model.moving_spheres)]
+    beyond = np.maximum(box.lower - centers, centers - box.upper).max(axis=1)
+    if not len(centers) or beyond.min() <= 0:
+        return
+    lower, upper = ("(" + ", ".join(f"{v:.2f}" for v in corner) + ")" for corner in (box.lower, box.upper))
+    raise NotEvaluableError(
+        f"--field: expected the robot in the grid from {lower} to {upper} m, got all {len(centers)} moving spheres "
+        f"outside it, the nearest by {beyond.min():.2f} m",
+        remedy="check --base and the frame of the field, or bake a --box around the robot",
+    )
 
 
 def _clock(model: "RobotModel", states: "StateColumns", motion: "ImageMotion") -> "ClockOffset":

@@ -69,15 +69,16 @@ def checked_posture(model: ArmModel, q: Float64, *, what: str = "joint positions
     return posture
 
 
-def check_within_limits(model: ArmModel, q: Float64, tolerance: float) -> None:
-    """Raise InputError for a start q (J,) outside the position limits by more than `tolerance` [rad]."""
+def check_within_limits(model: ArmModel, q: Float64, tolerance: float, what: str = "start") -> None:
+    """Raise InputError for a start or goal q (J,) outside the position limits by more than `tolerance` [rad]."""
     outside = np.maximum(q - model.upper, model.lower - q)
     worst = int(np.argmax(outside))
     if outside[worst] > tolerance:
         raise InputError(
-            f"start: joint {model.joint_names[worst]}: expected within [{model.lower[worst]:.4f}, "
+            f"{what}: joint {model.joint_names[worst]}: expected within [{model.lower[worst]:.4f}, "
             f"{model.upper[worst]:.4f}] rad, got {q[worst]:.4f}",
-            remedy="choose another --start-time, or check that the URDF is of this robot",
+            remedy=f"choose another {'--start-time' if what == 'start' else what}, or check that the URDF is of this "
+            "robot",
         )
 
 

@@ -72,6 +72,8 @@ class NpzFile:
                 shape, dtype, _, _ = self._opened(stack, name)
                 if dtype.kind in "iuf" and shape and shape[0] >= least:
                     return shape, dtype
+                if dtype.kind in "iuf" and shape and not shape[0]:
+                    raise InputError(f"{self._path}: {name}: expected rows, got none", remedy="record it again")
                 found = f"{dtype} of shape {shape}"
         raise InputError(
             f"{self._path}: {name!r}: expected an array of numbers, got {found}",

@@ -16,6 +16,7 @@ from splatctrl_cli.robot.model import RobotModel
 
 FAR = 0.5  # [rad] beyond the limits, and beyond a whole turn: not the limits of another joint
 MANY = 0.5  # of the states that must be there
+LONGEST_PAUSE = 86_400.0  # [s] between states; beyond it another clock goes on
 SLACK = 0.1  # [rad] by which degrees may exceed the limits
 MAX_POSES = 200  # that are compared, spread over the log
 SAME_POSITION, SAME_ROTATION = 0.005, 0.02  # [m], [rad] within which poses agree
@@ -92,7 +93,9 @@ class PoseAgreement:
 
 
 def check_states(states: StateColumns, joints: Sequence[str]) -> None:
-    """Raise InputError where there are no states (model order), a stamp goes back, or a position is not finite."""
+    """Raise InputError where there are no states (model order), a stamp goes back, or leaps as no pause does, or a
+    position is not finite.
+    """
     stamps = states.stamp_ns
     if not len(stamps):
         raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
@@ -102,6 +105,14 @@ def check_states(states: StateColumns, joints: Sequence[str]) -> None:
         raise InputError(
             f"joint state {index}: expected a stamp not before {stamps[index - 1]} ns, got {stamps[index]} ns",
             remedy="sort the states by stamp",
+        )
+    pauses = np.diff(stamps)
+    if len(pauses) and pauses.max() > LONGEST_PAUSE * 1e9:
+        index = int(np.argmax(pauses)) + 1
+        raise InputError(
+            f"joint states: mixed clocks: stamps jump by {pauses[index - 1] * 1e-9:.0f} s at state {index} of "
+            f"{len(stamps)}",
+            remedy="cut the log there, or give all states the times of one clock",
         )
     for first, last in ranges(len(stamps)):
         q = states.position[first:last]

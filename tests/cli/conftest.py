@@ -1,12 +1,43 @@
 """What replays share."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from splatctrl_cli.cli import replay_draw
 from splatctrl_cli.io import state_source
+from splatctrl_cli.records import SphereSet
+from splatctrl_cli.robot import coverage
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import UrdfFile
 from tests.cli.replay_desk import Desk, FakeSource, logged
+
+MEASURED: dict[tuple[bytes, ...], coverage.CoverageReport] = {}
+
+
+@pytest.fixture
+def coverage_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What spheres leave uncovered of a robot without meshes is measured once: that takes longer than a replay."""
+    measure = coverage.coverage_deficit
+
+    def known(urdf: UrdfFile, spheres: SphereSet, **how: Any) -> coverage.CoverageReport:
+        text = urdf.path.read_bytes()
+        if b"<mesh" in text:
+            return measure(urdf, spheres, **how)
+        names = repr((how, spheres.links)).encode()
+        key = (text, names, spheres.centers.tobytes(), spheres.radii.tobytes())
+        if key not in MEASURED:
+            MEASURED[key] = measure(urdf, spheres, **how)
+        return MEASURED[key]
+
+    monkeypatch.setattr(coverage, "coverage_deficit", known)
+
+
+@pytest.fixture
+def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of other files of the output."""
+    monkeypatch.setattr(replay_draw, "draw_replay", lambda *_: None)
 
 
 @pytest.fixture
@@ -17,7 +48,7 @@ def arm(sample_data: Path) -> RobotModel:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, sample_data: Path, monkeypatch: pytest.MonkeyPatch) -> Desk:
+def desk(tmp_path: Path, sample_data: Path, monkeypatch: pytest.MonkeyPatch, coverage_once: None) -> Desk:
     tabletop = sample_data / "tabletop"
     robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
     desk = Desk(folder=tmp_path, source=FakeSource(states=logged()), robot=robot)

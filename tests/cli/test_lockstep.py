@@ -22,6 +22,7 @@ from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
 
 SETTINGS = ["scene.max_splats=600", "scene.first_iterations=15", "scene.iterations_per_step=3"]
+pytestmark = pytest.mark.usefixtures("coverage_once", "without_plots")
 FAST = ["--threads", "1", "-q", *(word for setting in SETTINGS for word in ("--set", setting))]
 
 

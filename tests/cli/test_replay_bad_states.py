@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.io.grid import write_npz
@@ -14,6 +15,7 @@ from splatctrl_cli.records import Box
 from tests.cli.replay_desk import BALL, START, Desk, grid_seen, splats_of, write_scene
 from tests.io.make_states import START_NS, STEP_NS, states_of, write_mcap
 
+pytestmark = pytest.mark.usefixtures("without_plots")
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 
 
@@ -21,8 +23,6 @@ def replayed(desk: Desk, q: np.ndarray, stamps: list[int], *more: str) -> int:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     log = write_mcap(desk.folder / "x.mcap", states_of(q, JOINTS, stamps=stamps))
     desk.source.name = "none"
-    from splatctrl_cli.cli.main import main
-
     arguments = ["replay", str(log), *desk.robot, "--scene", str(scene), "-o", str(desk.folder / "out"), *more]
     return main([*arguments, "--max-unknown", "1"])
 
@@ -51,13 +51,43 @@ def test_a_posture_outside_the_limits_is_an_event_with_its_joint(desk: Desk) -> 
     assert (outside["worst_name"], outside["num_states"]) == ("joint4", 3) and outside["worst"] < -0.5
 
 
-def test_a_grid_without_the_robot_is_space_never_seen(
-    desk: Desk, capsys: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.parametrize("mode", ["audit", "closed-loop"])
+def test_a_grid_without_the_robot_is_refused_by_where_both_are(
+    desk: Desk, capsys: pytest.CaptureFixture[str], tmp_path: Path, mode: str
 ) -> None:
     box = Box(lower=np.array([3.0, 3.0, 0.0]), upper=np.array([3.4, 3.4, 0.4]))
     (tmp_path / "field").mkdir()
     grid = bake(splats_of(BALL), box, replace(FieldConfig(), voxel=0.1), occupancy=grid_seen(), threads=1)
     write_npz(tmp_path / "field" / "field.npz", grid)
-    assert desk.replay("--field", str(tmp_path / "field"), "-q") == 5
+    assert desk.replay("--field", str(tmp_path / "field"), "-q", "--mode", mode, "--max-unknown", "1") == 5
     (line,) = capsys.readouterr().err.splitlines()
-    assert "100.0 % of the sphere centres" in line and "first more than that at 0.000 s" in line
+    assert "--field: expected the robot in the grid from (3.00, 3.00, 0.00) to (" in line
+    assert "moving spheres outside it, the nearest by 2." in line and "check --base" in line
+
+
+@pytest.mark.parametrize("fault", ["other-clock", "empty"])
+def test_a_table_that_no_robot_wrote_is_refused_in_one_line(
+    desk: Desk, capsys: pytest.CaptureFixture[str], fault: str
+) -> None:
+    q, t = np.repeat(START[None], 10, axis=0), 0.001 * np.arange(10)
+    t[6:] += 1.7e9
+    num = 10 if fault == "other-clock" else 0
+    np.savez(desk.folder / "x.npz", t=t[:num], q=q[:num])
+    log = desk.folder / "x.toml"
+    log.write_text(f'[states]\nfile = "x.npz"\njoints = {list(JOINTS)}\ntime = "t"\nposition = ["q"]\n')
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert main(["replay", str(log), *desk.robot, "--scene", str(scene), "-o", str(desk.folder / "out")]) == 4
+    *_, line = capsys.readouterr().err.splitlines()
+    said = {
+        "other-clock": "joint states: mixed clocks: stamps jump by 1700000000 s at state 6 of 10; cut the log there",
+        "empty": "x.npz: q: expected rows, got none; record it again",
+    }[fault]
+    assert said in line
+
+
+def test_a_goal_outside_the_limits_names_the_joint(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    goal = "--goal-joints=0,0,0,-2,0,2,9"
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", goal) == 4
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "goal: joint joint7: expected within [" in line and "got 9.0000; choose another goal" in line

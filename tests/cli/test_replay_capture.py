@@ -21,6 +21,7 @@ from tests.cli.replay_desk import BALL, START, splats_of, write_scene
 from tests.io.make_log import START_NS, LogRecipe, make_log
 from tests.io.make_states import NEW_CONTROLLER, Message, header, joint_state, store_with
 
+pytestmark = pytest.mark.usefixtures("coverage_once", "without_plots")
 NUM = 60  # states, every 10 ms
 STORE = store_with(control_msgs__JointTrajectoryControllerState=NEW_CONTROLLER)
 STATE, CONTROLLER = "sensor_msgs/msg/JointState", "control_msgs/msg/JointTrajectoryControllerState"

@@ -20,6 +20,7 @@ def in_blocks_of(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
 
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
+@pytest.mark.usefixtures("without_plots")
 def test_blocks_of_any_size_give_the_same_files(desk: Desk, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
     move = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     desk.source.states = [
