@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.state_motion import CameraMotion, ImageMotion, silhouettes
-from splatctrl_cli.io.state_offset import ClockOffset, RobotPoints, estimate_clock_offset
+from splatctrl_cli.io.state_offset import ClockOffset, RobotPoints, estimate_clock_offset, states_asked
 from splatctrl_cli.io.state_source import open_states
 from splatctrl_cli.records import Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
@@ -61,6 +61,38 @@ def test_whole_images_find_it_to_the_time_between_frames(
     found = estimate_clock_offset(shifted(states, seconds), motion)
     assert found.offset_s is not None
     assert abs(found.offset_s - seconds) < INTERVAL
+
+
+@pytest.mark.parametrize("has_robot", [True, False])
+def test_the_offset_is_found_from_few_states_of_a_dense_log(
+    sample: tuple[list[JointState], ImageMotion, RobotPoints], has_robot: bool
+) -> None:
+    """Of a log at 200 Hz that goes on for minutes after its frames, with a pause between two of them."""
+    states, motion, points = sample
+    pause = 60 * 10**9
+    cameras = {}
+    for name, camera in motion.cameras.items():
+        half = len(camera.stamps_ns) // 2
+        stamps = [stamp + pause * (i >= half) for i, stamp in enumerate(camera.stamps_ns)]
+        cameras[name] = replace(camera, stamps_ns=stamps)
+    long = ImageMotion(cameras=cameras)
+    middle = sorted(motion.cameras["cam0"].stamps_ns)[len(motion.cameras["cam0"].stamps_ns) // 2]
+    known = np.array([s.stamp_ns + pause * (s.stamp_ns >= middle) for s in states])
+    stamps = np.arange(known[0], known[-1] + 120 * 10**9, 5_000_000)
+    q = np.array([state.position for state in states])
+    position = np.column_stack([np.interp(stamps, known, q[:, j]) for j in range(q.shape[1])])
+    centers = np.array(points.centers[np.searchsorted(known, stamps, side="right") - 1][:, :8])
+
+    def found_from(index: np.ndarray) -> ClockOffset:
+        some = [
+            JointState(stamp_ns=int(stamps[i]), position=position[i], velocity=np.zeros(q.shape[1])) for i in index
+        ]
+        robot = RobotPoints(centers=centers[index], radii=points.radii[:8]) if has_robot else None
+        return estimate_clock_offset(some, long, robot)
+
+    asked = states_asked(stamps, long)
+    assert len(asked) < len(stamps) // 2
+    assert found_from(asked) == found_from(np.arange(len(stamps)))
 
 
 def refused(found: ClockOffset) -> str:
