@@ -152,9 +152,9 @@ def _write_shot(folder: Path, shot: Shot, row: dict[str, str], camera: Mapping[s
         color = encoded(cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
     is_png = color.startswith(b"\x89PNG")
     color_name = f"color/{frame.camera}/{stem}.{'png' if is_png else 'jpg'}"
-    counts = _counts(frame.depth, unit, is_exact=shot.depth_unit is not None)
-    depth_name = f"depth/{frame.camera}/{stem}.{'npy' if counts is None else 'png'}"
-    files = {color_name: color, depth_name: _npy(frame.depth) if counts is None else encoded(counts)}
+    kind, depth = _depth_file(shot, unit)
+    depth_name = f"depth/{frame.camera}/{stem}.{kind}"
+    files = {color_name: color, depth_name: depth}
     named = {"color": color_name, "depth": depth_name}
     if frame.human is not None:
         named["human"] = f"human/{frame.camera}/{stem}.png"
@@ -165,6 +165,14 @@ def _write_shot(folder: Path, shot: Shot, row: dict[str, str], camera: Mapping[s
         path.write_bytes(data)
         sums.append((hashlib.sha256(data).hexdigest(), name))
     return Entry(row=row | named, sums=sums)
+
+
+def _depth_file(shot: Shot, unit: float) -> tuple[str, bytes]:
+    """Suffix and bytes of the depth image: the recorded PNG where it counts in the camera's unit."""
+    if shot.depth_file is not None and shot.depth_unit == unit:
+        return "png", shot.depth_file
+    counts = _counts(shot.frame.depth, unit, is_exact=shot.depth_unit is not None)
+    return ("npy", _npy(shot.frame.depth)) if counts is None else ("png", encoded(counts))
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:

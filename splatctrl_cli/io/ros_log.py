@@ -8,6 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.io.image_rate import dropped, first_of_each
@@ -20,7 +22,7 @@ from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.pairing import pair_by_stamp
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
-from splatctrl_cli.io.shot import Shot, check_depth, is_kept, merged
+from splatctrl_cli.io.shot import Shot, check_depth, is_kept, is_png, merged
 from splatctrl_cli.io.survey import Survey, survey
 from splatctrl_cli.records import Float64, JointState, LossReport, Record, RgbdFrame, UInt8
 
@@ -254,8 +256,10 @@ def _shot(planned: _Planned, color: ImageMessage, depth: ImageMessage, human: UI
         T_world_camera=planned.T_world_camera,
         human=human,
     )
+    is_own_png = is_counts and camera.undistortion is None and depth.pixels.dtype == np.uint16
     return Shot(
         frame=frame,
+        depth_file=depth.compressed if is_own_png and is_png(depth.compressed) else None,
         color_file=color.compressed if camera.undistortion is None and is_kept(color.compressed) else None,
         depth_unit=_scale(depth, scale) if is_counts else None,
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",

@@ -17,6 +17,7 @@ class Shot:
     """A frame and its source.
 
     color_file: the bytes of a JPEG or PNG that decode to exactly `frame.color`, None where there are none;
+    depth_file: those of a 16-bit PNG of which `frame.depth` is exactly ``counts * float32(depth_unit)``, or None;
     depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
     origin: where it came from, in words.
     """
@@ -25,6 +26,7 @@ class Shot:
     color_file: bytes | None
     depth_unit: float | None
     origin: str
+    depth_file: bytes | None = None
 
 
 class ShotSource(RecordSource, Protocol):
@@ -47,6 +49,11 @@ class ShotSource(RecordSource, Protocol):
 def is_kept(data: bytes | None) -> bool:
     """Whether an image file's bytes are of a kind that captures hold: JPEG or PNG."""
     return data is not None and data.startswith((b"\x89PNG\r\n", b"\xff\xd8\xff"))
+
+
+def is_png(data: bytes | None) -> bool:
+    """Whether these are the bytes of a PNG file."""
+    return data is not None and data.startswith(b"\x89PNG\r\n")
 
 
 def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot | JointState]:
