@@ -6,7 +6,7 @@ depth_visual_0000.png (above 10 where the depth counts). Lengths there are milli
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +42,9 @@ class DtuView:
     mask: Bool | None = None
 
 
+Shrink = Callable[[DtuView], DtuView]
+
+
 @dataclass(frozen=True, kw_only=True)
 class DtuScan:
     """The views of one scan, their numbers, the files that were read, and the names of views without_depth."""
@@ -53,8 +56,12 @@ class DtuScan:
     without_depth: tuple[str, ...]
 
 
-def read_dtu(root: Path, scan: str | None = None, masks: Path | None = None) -> DtuScan:
+def read_dtu(
+    root: Path, scan: str | None = None, masks: Path | None = None, shrink: Shrink = lambda view: view
+) -> DtuScan:
     """The views of scan `scan` (default: the only one) of a DTU folder; `masks` holds NNN.png by view number.
+
+    `shrink` makes of each view the one that is kept, before the next is read.
 
     K is scaled to the images as MVSNet's own loaders do (the file's K may be for 1600x1200 or for a quarter of the
     image). Depth of another size than the image is sampled, not blended: from 1600x1200 at the pixels the image
@@ -80,16 +87,15 @@ def read_dtu(root: Path, scan: str | None = None, masks: Path | None = None) -> 
         depth = read_depth(depth_path, visual, size)
         mask_path = None if masks is None else _mask_file(masks, number)
         numbers.append(number)
-        views.append(
-            DtuView(
-                name=path.stem,
-                color=color,
-                depth=depth,
-                intrinsics=_fitted(K, size, camera),
-                T_world_camera=T_world_camera,
-                mask=None if mask_path is None else read_mask(mask_path, size),
-            )
+        view = DtuView(
+            name=path.stem,
+            color=color,
+            depth=depth,
+            intrinsics=_fitted(K, size, camera),
+            T_world_camera=T_world_camera,
+            mask=None if mask_path is None else read_mask(mask_path, size),
         )
+        views.append(shrink(view))
         files += [path, camera, depth_path, *([visual] if visual.exists() else [])]
         files += [] if mask_path is None else [mask_path]
     if not views:

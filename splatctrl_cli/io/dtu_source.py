@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.io.dtu import DtuScan, DtuView, read_dtu
+from splatctrl_cli.io.dtu import DtuScan, DtuView, Shrink, read_dtu
 from splatctrl_cli.io.idr import idr_scans, read_idr
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.protocols import ScoreProtocol, Split
@@ -47,10 +47,14 @@ class DtuSource:
     ) -> None:
         self._root = root
         self._layout = "IDR" if not (root / "Rectified").is_dir() and idr_scans(root) else "MVSNet"
-        found = self._read(scan, masks, depths)
+        found = self._read(
+            scan,
+            masks,
+            depths,
+            lambda view: shrunk(view, _factor(view, protocol) if downscale is None else downscale),
+        )
         self._name, self._files = found.name, found.files
-        factor = _factor(found.views[0], protocol) if downscale is None else downscale
-        self._views = {n: shrunk(view, factor) for n, view in zip(found.numbers, found.views, strict=True)}
+        self._views = dict(zip(found.numbers, found.views, strict=True))
         numbers = tuple(self._views)
         if protocol is not None:
             if holdout:
@@ -62,14 +66,14 @@ class DtuSource:
         notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in found.without_depth]
         self._loss = LossReport(unpaired_color=len(notes), notes=notes)
 
-    def _read(self, scan: str | None, masks: Path | None, depths: Path | None) -> DtuScan:
+    def _read(self, scan: str | None, masks: Path | None, depths: Path | None, shrink: Shrink) -> DtuScan:
         if self._layout == "MVSNet":
             if depths is not None:
                 raise UsageError(f"--depths {depths}: MVSNet's layout has its own", remedy="leave it out")
-            return read_dtu(self._root, scan, masks)
+            return read_dtu(self._root, scan, masks, shrink)
         if masks is not None:
             raise UsageError(f"--masks {masks}: IDR's layout has its own", remedy="leave it out")
-        return read_idr(self._root, scan, depths)
+        return read_idr(self._root, scan, depths, shrink)
 
     @property
     def name(self) -> str:

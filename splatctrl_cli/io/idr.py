@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.dtu import MILLIMETRES, DtuScan, DtuView, read_depth, read_image, read_mask
+from splatctrl_cli.io.dtu import MILLIMETRES, DtuScan, DtuView, Shrink, read_depth, read_image, read_mask
 from splatctrl_cli.records import Float64, Intrinsics
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
@@ -31,10 +31,13 @@ def is_idr(folder: Path) -> bool:
     return any((folder / name).is_file() for name in CAMERAS)
 
 
-def read_idr(root: Path, scan: str | None = None, depths: Path | None = None) -> DtuScan:
+def read_idr(
+    root: Path, scan: str | None = None, depths: Path | None = None, shrink: Shrink = lambda view: view
+) -> DtuScan:
     """The views of scan `scan` (default: the only one); `depths` holds their depth maps (default: SCAN/depth).
 
-    A view without a depth map stays, with a depth of 0 everywhere. Raises InputError naming the file.
+    `shrink` makes of each view the one that is kept. A view without a depth map stays, with a depth of 0 everywhere.
+    Raises InputError naming the file.
     """
     scans = idr_scans(root)
     if scan is None and len(scans) == 1:
@@ -65,16 +68,15 @@ def read_idr(root: Path, scan: str | None = None, depths: Path | None = None) ->
             files += [depth_path, *([visual] if visual.is_file() else [])]
         else:
             without_depth.append(image.name)
-        views.append(
-            DtuView(
-                name=image.stem,
-                color=color,
-                depth=depth,
-                intrinsics=_intrinsics(K, size, path),
-                T_world_camera=T_world_camera,
-                mask=read_mask(masks[number], size) if masks else None,
-            )
+        view = DtuView(
+            name=image.stem,
+            color=color,
+            depth=depth,
+            intrinsics=_intrinsics(K, size, path),
+            T_world_camera=T_world_camera,
+            mask=read_mask(masks[number], size) if masks else None,
         )
+        views.append(shrink(view))
     if depths is not None and len(without_depth) == len(views):
         raise InputError(f"{depths}: expected depth_map_0000.pfm and so on, got none")
     return DtuScan(

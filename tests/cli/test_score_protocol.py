@@ -12,32 +12,16 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.records import Float64
-from tests.io.make_idr import write_idr
+from tests.io.make_idr import half_size, write_idr
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
 HOLDOUT = "holdout:every4"
 
 
-def half(view: DtuView) -> DtuView:
-    """The view at half the size, with the middle as its mask, for speed."""
-    k = view.intrinsics
-    mask = np.zeros((k.height // 2, k.width // 2), np.bool_)
-    mask[20:-20, 30:-30] = True
-    return replace(
-        view,
-        color=np.ascontiguousarray(view.color[::2, ::2]),
-        depth=np.ascontiguousarray(view.depth[::2, ::2]),
-        intrinsics=replace(
-            k, fx=k.fx / 2, fy=k.fy / 2, cx=k.cx / 2, cy=k.cy / 2, width=k.width // 2, height=k.height // 2
-        ),
-        mask=mask,
-    )
-
-
 @pytest.fixture(scope="module")
 def views(request: pytest.FixtureRequest) -> list[DtuView]:
     sample_data: Path = request.getfixturevalue("sample_data")
-    return [half(view) for view in read_dtu(sample_data / "dtu").views]
+    return [half_size(view) for view in read_dtu(sample_data / "dtu").views]
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +60,8 @@ def test_a_scan_scores_the_same_through_both_layouts(place: Path, capsys: pytest
     for name, value in one["metrics"].items():
         assert other["metrics"][name] == pytest.approx(value, rel=1e-4), name
     assert 10 < one["metrics"]["psnr_masked"] < 60
+    first = json.loads((place / "scene" / "run.json").read_text())["metrics"]["first_frames"]
+    assert [(kept["camera"], kept["stamp_ns"]) for kept in first] == [("camera", 1)]
     assert one["recording"]["differences"] == other["recording"]["differences"] == []
 
 
@@ -189,6 +175,8 @@ def test_the_surface_is_compared_with_a_cloud_in_millimetres(
     out = capsys.readouterr().out
     assert "surface: accuracy " in out
     assert "1 unit = 0.001 m; points thinned to 4 mm; means below 20 mm" in out
+    blind = scored(capsys, place, "blind", *given)["metrics"]
+    assert blind["accuracy"] == pytest.approx(metrics["accuracy"], rel=1e-3), "the surface is rendered, not recorded"
     moved = scored(capsys, place, "mvsnet", *given[:4], "--cloud-max", "0.004")["metrics"]
     assert moved["accuracy"] < metrics["accuracy"]
     assert moved["accuracy_beyond"] > metrics["accuracy_beyond"]

@@ -69,3 +69,10 @@ def test_only_training_cameras_count() -> None:
 
 def test_nothing_is_scored_where_no_frame_is() -> None:
     assert list(views_to_score(FakeSource([]), scoring=["a"], training=["b"], has_clock=True)) == []
+
+
+def test_stamps_that_number_the_views_name_them() -> None:
+    views = views_to_score(
+        FakeSource(RECORDS), scoring=["held/out"], training=["a"], has_clock=False, numbered_by_stamp=True
+    )
+    assert [view.name for view in views] == ["held_out-0000", "held_out-0001", "held_out-0003"]
