@@ -25,7 +25,7 @@ class SourceOptions:
     world_frame: frame of poses (default: the root of the tf tree). cameras: only these (default: all).
     camera_topics: topics by camera name, instead of those found. camera_poses: T_world_camera of fixed cameras as
     x, y, z, qx, qy, qz, qw, instead of those recorded. human_topics: image topics by camera name, not 0 where a
-    pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, where the input has none. depth_scale:
+    pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, instead of those recorded. depth_scale:
     [m per count] of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an
     image folder that become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging.
     """

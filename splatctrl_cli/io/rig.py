@@ -198,7 +198,7 @@ class _Builder:
     def _calibration(self, info: str, image_topic: str) -> Calibration:
         calibration = self._survey.topics[info].calibration if info else None
         given = self._options.intrinsics.get(self._topics.name)
-        if calibration is None and given is not None:
+        if given is not None and image_topic == self._topics.color:
             return self._given(given, image_topic)
         if calibration is None:
             there = [t.topic.name for t in self._survey.of_type(CAMERA_INFO)]

@@ -133,6 +133,29 @@ def test_rotated_depth_is_turned_back(tmp_path: Path) -> None:
     assert frames_of(list(open_source(path).records()))[0].depth == pytest.approx(0.8)
 
 
+@pytest.mark.parametrize("suffix", ["npy", "tiff"])
+def test_float_depth_files_are_read_in_their_unit(tmp_path: Path, suffix: str) -> None:
+    path = described(tmp_path)
+    path.write_text(
+        path.read_text()
+        .replace("depth/*.png", f"depth/*.{suffix}")
+        .replace("[depth]\n", '[depth]\nencoding = "float32"\n')
+    )
+    values = np.full((6, 8), 12345.6, np.float32)
+    values[0, 0], values[0, 1] = np.nan, -1.0
+    for name in ("7", "8", "12"):
+        file = tmp_path / f"images/depth/{name}.{suffix}"
+        if suffix == "npy":
+            np.save(file, values)
+        else:
+            cv2.imwrite(str(file), values)
+    source = open_source(path)
+    depth = frames_of(list(source.records()))[0].depth
+    assert depth[0, :2].tolist() == [0, 0]
+    assert depth[1, 1] == np.float32(12345.6) * np.float32(1e-4)
+    assert source.loss.invalid_depth == 6
+
+
 def test_files_without_partner_are_counted(tmp_path: Path) -> None:
     path = described(tmp_path)
     (tmp_path / "images/depth/8.png").unlink()

@@ -5,8 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.bag_log import open_raw_log
+from splatctrl_cli.io.raw_log import Damage
 from splatctrl_cli.io.source import CameraTopics, SourceOptions, open_source
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from tests.io.make_log import (
@@ -20,6 +23,7 @@ from tests.io.make_log import (
     make_log,
     mask_pixels,
 )
+from tests.io.test_bag_log import as_ros1_bag, assert_same
 
 
 def records_of(path: Path, options: SourceOptions | None = None) -> list[Record]:
@@ -350,3 +354,36 @@ def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) 
     assert human is not None
     assert set(np.unique(human)) == {0, 1}
     assert not np.array_equal(human, mask_pixels(0) > 0)
+
+
+def test_ros1_messages_in_an_mcap_give_the_same_records(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    bag = as_ros1_bag(log, tmp_path / "log.bag")
+    converted = tmp_path / "ros1.mcap"
+    with converted.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros1")
+        channels: dict[str, int] = {}
+        for message in open_raw_log(bag).messages(Damage()):
+            topic = message.topic
+            if topic.name not in channels:
+                name = topic.type_name.replace("/msg/", "/")
+                schema = writer.register_schema(name=name, encoding="ros1msg", data=topic.definition.encode())
+                channels[topic.name] = writer.register_channel(
+                    topic=topic.name, message_encoding="ros1", schema_id=schema
+                )
+            time = message.log_time_ns
+            writer.add_message(channels[topic.name], log_time=time, publish_time=time, data=message.data)
+        writer.finish()
+    assert_same(records_of(log), records_of(converted))
+
+
+def test_a_lens_that_a_person_gives_stands_in_for_camera_info(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_info=False))
+    frame = frames_of(log, SourceOptions(intrinsics={"cam0": (31.0, 32.0, 15.0, 11.0)}))[0]
+    k = frame.intrinsics
+    assert (k.fx, k.fy, k.cx, k.cy, k.width, k.height) == (31.0, 32.0, 15.0, 11.0, WIDTH, HEIGHT)
+    assert "give --intrinsics cam0=FX,FY,CX,CY" in refusal(log)
+    assert "no camera 'cam7'" in refusal(log, SourceOptions(intrinsics={"cam7": (31.0, 32.0, 15.0, 11.0)}))
+    recorded = make_log(tmp_path / "whole.mcap")
+    assert frames_of(recorded, SourceOptions(intrinsics={"cam0": (31.0, 32.0, 15.0, 11.0)}))[0].intrinsics == k
