@@ -61,7 +61,7 @@ class Bag1Log:
             elif record.kind == CHUNK:
                 yield from self._chunk(record, budget, damage, names)
             elif not record.is_cut:
-                yield from self._read(record.kind, record.fields, record.body, damage, names)
+                yield from self._read(record.kind, record.fields, record.body, record.offset, damage, names)
         if num_chunks is None or num_indexed < num_chunks:
             damage.add(f"{self.path.name}: its index is not whole")
 
@@ -76,13 +76,13 @@ class Bag1Log:
             else:
                 content = budget.unpacked(record.body, compression, size)
             for kind, fields, body in records_in(content):
-                yield from self._read(kind, fields, body, damage, names)
+                yield from self._read(kind, fields, body, record.offset, damage, names)
         except (BadBlockError, ValueError) as error:
             if not record.is_cut:  # the cut has been counted
                 damage.add(f"{self.path.name}: the chunk at byte {record.offset} was left out: {error}")
 
     def _read(
-        self, kind: int, fields: Fields, body: bytes, damage: Damage, names: Collection[str] | None
+        self, kind: int, fields: Fields, body: bytes, offset: int, damage: Damage, names: Collection[str] | None
     ) -> Iterator[RawMessage]:
         if kind == CONNECTION:
             self._connect(fields, body, damage)
@@ -92,7 +92,8 @@ class Bag1Log:
                 damage.add(f"{self.path.name}: a message without a connection or time")
             elif names is None or topic.name in names:
                 seconds, nanoseconds = int.from_bytes(time[:4], "little"), int.from_bytes(time[4:], "little")
-                yield RawMessage(topic=topic, log_time_ns=seconds * _SECOND + nanoseconds, data=body)
+                at = seconds * _SECOND + nanoseconds
+                yield RawMessage(topic=topic, log_time_ns=at, data=body, file=self.path.name, offset=offset)
 
     def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:
         told = fields_of(body)

@@ -14,10 +14,16 @@ JOURNAL = "ingest.jsonl"  # in the folder while it is partial
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A frame that is on disk: its row of frames.csv, and (sha256, name) of its files."""
+    """A frame that is on disk: its row of frames.csv, (sha256, name) of its files, its row of provenance.csv."""
 
     row: Mapping[str, str]
     sums: Sequence[tuple[str, str]]
+    provenance: Mapping[str, str]
+
+
+def _entry(line: Mapping[str, Any]) -> Entry:
+    sums = [(digest, name) for digest, name in line["sums"]]
+    return Entry(row=line["row"], sums=sums, provenance=line["provenance"])
 
 
 class Journal:
@@ -28,7 +34,7 @@ class Journal:
         self._path = folder / JOURNAL
         self._files = ExitStack()
         self.num_entries = 0
-        self.has_mask = False
+        self.has_mask = self.has_provenance = False
         folder.mkdir(parents=True, exist_ok=True)
         if not self._path.is_file():
             self._path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
@@ -48,30 +54,31 @@ class Journal:
         found = next(self._kept, None)
         if found is None:
             return None
-        self._count(found["row"])
-        return Entry(row=found["row"], sums=[(digest, name) for digest, name in found["sums"]])
+        entry = _entry(found)
+        self._count(entry)
+        return entry
 
     def add(self, entry: Entry) -> None:
         """A frame whose files are written."""
-        self._count(entry.row)
-        self._stream.write(json.dumps({"row": entry.row, "sums": entry.sums}) + "\n")
+        self._count(entry)
+        self._stream.write(json.dumps({"row": entry.row, "sums": entry.sums, "provenance": entry.provenance}) + "\n")
         self._stream.flush()
 
     def entries(self) -> Iterator[Entry]:
         """All so far, in their order."""
         lines = _lines(self._path)
         next(lines, None)
-        for line in lines:
-            yield Entry(row=line["row"], sums=[(digest, name) for digest, name in line["sums"]])
+        yield from map(_entry, lines)
 
     def remove(self) -> None:
         """Once everything is written."""
         self._files.close()
         self._path.unlink()
 
-    def _count(self, row: Mapping[str, str]) -> None:
+    def _count(self, entry: Entry) -> None:
         self.num_entries += 1
-        self.has_mask |= "human" in row
+        self.has_mask |= "human" in entry.row
+        self.has_provenance |= bool(entry.provenance)
 
     def _cut(self) -> None:
         """Leave out a last line that was not finished."""

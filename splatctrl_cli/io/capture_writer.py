@@ -28,6 +28,9 @@ from splatctrl_cli.records import Float32, JointState, LossReport
 FORMAT, VERSION = "splatctrl-capture", 1
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
 MASKED_COLUMNS = (*COLUMNS, "human")  # where the recording has masks
+PROVENANCE = "provenance.csv"
+PLACE = ("file", "offset", "log_time_ns")
+PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
 FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
 FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
 PNG_LEVEL = 3  # zlib; 3 is half the time of OpenCV's default 6 and 5 % larger on apc_shelf depth
@@ -104,13 +107,19 @@ def write_capture(
 
 
 def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None) -> None:
-    """frames.csv, the joint topics, capture.json and SHA256SUMS, which names everything but itself."""
+    """frames.csv, provenance.csv, joint topics, capture.json and SHA256SUMS, which names everything but itself."""
     names = ["joints.npz", "frames.csv"]
     columns = MASKED_COLUMNS if journal.has_mask else COLUMNS
     with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(entry.row for entry in journal.entries())
+    if journal.has_provenance:
+        names.append(PROVENANCE)
+        with (folder / PROVENANCE).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, PROVENANCE_COLUMNS, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(entry.provenance for entry in journal.entries())
     if topics is not None and topics.topics:
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
@@ -164,7 +173,18 @@ def _write_shot(folder: Path, shot: Shot, row: dict[str, str], camera: Mapping[s
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
         sums.append((hashlib.sha256(data).hexdigest(), name))
-    return Entry(row=row | named, sums=sums)
+    return Entry(row=row | named, sums=sums, provenance=_provenance(shot, color_name, depth_name))
+
+
+def _provenance(shot: Shot, color: str, depth: str) -> dict[str, str]:
+    """Where the images of a frame were recorded; a byte that is not known stays empty."""
+    if not shot.places:
+        return {}
+    found = {"color": color, "depth": depth}
+    for kind, place in zip(("color", "depth"), shot.places, strict=False):
+        offset = "" if place.offset < 0 else str(place.offset)
+        found |= {f"{kind}_file": place.file, f"{kind}_offset": offset, f"{kind}_log_time_ns": str(place.log_time_ns)}
+    return found
 
 
 def _depth_file(shot: Shot, unit: float) -> tuple[str, bytes]:

@@ -49,7 +49,7 @@ class Db3Log:
                 if topic is None or not isinstance(data, bytes) or not isinstance(log_time_ns, int):
                     damage.add(f"{self.path.name}: a message without topic, time or data")
                 elif names is None or topic.name in names:
-                    yield RawMessage(topic=topic, log_time_ns=log_time_ns, data=data)
+                    yield RawMessage(topic=topic, log_time_ns=log_time_ns, data=data, file=self.path.name)
 
     def _rows(self, database: sqlite3.Connection, damage: Damage) -> Iterator[tuple[object, object, object]]:
         last, hole = -(1 << 62), 1  # hole: how many rows to pass over next

@@ -81,7 +81,7 @@ class McapLog:
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
             elif part.opcode == MESSAGE and part.content:
-                message = self._message(part.content, 0, len(part.content), damage, names)
+                message = self._message(part.content, 0, len(part.content), part.offset, damage, names)
                 if message is not None:
                     yield message
             elif part.opcode in {SCHEMA, CHANNEL}:
@@ -108,7 +108,7 @@ class McapLog:
                     damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are no record")
                 return
             if opcode == MESSAGE:
-                message = self._message(records, start, at, damage, names)
+                message = self._message(records, start, at, offset, damage, names)
                 if message is not None:
                     yield message
             elif opcode in {SCHEMA, CHANNEL}:
@@ -131,9 +131,9 @@ class McapLog:
         return records
 
     def _message(
-        self, records: bytes, start: int, end: int, damage: Damage, names: Collection[str] | None
+        self, records: bytes, start: int, end: int, offset: int, damage: Damage, names: Collection[str] | None
     ) -> RawMessage | None:
-        """The message in these bytes of `records`; None where it is not wanted or no message."""
+        """The message in these bytes of `records`, found at `offset`; None where it is not wanted or no message."""
         if end - start < _MESSAGE.size:
             damage.add(f"{self.path.name}: a message record of {end - start} bytes")
             return None
@@ -144,7 +144,8 @@ class McapLog:
             return None
         if names is not None and topic.name not in names:
             return None
-        return RawMessage(topic=topic, log_time_ns=log_time_ns, data=records[start + _MESSAGE.size : end])
+        data = records[start + _MESSAGE.size : end]
+        return RawMessage(topic=topic, log_time_ns=log_time_ns, data=data, file=self.path.name, offset=offset)
 
     def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
         """Take a schema, a channel or the statistics."""

@@ -28,11 +28,17 @@ class Topic:
 
 @dataclass(frozen=True, kw_only=True)
 class RawMessage:
-    """One message: its topic, the time it was logged [ns] and its bytes."""
+    """One message: its topic, the time it was logged [ns] and its bytes.
+
+    file and offset say where it was read: the byte at which its record, or that of its chunk, begins; -1 where the
+    container has no such place.
+    """
 
     topic: Topic
     log_time_ns: int
     data: bytes
+    file: str = ""
+    offset: int = -1
 
 
 @dataclass(kw_only=True)

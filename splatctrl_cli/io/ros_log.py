@@ -22,7 +22,7 @@ from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.pairing import pair_by_stamp
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
-from splatctrl_cli.io.shot import Shot, check_depth, is_kept, is_png, merged
+from splatctrl_cli.io.shot import Place, Shot, check_depth, is_kept, is_png, merged
 from splatctrl_cli.io.survey import Survey, survey
 from splatctrl_cli.records import Float64, JointState, LossReport, Record, RgbdFrame, UInt8
 
@@ -173,10 +173,10 @@ class RosLogSource:
     def _shots(self) -> Iterator[Shot]:
         images = _PlannedImages(self._log, self._plan)
         checked: set[str] = set()
-        for planned, (color, depth, *masks) in images.of_frames(self._damage):
+        for planned, (color, depth, *masks), places in images.of_frames(self._damage):
             human = self._human(planned.camera, masks[0]) if masks else None
             self._num_invalid += num_invalid(depth.pixels)
-            shot = _shot(planned, color, depth, human)
+            shot = replace(_shot(planned, color, depth, human), places=places)
             camera = planned.camera
             if camera.name not in checked:
                 scale = _scale(depth, camera.depth_scale)
@@ -201,8 +201,8 @@ class _PlannedImages:
             for key in _keys(planned):
                 self._uses[key] = self._uses.get(key, 0) + 1
 
-    def of_frames(self, damage: Damage) -> Iterator[tuple[_Planned, list[ImageMessage]]]:
-        """Yield each planned frame with its colour, depth and mask; one that does not decode goes to `damage`."""
+    def of_frames(self, damage: Damage) -> Iterator[tuple[_Planned, list[ImageMessage], tuple[Place, ...]]]:
+        """Yield each planned frame with its colour, depth and mask, and their places; what fails goes to `damage`."""
         topics = {key[0] for key in self._uses}
         numbers = dict.fromkeys(topics, 0)
         decoder = MessageDecoder()
@@ -222,11 +222,15 @@ class _PlannedImages:
                 except UndecodableMessageError as error:
                     damage.add(f"camera {planned.camera.name} at {planned.stamp_ns} ns: {error}")
                     continue
-                yield planned, images
+                yield planned, images, tuple(_place(message) for message in taken)
 
     def _take(self, key: tuple[str, int]) -> RawMessage:
         self._uses[key] -= 1
         return self._held[key] if self._uses[key] else self._held.pop(key)
+
+
+def _place(message: RawMessage) -> Place:
+    return Place(file=message.file, offset=message.offset, log_time_ns=message.log_time_ns)
 
 
 def _keys(planned: _Planned) -> list[tuple[str, int]]:

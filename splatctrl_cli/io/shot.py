@@ -13,19 +13,32 @@ PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
 
 
 @dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where an image was recorded.
+
+    offset: the byte of the file at which its record, or that of its chunk, begins; -1 where there is no such place.
+    """
+
+    file: str
+    offset: int
+    log_time_ns: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class Shot:
     """A frame and its source.
 
     color_file: the bytes of a JPEG or PNG that decode to exactly `frame.color`, None where there are none;
     depth_file: those of a 16-bit PNG of which `frame.depth` is exactly ``counts * float32(depth_unit)``, or None;
     depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
-    origin: where it came from, in words.
+    origin: where it came from, in words; places: of the colour and the depth message, empty where there are none.
     """
 
     frame: RgbdFrame
     color_file: bytes | None
     depth_unit: float | None
     origin: str
+    places: tuple[Place, ...] = ()
     depth_file: bytes | None = None
 
 

@@ -1,5 +1,6 @@
 """A capture gives back what was put in, to the bit where it can, and notices damage."""
 
+import csv
 import hashlib
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,10 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.capture import write_capture
+from splatctrl_cli.io.mcap_records import CHUNK
 from splatctrl_cli.io.source import SourceOptions, open_source
 from splatctrl_cli.records import JointState, Record, RgbdFrame
-from tests.io.make_log import LogRecipe, make_log
+from tests.io.make_log import FRAME_NS, START_NS, LogRecipe, make_log
 
 
 def captured(tmp_path: Path, recipe: LogRecipe, name: str = "x.capture") -> tuple[list[Record], Path]:
@@ -73,7 +75,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     _, second = captured(tmp_path, LogRecipe(), "b.capture")
     files = sorted(p.relative_to(first) for p in first.rglob("*") if p.is_file())
     assert files == sorted(p.relative_to(second) for p in second.rglob("*") if p.is_file())
-    assert len(files) == 14
+    assert len(files) == 15
     assert all((first / name).read_bytes() == (second / name).read_bytes() for name in files)
 
 
@@ -192,3 +194,28 @@ def test_a_damaged_mask_is_counted_and_its_frame_kept(tmp_path: Path) -> None:
     frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
     assert [frame.human is not None for frame in frames] == [True, False, True, True, True]
     assert source.loss.damaged == 1
+
+
+def test_provenance_says_where_each_image_lies(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe(chunk_size=512))
+    with (folder / "provenance.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    log = (tmp_path / "log.mcap").read_bytes()
+    assert [row["color"] for row in rows] == [f"color/cam0/{i:06d}.jpg" for i in range(5)]
+    assert {row["color_file"] for row in rows} | {row["depth_file"] for row in rows} == {"log.mcap"}
+    assert [int(row["color_log_time_ns"]) for row in rows] == [START_NS + i * FRAME_NS for i in range(5)]
+    assert [int(row["depth_log_time_ns"]) for row in rows] == [START_NS + i * FRAME_NS + 3_000_000 for i in range(5)]
+    offsets = [int(row["color_offset"]) for row in rows]
+    assert sorted(set(offsets)) == offsets
+    for row, offset in zip(rows, offsets, strict=True):
+        assert log[offset] == CHUNK
+        first, last = (int.from_bytes(log[offset + at : offset + at + 8], "little") for at in (9, 17))
+        assert first <= int(row["color_log_time_ns"]) <= last
+
+
+def test_a_capture_without_provenance_is_read_as_before(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, LogRecipe())
+    (folder / "provenance.csv").unlink()
+    sums = (folder / "SHA256SUMS").read_text().splitlines(keepends=True)
+    (folder / "SHA256SUMS").write_text("".join(line for line in sums if "provenance" not in line))
+    assert_same(before, list(open_source(folder).records()))
