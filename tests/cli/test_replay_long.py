@@ -1,6 +1,7 @@
 """Replays whose states come in blocks: the same to the bit, and events that cross a border are one."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +22,9 @@ def in_blocks_of(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
 @pytest.mark.usefixtures("without_plots")
-def test_blocks_of_any_size_give_the_same_files(desk: Desk, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+def test_blocks_of_any_size_give_the_same_files(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, sample_data: Path, mode: str
+) -> None:
     move = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     desk.source.states = [
         JointState(stamp_ns=s.stamp_ns, position=s.position, velocity=move) for s in logged(START + move, num=24)
@@ -33,10 +36,11 @@ def test_blocks_of_any_size_give_the_same_files(desk: Desk, monkeypatch: pytest.
         (SECOND, splats_of(BALL, near)),
         (SECOND * 2, splats_of(BALL)),
     )
-    follow = ("--follow",) if mode == "closed-loop" else ()
+    truth = ("--truth", str(sample_data / "tabletop" / "truth.json"))
+    more = {"audit": truth, "open-loop": (), "closed-loop": ("--follow",)}[mode]
     for num in (1, 7, 10_000):
         in_blocks_of(monkeypatch, num)
-        assert desk.replay("--scene", str(scene), "-q", "--mode", mode, *follow, out=str(num)) == 0
+        assert desk.replay("--scene", str(scene), "-q", "--mode", mode, *more, out=str(num)) == 0
     for file in FILES:
         whole = (desk.folder / "10000" / file).read_bytes()
         assert all((desk.folder / out / file).read_bytes() == whole for out in ("1", "7")), file

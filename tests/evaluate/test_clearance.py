@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from splatctrl_cli.evaluate import clearance as module
 from splatctrl_cli.evaluate.clearance import clearance_agreement, intervals_below, least, mark_seen
 from splatctrl_cli.records import Intrinsics, RgbdFrame
 
@@ -47,7 +48,8 @@ def test_without_a_state_to_compare_there_is_no_figure() -> None:
     assert agreement.num_states == 0 and agreement.median is None and agreement.share_within is None
 
 
-def test_a_frame_shows_a_surface_to_later_states_only() -> None:
+@pytest.mark.parametrize("block", [1, 4, 6])
+def test_a_frame_shows_a_surface_to_later_states_only(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
     frame = RgbdFrame(
         stamp_ns=20,
         camera="cam0",
@@ -56,6 +58,7 @@ def test_a_frame_shows_a_surface_to_later_states_only() -> None:
         intrinsics=Intrinsics(fx=3.0, fy=3.0, cx=1.0, cy=1.0, width=3, height=3),
         T_world_camera=np.eye(4),
     )
+    monkeypatch.setattr(module, "BLOCK", block)
     points = np.tile([0.0, 0.0, 1.0], (6, 1))
     points[5] = [0.0, 0.0, 1.5]
     seen = np.zeros(6, bool)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.time_axis import SHORTEST, envelope, spans
+from splatctrl_cli.evaluate import time_axis
+from splatctrl_cli.evaluate.time_axis import SHORTEST, column, envelope, spans
 
 
 def test_a_short_series_is_drawn_as_it_is() -> None:
@@ -11,6 +12,13 @@ def test_a_short_series_is_drawn_as_it_is() -> None:
     of = envelope(seconds, values, columns=10)
     assert of.is_exact
     np.testing.assert_array_equal(of.lowest, values)
+
+
+@pytest.mark.parametrize("block", [1, 3, 7, 50])
+def test_a_column_is_read_by_blocks(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
+    monkeypatch.setattr(time_axis, "BLOCK", block)
+    rows = np.arange(14.0).reshape(7, 2)
+    np.testing.assert_array_equal(column(rows, 1), rows[:, 1])
 
 
 def test_a_long_series_keeps_its_extremes_where_they_are() -> None:
