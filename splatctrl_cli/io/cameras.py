@@ -1,6 +1,8 @@
 """RGB-D cameras in a log: which colour, depth and CameraInfo topics belong together, by name and by content."""
 
+import re
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from splatctrl_cli.io.realsense import device_of
 from splatctrl_cli.io.survey import Calibration, Survey, TopicSurvey
 
 _TRANSPORTS = {"compressed", "compressedDepth"}
+_LONGEST_NAME = 80  # characters of a camera's name; a file system has 255 bytes
 _REGISTERED_WORDS = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")
 
 
@@ -142,16 +145,20 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
-    """The last part of the namespace where that is unique, else all of it; `camera` where there is none."""
-    short = [camera.name.rpartition("/")[2] or "camera" for camera in cameras]
+    """The last part of the namespace where that is unique, else all of it; `camera` where there is none.
+
+    A name becomes a folder: characters but letters, digits, ``_``, ``-`` and ``.`` become ``_``, and it begins with
+    none of the last two.
+    """
+    short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
+    long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
+    names = [name if short.count(name) == 1 else long[i] for i, name in enumerate(short)]
     named = [
-        CameraTopics(
-            name=name if short.count(name) == 1 else camera.name.replace("/", "_"),
-            color=camera.color,
-            depth=camera.depth,
-            info=camera.info,
-            depth_info=camera.depth_info,
-        )
-        for camera, name in zip(cameras, short, strict=True)
+        replace(camera, name=name if names.count(name) == 1 else f"{name}_{i}")
+        for i, (camera, name) in enumerate(zip(cameras, names, strict=True))
     ]
     return tuple(sorted(named, key=lambda camera: camera.name))
+
+
+def _folder_name(name: str) -> str:
+    return re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:_LONGEST_NAME] or "camera"

@@ -241,6 +241,9 @@ def _read_frames(path: Path) -> list[dict[str, str]]:
         for row in rows:
             int(row["stamp_ns"])
             [float(row[key]) for key in COLUMNS[4:11]]
+            for name in (row["color"], row["depth"], row.get("human") or ""):
+                if Path(name).is_absolute() or ".." in Path(name).parts:
+                    raise ValueError(f"{name} lies outside the capture")
     except (ValueError, TypeError) as error:
         raise InputError(f"{file}: {error}", remedy="run `splatctrl ingest` again") from None
     return rows

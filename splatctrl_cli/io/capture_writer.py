@@ -133,6 +133,8 @@ def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics:
 def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
     """The frame's row of frames.csv, but for the suffixes of its files; its camera is counted."""
     frame = shot.frame
+    if frame.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(frame.camera):
+        raise InputError(f"{shot.origin}: camera {frame.camera!r}: cannot name a folder", remedy="name it otherwise")
     unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
     camera = cameras.setdefault(frame.camera, {**asdict(frame.intrinsics), "depth_scale": unit, "num_frames": 0})
     if any(camera[name] != value for name, value in asdict(frame.intrinsics).items()):
