@@ -1,5 +1,6 @@
 """The views that a description of an image folder comes to: files, poses, stamps and lenses, matched by name."""
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,7 @@ class View:
 
 def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:
     """By stamp; what has no partner or pose is counted in `loss`. Raises InputError where nothing is left."""
-    listed = description.listed or _listed(description, options, loss)
+    listed = _present(description, loss) if description.listed else _listed(description, options, loss)
     names = [view.name for view in listed]
     held = _holdout(description, names, options)
     views = []
@@ -81,6 +82,30 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
             raise UsageError(f"--holdout: all {len(views)} views are held out", remedy=remedy)
         raise InputError(f"{description.path}: [split] holds all {len(views)} views out", remedy=remedy)
     return sorted(views, key=lambda view: (view.stamp_ns, view.name))
+
+
+def _present(description: Description, loss: LossReport) -> list[ListedView]:
+    """Listed views whose files are there; others are counted as unpaired. Raises InputError for a file outside."""
+    root, present, absent = description.root.absolute(), [], []
+    for view in description.listed:
+        for path in (view.color, view.depth):
+            if not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)):
+                raise InputError(
+                    f"{description.path}: {path} is not in {description.root}",
+                    remedy="give the folder that holds all files",
+                )
+        missing = [path for path in (view.color, view.depth) if not path.is_file()]
+        absent += missing[:1]
+        present += [] if missing else [view]
+        loss.unpaired_color += view.depth in missing and view.color not in missing
+        loss.unpaired_depth += view.color in missing and view.depth not in missing
+    if absent:
+        loss.notes.append(f"{len(absent)} of {len(description.listed)} views lack a file ({absent[0]}, ...)")
+    if not present:
+        raise InputError(
+            f"{description.path}: {absent[0]}: no such file, nor any other", remedy="copy the images too"
+        )
+    return present
 
 
 def find_files(root: Path, pattern: str) -> list[tuple[str, Path]]:

@@ -16,6 +16,7 @@ from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.records import Float64
 
 FILE = "scene_camera.json"
+_REMEDY = "see BOP's format of datasets"
 COLOR_FOLDERS = ("rgb", "gray")
 
 
@@ -32,15 +33,19 @@ def read(folder: Path, options: SourceOptions) -> Description:
     if color_folder is None:
         raise InputError(f"{folder}: expected a folder rgb or gray, got none", remedy="unpack the whole scene")
     colors, depths = images_of(color_folder), images_of(folder / "depth")
-    entries = {int(key): entry for key, entry in read_json(path).items()}
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected an object by image number, got {type(content).__name__}", remedy=_REMEDY)
+    entries = {int(key): entry for key, entry in content.items() if key.isdigit()}
     lenses, views = Lenses(), []
+    size = image_size(next(iter(colors.values()))) if colors else (0, 0)  # that of all images of a scene
     for name, color in colors.items():
         entry = entries.get(int(name)) if name.isdigit() else None
         if name not in depths or entry is None:
             continue
         where = f"{path}: image {int(name)}"
         try:
-            lens = _lens(entry, image_size(color))
+            lens = _lens(entry, size)
             view = ListedView(
                 name=name,
                 color=color,
@@ -50,9 +55,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
                 depth_scale=float(entry["depth_scale"]) * MILLIMETRE,
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{where}: expected BOP's fields, got no usable {error}", remedy="see BOP's format"
-            ) from None
+            raise InputError(f"{where}: expected BOP's fields, got no usable {error}", remedy=_REMEDY) from None
         views.append(view)
     return described(
         path,

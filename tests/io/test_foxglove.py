@@ -237,6 +237,22 @@ def test_fields_that_were_not_written_have_their_defaults_and_unknown_ones_are_p
         types.read("foxglove.Nothing", b"")
 
 
+def test_nested_types_and_numbers_of_every_wire_form_are_read() -> None:
+    """type a.Outer { message Inner { sint64 z = 1; } Inner i = 1; repeated uint32 packed = 2; bool b = 3; }"""
+
+    def field(name: str, number: int, label: int, kind: int, of: str = "") -> bytes:
+        numbers = b"\x18" + varint(number) + b"\x20" + varint(label) + b"\x28" + varint(kind)
+        return delimited(2, delimited(1, name.encode()) + numbers + (delimited(6, of.encode()) if of else b""))
+
+    inner = delimited(3, delimited(1, b"Inner") + field("z", 1, 1, 18))
+    outer = delimited(1, b"Outer") + inner + field("i", 1, 1, MESSAGE, "Inner")
+    outer += field("packed", 2, 3, 13) + field("b", 3, 1, 8)
+    types = MessageTypes(delimited(1, delimited(2, b"a") + delimited(4, outer)))
+    data = delimited(1, b"\x08" + varint(5)) + delimited(2, varint(300) + varint(7)) + b"\x18\x01" + b"\x10\x09"
+    message = types.read("a.Outer", data)
+    assert (message.i.z, message.packed, message.b) == (-3, [300, 7, 9], True)
+
+
 def test_the_descriptors_of_a_real_log_are_read(real_data: Path) -> None:
     with (real_data / "rosbag2_mcap_sensor_msgs/simple-protobuf.mcap").open("rb") as stream:
         _, message = next(

@@ -1,6 +1,7 @@
 """Folders of public datasets, opened by their own files: small trees with a known pose and depth."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Float64, RgbdFrame
 
 WIDTH, HEIGHT = 8, 6
+TEXTS = {".txt", ".json", ".log"}
 POSES = [look_at([0.5 + 0.1 * index, 0.2, 1.0], [0.0, 0.0, 0.0]) for index in range(3)]
 K = (10.0, 11.0, 3.5, 2.5)
 
@@ -301,6 +303,38 @@ def test_each_layout_is_known_by_its_files_and_described(tmp_path: Path) -> None
         assert found is not None and found.name == layout.name
         summary = describe(folder)
         assert (summary.kind, summary.grids[0].rows) == (layout.name, [["camera", 3]])
+
+
+def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
+    folder = make_tum(tmp_path / "freiburg3")
+    next((folder / "depth").iterdir()).unlink()
+    source = open_source(folder, INTRINSICS)
+    assert len(list(source.records())) == 2
+    assert (source.loss.unpaired_color, source.loss.unpaired_depth) == (1, 0)
+    assert "1 of 3 views lack a file" in source.loss.notes[0]
+    (folder / "rgb").rename(tmp_path / "rgb")
+    (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text().replace("rgb/", "../rgb/"))
+    with pytest.raises(InputError, match="is not in"):
+        open_source(folder, INTRINSICS)
+
+
+@pytest.mark.parametrize("make", [make_tum, make_bop, make_scannet, make_frames, make_nerfstudio, make_redwood])
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b"[]", b"null", b"1 2 3\n", b"\xff\xfe nonsense \x00", b'{"0": 3, "frames": [1]}']
+)
+def test_a_damaged_text_of_a_layout_is_refused_in_one_line_or_read_around(
+    tmp_path: Path, make: Callable[[Path], Path], content: bytes
+) -> None:
+    names = [p.relative_to(tmp_path / "whole") for p in make(tmp_path / "whole").rglob("*") if p.suffix in TEXTS]
+    assert names
+    for number, name in enumerate(names):
+        folder = make(tmp_path / f"freiburg3_{number}")
+        (folder / name).write_bytes(content)
+        try:
+            source = open_source(folder, SourceOptions())
+            list(source.records())
+        except InputError as error:
+            assert "\n" not in str(error) and error.remedy
 
 
 def test_a_name_that_no_camera_has_is_refused(tmp_path: Path) -> None:
