@@ -13,6 +13,8 @@ from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.bag_log import open_raw_log
 from splatctrl_cli.io.mcap_file import McapFile
 from splatctrl_cli.io.mcap_log import McapLog
 from splatctrl_cli.io.mcap_records import CHUNK, MAGIC
@@ -233,3 +235,20 @@ def test_a_small_file_that_asks_for_much_gets_little(tmp_path: Path, name: str, 
     megabytes, note = done.stdout.split(" ", 1)
     assert told in note
     assert int(megabytes) < 700
+
+
+@pytest.mark.parametrize("name", ["x.bag", "x.db3", "x"])
+def test_an_mcap_is_known_by_its_first_bytes(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(small_log())
+    log = open_raw_log(tmp_path / name)
+    assert log.container == "MCAP"
+    assert len(list(log.messages(Damage()))) == 40
+
+
+def test_what_is_no_log_is_refused_by_its_bytes(tmp_path: Path) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"hello, this is text")
+    with pytest.raises(InputError, match=r"does not begin like a .mcap file \(first bytes b'hello, t'\)"):
+        open_raw_log(tmp_path / "x.mcap")
+    (tmp_path / "x.mcap").write_bytes(b"")
+    with pytest.raises(InputError, match=r"the file is empty \(0 bytes\)"):
+        open_raw_log(tmp_path / "x.mcap")
