@@ -2,13 +2,16 @@
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from splatctrl_cli.io.check_report import BLOCKED
 from tests.cli.test_ingest import run
+from tests.io.break_log import Message, broken_log
 from tests.io.make_log import LogRecipe, make_log
 
 GOOD = LogRecipe(num_frames=20)
@@ -60,6 +63,23 @@ def test_cameras_whose_poses_disagree_are_an_error_with_millimetres(
     finding = json.loads(printed)["findings"][0]
     assert (finding["code"], finding["severity"], finding["unit"]) == ("agreement", "error", "mm")
     assert finding["value"] == pytest.approx(99, abs=3)
+
+
+def test_a_camera_that_sees_a_wall_elsewhere_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def farther(log_time: int, topic: str, kind: str, message: Any) -> Iterator[Message]:
+        if topic == "/cam1/depth/image_raw":
+            counts = message.data.view("<u2")
+            counts[counts > 0] += 100
+        yield log_time, topic, kind, message
+
+    log = broken_log(tmp_path / "log.mcap", farther, replace(GOOD, cameras=("cam0", "cam1")))
+    code, printed, _ = run(capsys, "check", log, "--json")
+    result = json.loads(printed)
+    finding = result["findings"][0]
+    assert (code, finding["code"], finding["where"]) == (1, "agreement", "cameras cam0 and cam1")
+    assert finding["value"] == pytest.approx(100)
+    assert "agreement" in result["commands"]["reconstruct"][0]
+    assert result["commands"]["ingest"] == []
 
 
 @pytest.mark.parametrize(
