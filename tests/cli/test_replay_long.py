@@ -70,6 +70,15 @@ def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
     assert first.names == ("a", "b", "c") and [event.num_states for event in found] == [4, 3, 1, 2, 1]
 
 
+def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None:
+    stored: replay_store.StoredObjects[int] = replay_store.StoredObjects()
+    for block in ([0, 1], [], [2, 3, 4], [5]):
+        stored.extend(block)
+    whole = list(range(6))
+    assert list(stored) == whole and stored[-1] == 5 and stored[4:1:-1] == whole[4:1:-1]
+    assert all(stored[i:j] == whole[i:j] for i in range(-7, 8) for j in range(-7, 8))
+
+
 def test_the_first_time_in_unknown_space_is_named(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), is_seen=False)
     assert desk.replay("--scene", str(scene), "-q") == 5
