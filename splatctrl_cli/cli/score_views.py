@@ -132,9 +132,9 @@ class Scorer:
 
 
 def _figures(score: "ViewScore") -> str:
-    parts = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} dB where seen"]
-    parts += [f"{score.masked.psnr:.1f} dB in the mask"] if score.masked is not None else []
-    return ", ".join([*parts, f"{score.all.psnr:.1f} dB in all"])
+    parts = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
+    parts += [f"{score.masked.psnr:.1f} masked"] if score.masked is not None else []
+    return "dB: " + ", ".join([*parts, f"{score.all.psnr:.1f} all"])
 
 
 def rendered(

@@ -52,7 +52,7 @@ def test_the_mean_is_over_the_scans(
         return scene, 50.0 if scan == "scan1" else 70.0
 
     def score(args: Any, console: Any, folder: Path | None) -> Any:
-        metrics = dict.fromkeys(score_fit.EACH, 1.0) | {"psnr_all": psnr[args.scan, args.scene.parent.name]}
+        metrics = dict.fromkeys(score_fit.EACH, 1.0) | {"psnr_all": psnr.get((args.scan, args.scene.parent.name))}
         protocol = {"name": "x", "source": "y", "split": "z", "mask_rule": "none", "background": [0.0],
                     "published_resolution": None, "resolution": ["1x1"]}  # fmt: skip
         return {"metrics": metrics, "protocol": protocol}, None
@@ -67,6 +67,9 @@ def test_the_mean_is_over_the_scans(
     assert result["protocol"]["averaging"] == "mean over the views of a scan, then over the scans"
     assert main(["score", "--fit", "--dtu", str(tmp_path), "-q", "--require", "psnr_gain>=2"]) == 1
     assert "scan1 dB  scan2 dB  mean dB" in capsys.readouterr().out
+    del psnr["scan2", "budget"]
+    assert main(["score", "--fit", "--dtu", str(tmp_path), "-q", "--require", "psnr_ours>=2"]) == 1
+    assert "psnr_ours is unknown" in capsys.readouterr().err, "a scan without a figure leaves no mean"
 
 
 @pytest.mark.parametrize(
