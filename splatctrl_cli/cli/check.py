@@ -53,7 +53,6 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
-    from splatctrl_cli.io.capture import is_capture
     from splatctrl_cli.io.check_log import check_log
     from splatctrl_cli.io.check_source import check_source
 
@@ -62,13 +61,8 @@ def run(args: argparse.Namespace) -> int:
     options, model, path = source_options(args), _robot(args), args.source
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
-    if path.suffix == ".toml" or is_capture(path):
+    if path.suffix == ".toml" or (path.is_dir() and not is_bag_folder(path)):
         report = check_source(path, options, model=model, num_images=args.quick)
-    elif path.is_dir() and not is_bag_folder(path):
-        raise InputError(
-            f"{path}: a folder that is neither a capture nor a ROS 2 bag",
-            remedy="for images give the .toml that describes them",
-        )
     else:
         report = check_log(open_raw_log(path), options, model=model, num_images=args.quick)
     report = replace(report, findings=[*report.findings, *_agreement(report)])

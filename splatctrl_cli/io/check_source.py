@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.capture import is_capture
 from splatctrl_cli.io.check_arm import arm_agreement, arm_findings
 from splatctrl_cli.io.check_cameras import lens_findings, pose_findings
 from splatctrl_cli.io.check_images import ImageWatch, KeptDepth, depth_findings, strided_lens
@@ -55,7 +56,7 @@ def check_source(
     path: Path, options: SourceOptions, *, model: RobotModel | None = None, num_images: int | None = None
 ) -> CheckReport:
     """Read the frames of `path` once; with `num_images` up to as many of a camera."""
-    kind = "image folder" if path.suffix == ".toml" else "capture"
+    kind = "capture" if is_capture(path) else "image folder"
     try:
         source = open_source(path, options)
     except InputError as wrong:
