@@ -33,6 +33,7 @@ from splatctrl_cli.robot.coverage import coverage_deficit
 
 EPSILON = 0.02  # [m] of the paper
 BAR = 0.015  # [m] of true clearance to what a camera saw
+LEAST_REACHED = 0.95  # of the goals, where ways out are planned
 FIRST_CALIBRATION = 10_000  # seeds of the calibration scenes; the trials' begin at 0
 NEAR = 0.08  # [m] of clearance by the field, below which the field's over-estimate counts
 DETOURS = 3
@@ -113,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             file.flush()
             print(f"{seed}: {json.dumps([row.outcome for row in rows[-len(METHODS) :]])}", flush=True)
     _report(rows)
-    return int(any(_is_missed(rows, method) for method in METHODS[:2]))
+    return int(_is_missed(rows))
 
 
 def with_margin(config: Config, margin: float) -> Config:
@@ -244,10 +245,12 @@ def _seen(scene: TableScene, known: Known, position: Float64) -> tuple[float, fl
     return float(np.min(seen - radii[near])), over
 
 
-def _is_missed(rows: Sequence[Trial], method: str) -> bool:
-    of = [row for row in rows if row.method == method]
-    reached = sum(row.success for row in of) / len(of)
-    return reached < 0.95 or any(row.min_seen < BAR for row in of)
+def _is_missed(rows: Sequence[Trial]) -> bool:
+    """Whether a controlled motion came nearer than BAR to what was seen, or too few reached the goal."""
+    controlled = [row for row in rows if row.method in METHODS[:2]]
+    with_ways_out = [row for row in controlled if row.method == METHODS[1]]
+    reached = sum(row.success for row in with_ways_out) / len(with_ways_out)
+    return reached < LEAST_REACHED or any(row.min_seen < BAR for row in controlled)
 
 
 def _report(rows: Sequence[Trial]) -> None:
