@@ -174,6 +174,7 @@ class SceneFolder:
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:
         """By time."""
+        self._expect_isotropic()
         path = self.path / "snapshots.csv"
         try:
             with path.open(encoding="utf-8", newline="") as stream:
