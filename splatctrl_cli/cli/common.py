@@ -132,10 +132,18 @@ FirstTime = Callable[[str, Callable[[float], bool]], float | None]
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 
 
-def check_gate_names(requirements: Sequence[str], names: Collection[str]) -> None:
-    """Raise UsageError for a requirement on a metric that is not among `names`; to be called before the work."""
+def check_gate_names(
+    requirements: Sequence[str], names: Collection[str], elsewhere: Mapping[str, Collection[str]] | None = None
+) -> None:
+    """Raise UsageError for a requirement on a metric that is not among `names`; to be called before the work.
+
+    elsewhere: the metrics that other options would give, by those options.
+    """
     for requirement in requirements:
         name, _, _ = _parse_gate(requirement)
+        for options, others in (elsewhere or {}).items():
+            if name not in names and name in others:
+                raise UsageError(f"--require {requirement}: a figure of {options}", remedy="give it, or gate another")
         if name not in names:
             near = difflib.get_close_matches(name, names, n=1)
             choices = ", ".join(list(names)[:8]) + (", ..." if len(names) > 8 else "")

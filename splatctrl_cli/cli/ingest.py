@@ -16,7 +16,9 @@ from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from splatctrl_cli.io.capture_writer import CaptureSummary
     from splatctrl_cli.io.options import SourceOptions
+    from splatctrl_cli.io.state_offset import ClockOffset
 
 
 def register(subparsers: Subparsers) -> None:
@@ -89,16 +91,17 @@ def run(args: argparse.Namespace) -> int:
             metrics=metrics,
             stopwatch=stopwatch,
         )
+    console.result({"capture": str(out), **metrics}, [*_lines(summary, offset), f"wrote {out}"])
+    return 3 if summary.loss.damaged else 0
+
+
+def _lines(summary: "CaptureSummary", offset: "ClockOffset | None") -> list[str]:
     lines = table(["camera", "frames"], sorted(summary.num_frames.items()))
-    lines += [
-        f"{key.replace('_', ' ')}: {value}" for key, value in asdict(summary.loss).items() if value and key != "notes"
-    ]
+    lost = asdict(summary.loss).items()
+    lines += [f"{key.replace('_', ' ')}: {value}" for key, value in lost if value and key != "notes"]
     lines += [f"note: {note}" for note in summary.loss.notes]
     lines += [] if offset is None else [f"note: {offset.sentence}"]
-    console.result(
-        {"capture": str(out), **metrics}, [*lines, f"joint states: {summary.num_joint_states}", f"wrote {out}"]
-    )
-    return 3 if summary.loss.damaged else 0
+    return [*lines, f"joint states: {summary.num_joint_states}"]
 
 
 def _identity(options: "SourceOptions", inputs: Mapping[str, str]) -> dict[str, Any]:

@@ -97,16 +97,12 @@ def run(args: argparse.Namespace) -> int:
 
     config, console, stopwatch = with_preset(configured(args)), Console(args), Stopwatch()
     fields = ("exact", "barrier", *(("certified",) if args.field is not None else ()))
-    check_gate_names(
-        args.require,
-        metric_names(
-            args.mode,
-            fields,
-            has_truth=args.truth is not None,
-            baselines=read_baselines(args),
-            has_twists=args.twist_topic is not None,
-        ),
-    )
+    baselines, has_truth, has_twists = read_baselines(args), args.truth is not None, args.twist_topic is not None
+    names = {
+        mode: metric_names(mode, fields, has_truth=has_truth, baselines=baselines, has_twists=has_twists)
+        for mode in MODES
+    }
+    check_gate_names(args.require, names[args.mode], {f"--mode {mode}": names[mode] for mode in names})
     golden = read_golden(args)
     read_zone(args)
     check_lockstep(args)

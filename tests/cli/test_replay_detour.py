@@ -30,3 +30,11 @@ def test_a_negative_number_of_ways_is_refused(desk: Desk, capsys: pytest.Capture
     scene = write_scene(desk.folder / "scene", (0, splats_of(*WALL)))
     assert desk.replay("--scene", str(scene), "--set", "control.max_detours=-1") == 2
     assert "control.max_detours: expected 0 or more, got -1" in capsys.readouterr().err
+
+
+def test_a_gate_of_another_mode_is_told_the_mode(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(*WALL)))
+    assert desk.replay("--scene", str(scene), "--require", "num_detours<=0") == 2
+    assert "--require num_detours<=0: a figure of --mode closed-loop" in capsys.readouterr().err
+    assert desk.replay("--scene", str(scene), "--require", "num_detour<=0") == 2
+    assert "unknown metric" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.goal_postures import goal_postures
 from splatctrl_cli.control.path import least_clearance
-from splatctrl_cli.control.planned import GOAL_BLOCKED, NO_POSTURE, START_BLOCKED, planned_path
+from splatctrl_cli.control.planned import GOAL_BLOCKED, NO_POSTURE, START_BLOCKED, planned_detours, planned_path
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
 from splatctrl_cli.control.solids import Ball, Solids
 from splatctrl_cli.control.target import pose_error
@@ -96,3 +96,18 @@ def test_what_the_spheres_leave_uncovered_is_kept_as_well_where_the_controller_k
     kept = planned_path(Bare(), one_wall(), task(), PLANNER, replace(CONFIG, coverage="margin"))
     assert thin.margin == kept.margin == CONFIG.margin
     np.testing.assert_allclose(thin.clearance.at(START[None]) - kept.clearance.at(START[None]), 0.03)
+
+
+def test_a_way_out_is_planned_in_the_scene_of_the_stall_and_waits_as_configured() -> None:
+    asked: list[int] = []
+
+    def scene_at(stamp_ns: int) -> Solids:
+        asked.append(stamp_ns)
+        return one_wall()
+
+    detours = planned_detours(ARM, scene_at, "tip", PLANNER, CONFIG)
+    given = task()
+    detour = detours(7, given.start, given.T_world_goal)
+    assert asked == [7] and detour is not None
+    np.testing.assert_array_equal(detour.path.waypoints[0], given.start)
+    assert detour.wait_distance == PLANNER.wait_distance and detour.clock == 0.0
