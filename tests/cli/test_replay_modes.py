@@ -138,7 +138,7 @@ def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_join
         (("--mode", "closed-loop", "--waypoints", "nowhere.toml"), 4, "nowhere.toml: cannot be read"),
         (("--mode", "closed-loop", "--re-anchor", "0"), 2, "expected seconds above 0"),
         (("--max-map-age", "nan"), 2, "expected finite numbers"),
-        (("--require", "intervention_share<=0"), 2, "unknown metric"),
+        (("--require", "intervention_share<=0"), 2, "a figure of --mode"),
     ],
 )
 def test_what_cannot_be_is_refused_in_words(
