@@ -27,8 +27,11 @@ exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 
 damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug; 130 interrupted"""
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser with every subcommand registered."""
+def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The parser with the one subcommand that `words` begin with, where they begin with one, else with all.
+
+    So a run neither waits for the files of the other subcommands nor fails with them.
+    """
     parser = Parser(
         prog="splatctrl",
         description="What did the robot's cameras know, and would this controller have kept it safe?",
@@ -38,7 +41,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"splatctrl {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in COMMANDS:
+    named = [command for command in COMMANDS if [command] == list(words[:1])]
+    for command in named or COMMANDS:
         module = importlib.import_module(f"splatctrl_cli.cli.{command.replace('-', '_')}")
         module.register(subparsers)
     return parser
@@ -49,7 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     verbose = 0
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
     try:
-        args = build_parser().parse_args(argv)
+        words = sys.argv[1:] if argv is None else argv
+        args = build_parser(words).parse_args(words)
         verbose = args.verbose
         _keep_inputs(args)
         code: int = args.run(args)

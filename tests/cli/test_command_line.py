@@ -117,6 +117,16 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
     assert done.stderr == "[]\n"
 
 
+def test_a_command_runs_without_the_files_of_the_others(
+    sample_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "splatctrl_cli.cli.replay", None)  # importing it fails
+    assert main(["info", str(sample_data / "tabletop" / "truth.json")]) == 0
+    capsys.readouterr()
+    assert main(["replay"]) == 70
+    assert "splatctrl_cli.cli.replay" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", WRITERS)
 def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, command: str) -> None:
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--colour")
