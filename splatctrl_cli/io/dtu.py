@@ -63,10 +63,9 @@ def read_dtu(
 
     `shrink` makes of each view the one that is kept, before the next is read.
 
-    K is scaled to the images as MVSNet's own loaders do (the file's K may be for 1600x1200 or for a quarter of the
-    image). Depth of another size than the image is sampled, not blended: from 1600x1200 at the pixels the image
-    was cut from; a smaller map sets only the pixels it was made for. A view without depth is left out. Raises
-    InputError naming the file.
+    K is scaled to the images (the file's K may be for 1600x1200 or for a quarter of the image). Depth of another
+    size than the image is sampled, not blended: a larger map at the pixels that the image's come from; a smaller map
+    sets only the pixels it was made for. A view without depth is left out. Raises InputError naming the file.
     """
     scan, folder = _scan_folder(root, scan)
     images = _images(folder)
@@ -221,16 +220,23 @@ def _read_camera(path: Path) -> tuple[Float64, Float64]:
 
 
 def _fitted(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
-    """K for an image of `size` (width, height), whichever of the sizes in use the file's K was made for."""
+    """K for an image of `size` (width, height), whichever of the sizes in use the file's K was made for.
+
+    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). In an image made smaller they are at
+    (u + 0.5) scale - 0.5, as `shrunk` has it; but MVSNet's cameras for 640x512, and for a quarter of that, are
+    multiples of those for 1600x1200 (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders take them so.
+    """
     width, height = size
+    shift, crop = 0.0, (0, 0)
     if _is_centered(K, width, height):
-        scale, crop = 1.0, (0, 0)
+        scale = 1.0
     elif _is_centered(K, width / 4, height / 4):
-        scale, crop = 4.0, (0, 0)
+        scale = 4.0
     elif _is_centered(K, *RAW) and size == CROPPED:
         scale, crop = 0.5, CROP
     elif _is_centered(K, *RAW) and width * RAW[1] == height * RAW[0]:
-        scale, crop = width / RAW[0], (0, 0)
+        scale = width / RAW[0]
+        shift = 0.5 * scale - 0.5
     else:
         raise InputError(
             f"{path}: principal point ({K[0, 2]:g}, {K[1, 2]:g}) fits no image of {width}x{height}, nor a quarter of "
@@ -239,8 +245,8 @@ def _fitted(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     return Intrinsics(
         fx=float(K[0, 0] * scale),
         fy=float(K[1, 1] * scale),
-        cx=float(K[0, 2] * scale - crop[0]),
-        cy=float(K[1, 2] * scale - crop[1]),
+        cx=float(K[0, 2] * scale + shift - crop[0]),
+        cy=float(K[1, 2] * scale + shift - crop[1]),
         width=width,
         height=height,
     )
@@ -272,6 +278,9 @@ def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
         return depth
     if depth.shape == (RAW[1], RAW[0]) and size == CROPPED:
         return np.ascontiguousarray(depth[2 * CROP[1] :: 2, 2 * CROP[0] :: 2][:height, :width])
+    smaller = depth.shape[1] // width
+    if smaller >= 2 and (width * smaller, height * smaller) == depth.shape[::-1]:
+        return np.ascontiguousarray(depth[smaller // 2 :: smaller, smaller // 2 :: smaller])
     factor = width // depth.shape[1] if depth.shape[1] else 0
     if factor >= 2 and (depth.shape[1] * factor, depth.shape[0] * factor) == size:
         spread = np.zeros((height, width), dtype=np.float32)

@@ -136,9 +136,10 @@ class DtuSource:
 
 
 def shrunk(view: DtuView, factor: int) -> DtuView:
-    """The view with every `factor` x `factor` pixels as one: mean colour, and the depth and mask of one of them.
+    """The view with every `factor` x `factor` pixels as one: the mean colour, the middle's depth, the first's mask.
 
-    As RegNeRF does it (regnerf/internal/datasets.py, downsample, cv2.INTER_AREA). Pixel (0, 0) has its centre at
+    Colour and mask as RegNeRF has them (regnerf/internal/datasets.py, downsample: cv2.INTER_AREA, for masks
+    cv2.INTER_NEAREST, which takes the first pixel). Pixel (0, 0) has its centre at
     (0, 0), so that u becomes (u + 0.5) / factor - 0.5. Raises UsageError for a factor that does not divide the size.
     """
     k = view.intrinsics
@@ -162,7 +163,7 @@ def shrunk(view: DtuView, factor: int) -> DtuView:
         depth=np.ascontiguousarray(view.depth[sample, sample]),
         intrinsics=intrinsics,
         T_world_camera=view.T_world_camera,
-        mask=None if view.mask is None else np.ascontiguousarray(view.mask[sample, sample]),
+        mask=None if view.mask is None else np.ascontiguousarray(view.mask[::factor, ::factor]),
     )
 
 

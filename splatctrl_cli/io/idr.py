@@ -2,10 +2,12 @@
 
 SCAN/cameras_sphere.npz (or cameras.npz) with world_mat_I, the projection (4, 4) of world points to pixels of image I,
 and scale_mat_I, from the unit sphere around the object to the world; SCAN/image/000000.png; SCAN/mask/000.png.
-Image I is the I-th by name (Totoro97/NeuS, models/dataset.py). World lengths are millimetres there, metres here.
+Image I is the I-th by name (Totoro97/NeuS, models/dataset.py); where images are missing, the one with that number for
+a name. World lengths are millimetres there, metres here.
 There is no depth: SCAN/depth may hold depth_map_0000.pfm (and depth_visual_0000.png) as MVSNet names them.
 """
 
+import re
 from pathlib import Path
 
 import cv2
@@ -46,17 +48,19 @@ def read_idr(
         got = "several scans" if scan is None else f"no scan '{scan}'"
         raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(scans)}")
     folder = scans[scan]
-    images = sorted((folder / "image").glob("*.png")) or sorted((folder / "image").glob("*.jpg"))
-    masks = sorted((folder / "mask").glob("*.png"))
+    path = next(folder / name for name in CAMERAS if (folder / name).is_file())
+    projections = _projections(path)
+    images = _numbered(folder / "image", len(projections))
     if not images:
         raise InputError(f"{folder / 'image'}: expected images such as 000000.png, got none")
-    if masks and len(masks) != len(images):
-        raise InputError(f"{folder / 'mask'}: expected {len(images)} masks, one for each image, got {len(masks)}")
-    path = next(folder / name for name in CAMERAS if (folder / name).is_file())
-    projections = _projections(path, len(images))
-    files = [path, *images, *masks]
+    masks = _numbered(folder / "mask", len(projections))
+    missing = [number for number in images if number not in masks]
+    if masks and missing:
+        raise InputError(f"{folder / 'mask'}: expected a mask for each image, got none for image {missing[0]}")
+    files = [path, *images.values(), *(masks[number] for number in images if masks)]
     views, without_depth = [], []
-    for number, (image, P) in enumerate(zip(images, projections, strict=True)):
+    for number, image in images.items():
+        P = projections[number]
         color = read_image(image)
         size = (color.shape[1], color.shape[0])
         K, T_world_camera = decompose(P, f"{path}: world_mat_{number}")
@@ -82,7 +86,7 @@ def read_idr(
     return DtuScan(
         name=scan,
         views=tuple(views),
-        numbers=tuple(range(len(views))),
+        numbers=tuple(images),
         files=tuple(files),
         without_depth=tuple(without_depth),
     )
@@ -107,13 +111,35 @@ def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:
     return K / K[2, 2], T_world_camera
 
 
-def _projections(path: Path, num: int) -> list[Float64]:
+def _numbered(folder: Path, num: int) -> dict[int, Path]:
+    """The pictures in `folder` by the number of their camera, of which there are `num`: their places by name where
+    there is one for each, else the numbers that are their names. Raises InputError for a name that is no such number.
+    """
+    paths = sorted(folder.glob("*.png")) or sorted(folder.glob("*.jpg"))
+    if len(paths) == num:
+        return dict(enumerate(paths))
+    found: dict[int, Path] = {}
+    for path in paths:
+        number = int(path.stem) if path.stem.isdecimal() else num
+        if number >= num or number in found:
+            raise InputError(
+                f"{path}: expected one picture for each of {num} cameras, or their numbers as names, got {len(paths)}"
+                f" and this one" + (f" beside {found[number].name}" if number in found else ""),
+                remedy=f"name it by its camera's number, as {0:06d}.png to {num - 1:06d}.png, or take it away",
+            )
+        found[number] = path
+    return dict(sorted(found.items()))
+
+
+def _projections(path: Path) -> list[Float64]:
+    """World points [mm] to pixels (3, 4), of each camera in the file."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            world = [np.asarray(archive[f"world_mat_{i}"], np.float64)[:3, :4] for i in range(num)]
+            num = sum(1 for name in archive.files if re.fullmatch(r"world_mat_\d+", name))
+            world = [np.asarray(archive[f"world_mat_{i}"], np.float64)[:3, :4] for i in range(max(num, 1))]
             radius = float(archive["scale_mat_0"][0, 0]) / MILLIMETRES
     except KeyError as error:
-        raise InputError(f"{path}: {error.args[0]}; expected world_mat and scale_mat of {num} images") from None
+        raise InputError(f"{path}: {error.args[0]}; expected world_mat_0 and so on, and scale_mat_0") from None
     except Exception as error:  # numpy raises many kinds for a file that is no archive
         raise InputError(f"{path}: not the cameras of a scan: {error}") from None
     low, high = PLAUSIBLE_RADIUS

@@ -1,5 +1,6 @@
 """DTU scans: what is written reads back; K and depth of real layouts are scaled; damage is named."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform, look_at
+from splatctrl_cli.geometry import invert_transform, look_at, project
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
+from splatctrl_cli.io.dtu_source import shrunk
 from splatctrl_cli.io.pfm import read_pfm, write_pfm
 from splatctrl_cli.records import Intrinsics
 
@@ -94,6 +96,26 @@ def test_full_cameras_and_depth_are_halved_and_cropped(scan: Path) -> None:
     assert (found.intrinsics.cx, found.intrinsics.cy) == pytest.approx((331.6, 265.55))
     assert found.depth.shape == (512, 640)
     np.testing.assert_allclose(found.depth[10, 20] * 1000, depth[2 * (10 + 44), 2 * (20 + 80)], rtol=1e-6)
+
+
+def test_cameras_and_depth_of_the_full_size_fit_images_made_smaller(scan: Path) -> None:
+    """A patch of 4x4 pixels of the full image is one pixel of the small one; its middle stays where it was."""
+    full = np.array([[2892.3, 0, 823.2], [0, 2883.2, 619.1], [0, 0, 1]])
+    depth = np.arange(1600 * 1200, dtype=np.float32).reshape(1200, 1600) + 1
+    resized(scan, (400, 300), ("00000000_cam.txt", full), depth)
+    found = read_dtu(scan).views[0]
+    middle = np.array([[4 * 30 + 1.5, 4 * 20 + 1.5]])
+    point = np.column_stack([(middle - full[:2, 2]) / np.diag(full)[:2], [1.0]])
+    np.testing.assert_allclose(project(found.intrinsics, point), [[30.0, 20.0]], atol=1e-9)
+    at_full_size = replace(
+        found,
+        color=np.zeros((1200, 1600, 3), np.uint8),
+        depth=depth / np.float32(1000),
+        intrinsics=Intrinsics(fx=2892.3, fy=2883.2, cx=823.2, cy=619.1, width=1600, height=1200),
+    )
+    small = shrunk(at_full_size, 4)
+    assert small.intrinsics == found.intrinsics
+    np.testing.assert_array_equal(small.depth, found.depth)
 
 
 def test_pixels_that_depth_visual_hides_have_no_depth(scan: Path) -> None:

@@ -61,6 +61,18 @@ def test_a_scan_reads_the_same_from_both_layouts(tmp_path: Path) -> None:
         np.testing.assert_array_equal(b.mask, original.mask)
 
 
+def test_a_missing_image_leaves_the_others_their_cameras_and_masks(tmp_path: Path) -> None:
+    folder = write_idr(tmp_path, "scan1", VIEWS)
+    (folder / "image/000001.png").unlink()
+    scan = read_idr(tmp_path)
+    assert scan.numbers == (0, 2)
+    np.testing.assert_allclose(scan.views[1].T_world_camera, VIEWS[2].T_world_camera, atol=1e-9)
+    np.testing.assert_array_equal(scan.views[1].mask, VIEWS[2].mask)
+    np.testing.assert_allclose(scan.views[1].depth, VIEWS[2].depth, rtol=1e-6)
+    (folder / "mask/001.png").unlink()
+    assert read_idr(tmp_path).numbers == (0, 2)
+
+
 def test_views_without_depth_stay_and_are_named(tmp_path: Path) -> None:
     write_idr(tmp_path, "scan1", VIEWS, with_depth=False)
     source = DtuSource(tmp_path)
@@ -94,10 +106,15 @@ def test_cameras_in_the_unit_sphere_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda f: (f / "mask/001.png").unlink(), "expected 3 masks, one for each image, got 2"),
+        (lambda f: (f / "mask/001.png").unlink(), "expected a mask for each image, got none for image 1"),
         (lambda f: [p.unlink() for p in (f / "image").iterdir()], "expected images such as 000000.png, got none"),
         (lambda f: (f / "cameras_sphere.npz").write_bytes(b"no"), "not the cameras of a scan"),
-        (lambda f: np.savez(f / "cameras_sphere.npz", a=1), "expected world_mat and scale_mat of 3 images"),
+        (lambda f: np.savez(f / "cameras_sphere.npz", a=1), "expected world_mat_0 and so on, and scale_mat_0"),
+        (
+            lambda f: (f / "image/000001.png").rename(f / "image/b.png") and (f / "image/000002.png").unlink(),
+            "b.png: expected one picture for each of 3 cameras, or their numbers as names, got 2 and this",
+        ),
+        (lambda f: (f / "image/2.png").write_bytes(b"no"), r"2.png: expected one .*got 4 and this one beside 000002"),
         (lambda f: (f / "image/000001.png").write_bytes(b"no"), "000001.png: not an image that can be read"),
     ],
 )
