@@ -18,7 +18,6 @@ from splatctrl_cli.errors import UsageError
 if TYPE_CHECKING:
     from splatctrl_cli.io.capture_writer import CaptureSummary
     from splatctrl_cli.io.options import SourceOptions
-    from splatctrl_cli.io.state_offset import ClockOffset
 
 
 def register(subparsers: Subparsers) -> None:
@@ -46,15 +45,13 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.io.output import Stopwatch, output_path, write_run
     from splatctrl_cli.io.ros_log import RosLogSource
     from splatctrl_cli.io.source import open_session
-    from splatctrl_cli.io.state_watch import WatchedSource
 
     console, stopwatch = Console(args), Stopwatch()
     options = source_options(args)
     out = args.out or Path(args.source[0].stem + ".capture")
     with stopwatch.stage("survey"):
-        opened = open_session(args.source, options)
-        source = WatchedSource(opened)
-        topics = opened.joint_topics if isinstance(opened, RosLogSource | CaptureSource) else None
+        source = open_session(args.source, options)
+        topics = source.joint_topics if isinstance(source, RosLogSource | CaptureSource) else None
     if set(source.cameras) == {HOLDOUT}:
         raise UsageError(
             f"--cameras {args.cameras}: leaves no camera to train with", remedy="name another, or leave it out"
@@ -81,7 +78,6 @@ def run(args: argparse.Namespace) -> int:
             "frames": summary.num_frames,
             "joint_states": summary.num_joint_states,
             "loss": asdict(summary.loss),
-            "clock_offset": None if (offset := source.clock_offset()) is None else asdict(offset),
         }
         write_run(
             partial,
@@ -91,16 +87,15 @@ def run(args: argparse.Namespace) -> int:
             metrics=metrics,
             stopwatch=stopwatch,
         )
-    console.result({"capture": str(out), **metrics}, [*_lines(summary, offset), f"wrote {out}"])
+    console.result({"capture": str(out), **metrics}, [*_lines(summary), f"wrote {out}"])
     return 3 if summary.loss.damaged else 0
 
 
-def _lines(summary: "CaptureSummary", offset: "ClockOffset | None") -> list[str]:
+def _lines(summary: "CaptureSummary") -> list[str]:
     lines = table(["camera", "frames"], sorted(summary.num_frames.items()))
     lost = asdict(summary.loss).items()
     lines += [f"{key.replace('_', ' ')}: {value}" for key, value in lost if value and key != "notes"]
     lines += [f"note: {note}" for note in summary.loss.notes]
-    lines += [] if offset is None else [f"note: {offset.sentence}"]
     return [*lines, f"joint states: {summary.num_joint_states}"]
 
 

@@ -134,8 +134,8 @@ class CaptureSource:
             self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
             return None
         intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
-        return Shot(
-            frame=RgbdFrame(
+        return Shot.of(
+            RgbdFrame(
                 stamp_ns=int(row["stamp_ns"]),
                 camera=row["camera"],
                 color=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8),

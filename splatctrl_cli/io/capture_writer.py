@@ -73,7 +73,7 @@ def write_capture(
                 continue
             row, kept = _row(item, cameras), journal.kept()
             if kept is None:
-                journal.add(_write_shot(folder, item, row, cameras[item.frame.camera]))
+                journal.add(_write_shot(folder, item, row, cameras[item.camera]))
             else:
                 check_same_frame(folder, kept.row, row)
                 num_resumed += 1
@@ -132,22 +132,21 @@ def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics:
 
 def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
     """The frame's row of frames.csv, but for the suffixes of its files; its camera is counted."""
-    frame = shot.frame
-    if frame.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(frame.camera):
-        raise InputError(f"{shot.origin}: camera {frame.camera!r}: cannot name a folder", remedy="name it otherwise")
+    if shot.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(shot.camera):
+        raise InputError(f"{shot.origin}: camera {shot.camera!r}: cannot name a folder", remedy="name it otherwise")
     unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
-    camera = cameras.setdefault(frame.camera, {**asdict(frame.intrinsics), "depth_scale": unit, "num_frames": 0})
-    if any(camera[name] != value for name, value in asdict(frame.intrinsics).items()):
+    camera = cameras.setdefault(shot.camera, {**asdict(shot.intrinsics), "depth_scale": unit, "num_frames": 0})
+    if any(camera[name] != value for name, value in asdict(shot.intrinsics).items()):
         raise InputError(
-            f"{shot.origin}: camera {frame.camera} changes its lens, and a capture holds one of each camera",
+            f"{shot.origin}: camera {shot.camera} changes its lens, and a capture holds one of each camera",
             remedy="leave --holdout to `reconstruct` and `score`",
         )
     camera["num_frames"] += 1
-    T = frame.T_world_camera
+    T = shot.T_world_camera
     pose = [repr(float(value)) for value in (*T[:3, 3], *quat_from_rotation(T[:3, :3]))]
     return {
-        "camera": frame.camera,
-        "stamp_ns": str(frame.stamp_ns),
+        "camera": shot.camera,
+        "stamp_ns": str(shot.stamp_ns),
         **dict(zip(COLUMNS[4:11], pose, strict=True)),
         "source": shot.origin,
     }
@@ -155,21 +154,20 @@ def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
 
 def _write_shot(folder: Path, shot: Shot, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
     """Write the images of a frame whose row is without their names."""
-    frame = shot.frame
     sums: list[tuple[str, str]] = []
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
     color = shot.color_file
     if color is None:
-        color = encoded(cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+        color = encoded(cv2.cvtColor(shot.color, cv2.COLOR_RGB2BGR))
     is_png = color.startswith(b"\x89PNG")
-    color_name = f"color/{frame.camera}/{stem}.{'png' if is_png else 'jpg'}"
+    color_name = f"color/{shot.camera}/{stem}.{'png' if is_png else 'jpg'}"
     kind, depth = _depth_file(shot, unit)
-    depth_name = f"depth/{frame.camera}/{stem}.{kind}"
+    depth_name = f"depth/{shot.camera}/{stem}.{kind}"
     files = {color_name: color, depth_name: depth}
     named = {"color": color_name, "depth": depth_name}
-    if frame.human is not None:
-        named["human"] = f"human/{frame.camera}/{stem}.png"
-        files[named["human"]] = encoded(frame.human * np.uint8(255))
+    if shot.human is not None:
+        named["human"] = f"human/{shot.camera}/{stem}.png"
+        files[named["human"]] = encoded(shot.human * np.uint8(255))
     for name, data in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -193,8 +191,8 @@ def _depth_file(shot: Shot, unit: float) -> tuple[str, bytes]:
     """Suffix and bytes of the depth image: the recorded PNG where it counts in the camera's unit."""
     if shot.depth_file is not None and shot.depth_unit == unit:
         return "png", shot.depth_file
-    counts = _counts(shot.frame.depth, unit, is_exact=shot.depth_unit is not None)
-    return ("npy", _npy(shot.frame.depth)) if counts is None else ("png", encoded(counts))
+    counts = _counts(shot.depth, unit, is_exact=shot.depth_unit is not None)
+    return ("npy", _npy(shot.depth)) if counts is None else ("png", encoded(counts))
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:

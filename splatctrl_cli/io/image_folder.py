@@ -139,8 +139,8 @@ class ImageFolderSource:
         human = None if view.human is None else self._human(view.human, lens)
         is_counts = lens.registration is None and self._description.depth.encoding != "float32"
         is_plain = lens.undistortion is None and is_kept(color_bytes)
-        return Shot(
-            frame=RgbdFrame(
+        return Shot.of(
+            RgbdFrame(
                 stamp_ns=view.stamp_ns,
                 camera=view.camera,
                 color=np.asarray(color, dtype=np.uint8),

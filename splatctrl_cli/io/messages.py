@@ -1,7 +1,9 @@
 """Images of sensor_msgs messages as arrays: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m]."""
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import cv2
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.io.decoder import IMAGE, UndecodableMessageError, stamp_ns
 from splatctrl_cli.io.encodings import BAYER, COLOR_CONVERSIONS, DEPTH_ENCODINGS, raw_pixels, to_rgb
+from splatctrl_cli.io.image_file import JPEG, PNG, TAIL, image_head
 from splatctrl_cli.io.rvl import decode_rvl
 from splatctrl_cli.records import Float32, UInt8
 
@@ -24,34 +27,37 @@ __all__ = [
 ]
 
 MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
-_CLOSING_MARKS = ((b"\xff\xd8\xff", b"\xff\xd9"), (b"\x89PNG", b"IEND"))
+_CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
+_DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
-_TAIL = 64  # bytes in which the closing mark of a file stands; some encoders pad
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMessage:
     """An image as recorded.
 
-    pixels (H, W[, channels]) in `encoding`; compressed is the image file's bytes where the message held one
-    (JPEG, PNG), which decode to `pixels` in OpenCV's BGR order.
+    width, height [px]; decode gives pixels (H, W[, channels]) in `encoding`, or raises UndecodableMessageError;
+    compressed is the image file's bytes where the message held one (JPEG, PNG) that decodes to `pixels` in OpenCV's
+    BGR order.
     """
 
     stamp_ns: int
     frame_id: str
     encoding: str
-    pixels: NDArray[Any]
+    width: int
+    height: int
+    decode: Callable[[], NDArray[Any]]
     compressed: bytes | None = None
 
-    @property
-    def width(self) -> int:
-        """Columns [px]."""
-        return int(self.pixels.shape[1])
+    @cached_property
+    def pixels(self) -> NDArray[Any]:
+        """Those of `decode`, once."""
+        return self.decode()
 
     @property
-    def height(self) -> int:
-        """Rows [px]."""
-        return int(self.pixels.shape[0])
+    def is_counts(self) -> bool:
+        """Whether depth is whole counts of a unit."""
+        return self.encoding != "32FC1"
 
     @property
     def kind(self) -> str:
@@ -66,19 +72,58 @@ class ImageMessage:
         return self.encoding in {"mono8", "8UC1"}
 
 
-def read_image(message: Any, type_name: str) -> ImageMessage:
-    """The image of a decoded sensor_msgs/Image or CompressedImage. Raises UndecodableMessageError."""
+def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMessage:
+    """The image of a decoded sensor_msgs/Image or CompressedImage. Raises UndecodableMessageError.
+
+    lazily: leave a JPEG or PNG of a plain kind undecoded until its pixels are asked for; it is whole as far as its
+    marks and checksums say.
+    """
     if type_name == IMAGE:
-        pixels, encoding, compressed = raw_pixels(message), message.encoding, None
-    else:
-        pixels, encoding, compressed = _compressed_pixels(message.format, bytes(message.data))
+        pixels = raw_pixels(message)
+        return _image(message, message.encoding, pixels.shape, lambda: pixels, None)
+    data = bytes(message.data)
+    if lazily and (found := _plain(message.format, data)) is not None:
+        encoding, size, file, color = found
+        return _image(message, encoding, size, partial(_decoded, message.format, file, color=color), file)
+    pixels, encoding, compressed = _compressed_pixels(message.format, data)
+    return _image(message, encoding, pixels.shape, lambda: pixels, compressed)
+
+
+def _image(
+    message: Any, encoding: str, size: tuple[int, ...], decode: Callable[[], NDArray[Any]], compressed: bytes | None
+) -> ImageMessage:
     return ImageMessage(
         stamp_ns=stamp_ns(message.header),
         frame_id=message.header.frame_id.strip("/"),
         encoding=encoding,
-        pixels=pixels,
+        height=int(size[0]),
+        width=int(size[1]),
+        decode=decode,
         compressed=compressed,
     )
+
+
+def _plain(form: str, data: bytes) -> tuple[str, tuple[int, int], bytes, bool] | None:
+    """Encoding, (height, width), file and whether it is colour of a file that needs no decoding to be kept."""
+    is_depth = "compressedDepth" in form
+    recorded = form.partition(";")[0].strip()
+    if is_depth and ("rvl" in form.lower() or recorded == "32FC1"):
+        return None
+    file = data[_DEPTH_HEAD:] if is_depth else data
+    head = image_head(file)
+    if head is None or (is_depth and head.channels != 1) or recorded in BAYER:
+        return None
+    size = (head.height, head.width)
+    if is_depth or (head.channels, head.bits) == (1, 16):
+        return ("16UC1", size, file, False) if head.bits == 16 else None
+    return ("mono8" if head.channels == 1 else "bgr8", size, file, head.channels != 1)
+
+
+def _decoded(form: str, data: bytes, *, color: bool) -> NDArray[Any]:
+    pixels = decode_file(data, color=color)
+    if pixels is None:
+        raise UndecodableMessageError(f"compressed image ({form}): {len(data)} bytes that are no image file")
+    return pixels
 
 
 def color_of(image: ImageMessage) -> UInt8:
@@ -91,7 +136,7 @@ def depth_of(image: ImageMessage, scale: float | None) -> Float32:
 
     `scale` [m per count]: default 1 mm for integers, 1 for floats.
     """
-    if image.pixels.dtype.kind == "u":
+    if image.is_counts:
         return metres(image.pixels, MILLIMETRE if scale is None else scale)
     values = image.pixels * np.float32(1.0 if scale is None else scale)
     return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
@@ -112,7 +157,7 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 
     None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
     """
-    if any(data.startswith(start) and end not in data[-_TAIL:] for start, end in _CLOSING_MARKS):
+    if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
         return None
     if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
         return None
@@ -130,28 +175,27 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:
     if "compressedDepth" in form:
         return _compressed_depth(form, data)
-    pixels = decode_file(data, color=False)
-    if pixels is None:
-        raise UndecodableMessageError(f"compressed image ({form}): {len(data)} bytes that are no image file")
+    pixels = _decoded(form, data, color=False)
     if pixels.ndim == 2 and pixels.dtype == np.uint16:
         return pixels, "16UC1", data
-    color = decode_file(data, color=pixels.ndim != 2)
-    assert color is not None
+    if pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] != 3):
+        pixels = _decoded(form, data, color=pixels.ndim != 2)  # to three channels of eight bits
     recorded = form.partition(";")[0].strip()
-    if color.ndim == 2 and recorded in BAYER:
-        return color, recorded, None  # a mosaic in a file: its bytes are no colour image
-    return color, "mono8" if color.ndim == 2 else "bgr8", data
+    if pixels.ndim == 2 and recorded in BAYER:
+        return pixels, recorded, None  # a mosaic in a file: its bytes are no colour image
+    return pixels, "mono8" if pixels.ndim == 2 else "bgr8", data
 
 
-def _compressed_depth(form: str, data: bytes) -> tuple[NDArray[Any], str, None]:
+def _compressed_depth(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:
     """compressed_depth_image_transport: 12 bytes (int32, two float32 A, B), then a PNG or the sizes (two int32) and
     RVL; 32FC1 is A / (count - B) (its codec.cpp and rvl_codec.cpp).
     """
-    counts = _rvl_counts(data[12:]) if "rvl" in form.lower() else decode_file(data[12:], color=False)
+    is_rvl, file = "rvl" in form.lower(), data[_DEPTH_HEAD:]
+    counts = _rvl_counts(file) if is_rvl else decode_file(file, color=False)
     if counts is None or counts.ndim != 2:
         raise UndecodableMessageError(f"compressed depth ({form}): {len(data)} bytes that hold no depth image")
     if not form.strip().startswith("32FC1"):
-        return counts, "16UC1", None
+        return counts, "16UC1", None if is_rvl or counts.dtype != np.uint16 else file
     _, a, b = struct.unpack_from("<iff", data)
     with np.errstate(divide="ignore"):
         depth = np.where(counts > 0, a / (counts.astype(np.float64) - b), 0.0)

@@ -76,4 +76,4 @@ class RigFolderSource:
 
 
 def _stamp_ns(item: Shot | JointState) -> int:
-    return item.frame.stamp_ns if isinstance(item, Shot) else item.stamp_ns
+    return item.stamp_ns

@@ -1,14 +1,13 @@
 """A ROS log as records: cameras found, colour and depth paired, poses from tf, joints in one order.
 
 Two passes: the first takes all but the images (transforms may follow the images that need them) and plans every
-frame; the second decodes only planned images and holds no more of them than the log's disorder demands.
+frame; the second takes only planned images and holds no more of them than the log's disorder demands. For `ingest`,
+files that a capture can hold as they are stay undecoded.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-
-import numpy as np
+from functools import cached_property, partial
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
@@ -24,7 +23,7 @@ from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.io.shot import Place, Shot, check_depth, is_kept, is_png, merged
 from splatctrl_cli.io.survey import Survey, survey
-from splatctrl_cli.records import Float64, JointState, LossReport, Record, RgbdFrame, UInt8
+from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8
 
 _SECOND = 1_000_000_000
 
@@ -79,13 +78,16 @@ class RosLogSource:
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
-        for item in self.shots():
+        for item in self._merged(lazily=False):
             yield item.frame if isinstance(item, Shot) else item
 
     def shots(self) -> Iterator[Shot | JointState]:
-        """Joint states and shots by stamp."""
+        """Joint states and shots by stamp; image files that need no change are only decoded on demand."""
+        return self._merged(lazily=True)
+
+    def _merged(self, *, lazily: bool) -> Iterator[Shot | JointState]:
         self._damage, self._num_invalid = Damage(), 0
-        return merged(self._joints, self._shots())
+        return merged(self._joints, self._shots(lazily=lazily))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every planned frame."""
@@ -170,17 +172,22 @@ class RosLogSource:
         self._loss.without_pose += len(pairs) - len(planned)
         return planned
 
-    def _shots(self) -> Iterator[Shot]:
+    def _shots(self, *, lazily: bool) -> Iterator[Shot]:
         images = _PlannedImages(self._log, self._plan)
         checked: set[str] = set()
-        for planned, (color, depth, *masks), places in images.of_frames(self._damage):
+
+        def decodes(camera: Camera) -> bool:
+            return not lazily or camera.name not in checked  # the first depth is looked at
+
+        for planned, (color, depth, *masks), places in images.of_frames(self._damage, decodes):
             human = self._human(planned.camera, masks[0]) if masks else None
-            self._num_invalid += num_invalid(depth.pixels)
-            shot = replace(_shot(planned, color, depth, human), places=places)
+            if not depth.is_counts:
+                self._num_invalid += num_invalid(depth.pixels)
+            shot = _shot(planned, color, depth, human, places)
             camera = planned.camera
             if camera.name not in checked:
                 scale = _scale(depth, camera.depth_scale)
-                if check_depth(shot.frame.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
+                if check_depth(shot.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
                     checked.add(camera.name)
             yield shot
 
@@ -201,8 +208,13 @@ class _PlannedImages:
             for key in _keys(planned):
                 self._uses[key] = self._uses.get(key, 0) + 1
 
-    def of_frames(self, damage: Damage) -> Iterator[tuple[_Planned, list[ImageMessage], tuple[Place, ...]]]:
-        """Yield each planned frame with its colour, depth and mask, and their places; what fails goes to `damage`."""
+    def of_frames(
+        self, damage: Damage, decodes: Callable[[Camera], bool]
+    ) -> Iterator[tuple[_Planned, list[ImageMessage], tuple[Place, ...]]]:
+        """Yield each planned frame with its colour, depth and mask, and their places; what fails goes to `damage`.
+
+        decodes: whether all of a camera's images are decoded, and not only those that a capture cannot keep.
+        """
         topics = {key[0] for key in self._uses}
         numbers = dict.fromkeys(topics, 0)
         decoder = MessageDecoder()
@@ -217,8 +229,13 @@ class _PlannedImages:
                 planned = self._plan[position]
                 position += 1
                 taken = [self._take(key) for key in _keys(planned)]
+                kept = (False,) * 3 if decodes(planned.camera) else _kept(planned.camera)
                 try:
-                    images = [read_image(decoder.decode(m), m.topic.type_name) for m in taken]
+                    images = [
+                        read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
+                        for message, lazily in zip(taken, kept, strict=False)
+                    ]
+                    _check_sizes(planned.camera, *images[:2])
                 except UndecodableMessageError as error:
                     damage.add(f"camera {planned.camera.name} at {planned.stamp_ns} ns: {error}")
                     continue
@@ -239,41 +256,63 @@ def _keys(planned: _Planned) -> list[tuple[str, int]]:
     return keys if planned.human_index is None else [*keys, (camera.human_topic, planned.human_index)]
 
 
-def _shot(planned: _Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None) -> Shot:
+def _kept(camera: Camera) -> tuple[bool, bool, bool]:
+    """Whether image files of colour, depth and masks go into a capture as they are."""
+    is_plain = camera.undistortion is None
+    return is_plain, is_plain and camera.depth_to_color is None, False
+
+
+def _check_sizes(camera: Camera, color: ImageMessage, depth: ImageMessage) -> None:
+    """Raise UndecodableMessageError for images of another size than the camera's."""
+    registration = camera.depth_to_color
+    for image, lens in (
+        (color, camera.intrinsics),
+        (depth, camera.intrinsics if registration is None else registration.depth_intrinsics),
+    ):
+        if (image.width, image.height) != (lens.width, lens.height):
+            raise UndecodableMessageError(
+                f"expected an image of {lens.width}x{lens.height}, got {image.width}x{image.height}"
+            )
+
+
+def _shot(
+    planned: _Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, places: tuple[Place, ...]
+) -> Shot:
     camera = planned.camera
-    scale = camera.depth_scale
-    pixels, metres = color_of(color), depth_of(depth, scale)
-    is_counts = depth.pixels.dtype.kind == "u"
-    if camera.undistortion is not None:
-        pixels = camera.undistortion.color(pixels)
-        if camera.depth_to_color is None:
-            metres = camera.undistortion.depth(metres)
-    if camera.depth_to_color is not None:
-        metres = camera.depth_to_color.warp(metres)
-        is_counts = False
-    frame = RgbdFrame(
+    is_counts = depth.is_counts and camera.depth_to_color is None
+    keeps_color, keeps_depth, _ = _kept(camera)
+    return Shot(
         stamp_ns=planned.stamp_ns,
         camera=camera.name,
-        color=pixels,
-        depth=metres,
         intrinsics=camera.intrinsics,
         T_world_camera=planned.T_world_camera,
+        read_color=partial(_color, camera, color),
+        read_depth=partial(_depth, camera, depth),
         human=human,
-    )
-    is_own_png = is_counts and camera.undistortion is None and depth.pixels.dtype == np.uint16
-    return Shot(
-        frame=frame,
-        depth_file=depth.compressed if is_own_png and is_png(depth.compressed) else None,
-        color_file=color.compressed if camera.undistortion is None and is_kept(color.compressed) else None,
-        depth_unit=_scale(depth, scale) if is_counts else None,
+        color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
+        depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
+        depth_unit=_scale(depth, camera.depth_scale) if is_counts else None,
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
+        places=places,
     )
+
+
+def _color(camera: Camera, image: ImageMessage) -> UInt8:
+    pixels = color_of(image)
+    return pixels if camera.undistortion is None else camera.undistortion.color(pixels)
+
+
+def _depth(camera: Camera, image: ImageMessage) -> Float32:
+    metres = depth_of(image, camera.depth_scale)
+    if camera.depth_to_color is not None:
+        return camera.depth_to_color.warp(metres)
+    return metres if camera.undistortion is None else camera.undistortion.depth(metres)
 
 
 def _scale(depth: ImageMessage, scale: float | None) -> float:
     if scale is not None:
         return scale
-    return MILLIMETRE if depth.pixels.dtype.kind == "u" else 1.0
+    return MILLIMETRE if depth.is_counts else 1.0
 
 
 def _check_not_empty(log: RawLog, found: Survey) -> None:

@@ -1,13 +1,16 @@
-"""A frame together with how its source stored it, so that `ingest` can keep what is lossless."""
+"""A frame together with how its source stored it, so that `ingest` can keep what is lossless without decoding it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Float32, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.io.decoder import UndecodableMessageError
+from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RecordSource, RgbdFrame, UInt8
 
 PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
 
@@ -26,20 +29,73 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """A frame and its source.
+    """A frame whose images are decoded when they are asked for, and how its source stored them.
 
-    color_file: the bytes of a JPEG or PNG that decode to exactly `frame.color`, None where there are none;
-    depth_file: those of a 16-bit PNG of which `frame.depth` is exactly ``counts * float32(depth_unit)``, or None;
+    read_color, read_depth: give the frame's color and depth, or raise UndecodableMessageError;
+    color_file: the bytes of a JPEG or PNG that decode to exactly the frame's color, None where there are none;
+    depth_file: those of a 16-bit PNG of which the depth is exactly ``counts * float32(depth_unit)``, or None;
     depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
     origin: where it came from, in words; places: of the colour and the depth message, empty where there are none.
     """
 
-    frame: RgbdFrame
+    stamp_ns: int
+    camera: str
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+    read_color: Callable[[], UInt8]
+    read_depth: Callable[[], Float32]
     color_file: bytes | None
     depth_unit: float | None
     origin: str
+    human: UInt8 | None = None
     places: tuple[Place, ...] = ()
     depth_file: bytes | None = None
+
+    @classmethod
+    def of(cls, frame: RgbdFrame, **stored: Any) -> "Shot":
+        """A shot of a frame that is decoded already."""
+        return cls(
+            stamp_ns=frame.stamp_ns,
+            camera=frame.camera,
+            intrinsics=frame.intrinsics,
+            T_world_camera=frame.T_world_camera,
+            read_color=lambda: frame.color,
+            read_depth=lambda: frame.depth,
+            human=frame.human,
+            **stored,
+        )
+
+    @cached_property
+    def color(self) -> UInt8:
+        """Of the frame. Raises InputError where the image does not decode."""
+        with self._refused():
+            return self.read_color()
+
+    @cached_property
+    def depth(self) -> Float32:
+        """Of the frame. Raises InputError where the image does not decode."""
+        with self._refused():
+            return self.read_depth()
+
+    @property
+    def frame(self) -> RgbdFrame:
+        """The frame, with both images decoded. Raises InputError where one does not."""
+        return RgbdFrame(
+            stamp_ns=self.stamp_ns,
+            camera=self.camera,
+            color=self.color,
+            depth=self.depth,
+            intrinsics=self.intrinsics,
+            T_world_camera=self.T_world_camera,
+            human=self.human,
+        )
+
+    @contextmanager
+    def _refused(self) -> Iterator[None]:
+        try:
+            yield
+        except UndecodableMessageError as error:
+            raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
 
 
 class ShotSource(RecordSource, Protocol):
@@ -73,7 +129,7 @@ def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot
     """Joint states (sorted) and shots (sorted) by stamp, joint states first."""
     position = 0
     for shot in shots:
-        while position < len(joints) and joints[position].stamp_ns <= shot.frame.stamp_ns:
+        while position < len(joints) and joints[position].stamp_ns <= shot.stamp_ns:
             yield joints[position]
             position += 1
         yield shot

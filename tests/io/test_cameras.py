@@ -1,6 +1,7 @@
 """Cameras found in the topic names that real drivers use."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -41,9 +42,15 @@ def log_with(*topics: Has) -> Survey:
                 frame_id=has.frame,
             )
         else:
-            pixels = np.zeros((has.size[1], has.size[0]), np.uint8)
+            width, height = has.size
             entry.first_image = ImageMessage(
-                stamp_ns=0, frame_id=has.frame, encoding=has.encoding, pixels=pixels, compressed=compressed
+                stamp_ns=0,
+                frame_id=has.frame,
+                encoding=has.encoding,
+                width=width,
+                height=height,
+                decode=partial(np.zeros, (height, width), np.uint8),
+                compressed=compressed,
             )
         survey.topics[has.name] = entry
     return survey

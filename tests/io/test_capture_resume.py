@@ -25,8 +25,8 @@ def interrupted(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch, after: in
     """The partial folder of an ingest that was stopped after some frames."""
     shots = ros_log.RosLogSource._shots
 
-    def stopping(self: ros_log.RosLogSource) -> Iterator[Shot]:
-        for number, shot in enumerate(shots(self)):
+    def stopping(self: ros_log.RosLogSource, *, lazily: bool) -> Iterator[Shot]:
+        for number, shot in enumerate(shots(self, lazily=lazily)):
             if number == after:
                 raise KeyboardInterrupt
             yield shot

@@ -1,0 +1,88 @@
+"""What a JPEG or PNG file says of itself, and whether it is whole, without decoding it."""
+
+import struct
+import zlib
+from dataclasses import dataclass
+
+JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+TAIL = 64  # bytes in which the closing mark of a file stands; some encoders pad
+MOST_PIXELS = 1 << 27  # of an image that is left undecoded; OpenCV's own bound is 2^30
+_JPEG_FRAMES = frozenset({0xC0, 0xC1, 0xC2})  # baseline, extended, progressive; Huffman coded
+_JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
+_PNG_CHANNELS = {0: 1, 2: 3}  # by colour type: grey, RGB
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageHead:
+    """Size [px], channels (1 or 3) and bits of a channel of a file whose bytes can be kept as they are."""
+
+    width: int
+    height: int
+    channels: int
+    bits: int
+
+
+def image_head(data: bytes) -> ImageHead | None:
+    """The head of a whole JPEG or PNG of the plain kinds; None for any other, which only decoding can judge.
+
+    Plain are Huffman-coded JPEG of 8 bits, grey or of three channels, up to its closing mark, and PNG of grey or RGB
+    without transparency or interlace, every chunk of which has the checksum that it says (ITU-T T.81; W3C PNG).
+    """
+    head = (_jpeg_head if data.startswith(JPEG) else _png_head)(data)
+    if head is None or not 0 < head.width * head.height <= MOST_PIXELS:
+        return None
+    return head
+
+
+def _jpeg_head(data: bytes) -> ImageHead | None:
+    if b"\xff\xd9" not in data[-TAIL:]:
+        return None
+    at, head = 2, None
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a byte of filling
+            at += 1
+            continue
+        if marker in _JPEG_BARE:
+            at += 2
+            continue
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        if length < 2 or marker == 0xD9:
+            return None
+        if marker == 0xDA:  # the picture begins
+            return head
+        if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
+            if marker not in _JPEG_FRAMES or head is not None or at + 10 > len(data):
+                return None
+            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+            if bits != 8 or channels not in {1, 3}:
+                return None
+            head = ImageHead(width=width, height=height, channels=channels, bits=bits)
+        at += 2 + length
+    return None
+
+
+def _png_head(data: bytes) -> ImageHead | None:
+    if not data.startswith(PNG):
+        return None
+    at, head, has_pixels = len(PNG), None, False
+    view = memoryview(data)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length
+        if end > len(data) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return None
+        if (kind == b"IHDR") != (head is None) or kind == b"tRNS":
+            return None
+        if kind == b"IHDR":
+            if length != 13:
+                return None
+            width, height, bits, color, _, _, interlace = struct.unpack_from(">IIBBBBB", data, at + 8)
+            if interlace or bits not in {8, 16} or color not in _PNG_CHANNELS:
+                return None
+            head = ImageHead(width=width, height=height, channels=_PNG_CHANNELS[color], bits=bits)
+        has_pixels |= kind == b"IDAT"
+        if kind == b"IEND":
+            return head if has_pixels else None
+        at = end
+    return None
