@@ -115,8 +115,9 @@ class ListedView:
 class Description:
     """A whole description; camera and frames may be left to a transforms.json, poses to --camera-pose.
 
-    listed: the views of a layout, instead of frames; unpaired: colour and depth files without partner; notes: what a
-    layout leaves open and was taken as usual.
+    listed: the views of a layout, instead of frames; is_depth_resized: depth of another size shows the same view and
+    is brought to the size of colour by nearest pixels; unpaired: colour and depth files without partner; notes: what
+    a layout leaves open and was taken as usual.
     """
 
     path: Path
@@ -129,6 +130,7 @@ class Description:
     stamps: StampsTable
     split: SplitTable
     listed: tuple[ListedView, ...] = ()
+    is_depth_resized: bool = False
     unpaired: tuple[int, int] = (0, 0)
     notes: tuple[str, ...] = ()
 
@@ -205,7 +207,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
-    known = {f.name for f in fields(Description)} - {"path", "listed", "unpaired", "notes"}
+    known = {f.name for f in fields(Description)} - {"path", "listed", "is_depth_resized", "unpaired", "notes"}
     _check_keys(content, known, str(path), "")
     folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
     if not folder.is_dir():

@@ -130,6 +130,8 @@ class ImageFolderSource:
         lens = self._lens(view)
         _check_size(view.color, bgr, view.lens)
         color = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        if self._description.is_depth_resized:
+            depth = cv2.resize(depth, (view.lens.width, view.lens.height), interpolation=cv2.INTER_NEAREST)
         _check_size(view.depth, depth, self._description.depth_camera or view.lens)
         if lens.registration is not None:
             depth = lens.registration.warp(depth)
@@ -144,7 +146,7 @@ class ImageFolderSource:
                 stamp_ns=view.stamp_ns,
                 camera=view.camera,
                 color=np.asarray(color, dtype=np.uint8),
-                depth=depth,
+                depth=np.asarray(depth, dtype=np.float32),
                 intrinsics=lens.intrinsics,
                 T_world_camera=view.T_world_camera,
                 human=human,

@@ -26,6 +26,8 @@ from splatctrl_cli.records import Float64
 
 CAMERA = "camera"  # the name of a layout's only lens
 MILLIMETRE = 1e-3
+SAME = 1e-6  # largest entry of a matrix that is the identity
+_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 
 
 class Lenses:
@@ -58,6 +60,7 @@ def described(
     depth_camera: CameraTable | None = None,
     depth: DepthTable | None = None,
     has_stamps: bool = False,
+    is_depth_resized: bool = False,
     unpaired: tuple[int, int] = (0, 0),
     notes: tuple[str, ...] = (),
 ) -> Description:
@@ -81,6 +84,7 @@ def described(
         stamps=StampsTable(names=has_stamps),
         split=SplitTable(),
         listed=tuple(views),
+        is_depth_resized=is_depth_resized,
         unpaired=unpaired,
         notes=notes,
     )
@@ -99,6 +103,13 @@ def pinhole(values: Sequence[float], image: Path, distortion: Sequence[float] = 
     return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=list(distortion))
 
 
+def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
+    """The depth camera with its place in the colour camera; None where it is the colour camera."""
+    if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= SAME:
+        return None
+    return replace(depth, depth_to_color=T_color_depth.tolist())
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Columns and rows of an image file. Raises InputError where it is none."""
     try:
@@ -112,7 +123,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def images_of(folder: Path) -> dict[str, Path]:
     """Image files by stem, in the order of the numbers in their names."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in {".png", ".jpg", ".jpeg"}]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES]
     return {path.stem: path for path in sorted(files, key=lambda p: by_numbers(p.stem))}
 
 

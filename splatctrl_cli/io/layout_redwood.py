@@ -1,6 +1,9 @@
 """Open3D's and Redwood's scenes: a colour folder, ``depth/``, ``trajectory.log`` and ``camera_intrinsic.json``.
 
-Images go by their place in natural order, as in Open3D's reconstruction system
+Names are those that Open3D's data classes unpack (open3d.data: RedwoodIndoorLivingRoom1 with ``colors/``,
+LoungeRGBDImages, BedroomRGBDImages). Poses are camera to world: the reconstruction system writes those whose inverse
+it integrates with (examples/python/reconstruction_system/integrate_scene.py). Images go by their place in natural
+order, as in Open3D's reconstruction system
 (examples/python/reconstruction_system/open3d_example.py, get_rgbd_file_lists); where the trajectory has more poses
 than there are images, by the number in the file name.
 """
@@ -14,8 +17,16 @@ from splatctrl_cli.io.layout import described, given_lens, images_of, read_json
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.poses import read_trajectory_log
 
-COLOR_FOLDERS = ("color", "image", "rgb")
-TRAJECTORIES = ("trajectory.log", "scene/trajectory.log", "trajectory_*.log", "*-traj.txt", "odometry.log")
+COLOR_FOLDERS = ("color", "colors", "image", "rgb")
+TRAJECTORIES = (
+    "trajectory.log",
+    "scene/trajectory.log",  # as run_system.py writes it
+    "trajectory_*.log",
+    "*_trajectory.log",  # Stanford's scenes (lounge_trajectory.log)
+    "*-traj.txt",  # augmented ICL-NUIM (livingroom1-traj.txt)
+    "odometry.log",
+    "bedroom.log",
+)
 INTRINSICS = ("camera_intrinsic.json", "camera_intrinsics.json", "intrinsic.json", "camera_primesense.json")
 
 

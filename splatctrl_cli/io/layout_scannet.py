@@ -1,69 +1,56 @@
-"""ScanNet as its SensReader exports it: ``color/``, ``depth/``, ``pose/``, ``intrinsic/``.
+"""ScanNet as its SensReader exports it: ``color/``, ``depth/``, ``pose/`` and ``intrinsic/``.
 
 Numbers in the names, depth in millimetres in a camera of its own, poses camera to world with -inf where tracking was
-lost (SensReader/python/SensorData.py; "Data Organization" of the dataset's page).
+lost (SensReader/python/SensorData.py). The subset scannet_frames_25k has ``intrinsics_color.txt`` and
+``intrinsics_depth.txt`` instead of the last folder.
 """
 
 from pathlib import Path
 
-import numpy as np
-
-from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.io.layout import described, given_lens, images_of, pinhole, pose_or_none
+from splatctrl_cli.io.folder_description import DepthTable, Description, ListedView, PosesTable
+from splatctrl_cli.io.layout import described, images_of, pose_or_none
+from splatctrl_cli.io.layout_sens import read_text_files
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.poses import read_matrix_file
 from splatctrl_cli.records import Float64
 
-SAME = 1e-6  # largest entry of an extrinsic matrix that is no transform
-
 
 def matches(folder: Path) -> bool:
     """Whether the folder is such an export."""
-    return all((folder / name).is_dir() for name in ("color", "depth", "pose", "intrinsic"))
+    has_lenses = (folder / "intrinsic").is_dir() or (folder / "intrinsics_color.txt").is_file()
+    return has_lenses and all((folder / name).is_dir() for name in ("color", "depth", "pose"))
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
-    """The folder as a description; depth is registered to colour unless both have the same lens."""
+    """The folder as a description; depth is registered to colour unless both are the same camera."""
     colors, depths = images_of(folder / "color"), images_of(folder / "depth")
+    calibration = read_text_files(folder)
     views = [
-        ListedView(name=name, color=colors[name], depth=depths[name], matrix=_pose(folder / "pose" / f"{name}.txt"))
+        ListedView(
+            name=name,
+            color=colors[name],
+            depth=depths[name],
+            matrix=_pose(folder / "pose" / f"{name}.txt", calibration.T_base_color),
+        )
         for name in colors
         if name in depths
     ]
-    for name in ("extrinsic_color", "extrinsic_depth"):
-        file = folder / "intrinsic" / f"{name}.txt"
-        if file.is_file() and np.abs(read_matrix_file(file) - np.eye(4)).max() > SAME:
-            raise InputError(
-                f"{file}: expected the identity, as ScanNet's scans have, got a transform",
-                remedy="describe the folder in a .toml with [depth_camera] depth_to_color",
-            )
-    color_lens = depth_lens = None
+    color_lens = depth_camera = None
     if views:
-        color_lens = given_lens(options, views[0].color) or _lens(folder, "intrinsic_color", views[0].color)
-        depth_lens = _lens(folder, "intrinsic_depth", views[0].depth)
+        color_lens, depth_camera = calibration.cameras(views[0].color, views[0].depth, options)
     return described(
         folder,
         folder,
         views,
         poses=PosesTable(format="matrix-files", file="pose/*.txt"),
         camera=color_lens,
-        depth_camera=None if color_lens == depth_lens else depth_lens,
+        depth_camera=depth_camera,
+        depth=DepthTable(scale=calibration.depth_scale),
         unpaired=(len(colors) - len(views), len(depths) - len(views)),
     )
 
 
-def _pose(path: Path) -> Float64 | None:
-    return pose_or_none(read_matrix_file(path)) if path.is_file() else None
-
-
-def _lens(folder: Path, name: str, image: Path) -> CameraTable:
-    file = folder / "intrinsic" / f"{name}.txt"
-    K = read_matrix_file(file)
-    lens = pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), image)
-    if abs(2 * lens.cx - lens.width) > 0.25 * lens.width:
-        raise InputError(
-            f"{file}: cx {lens.cx:g} is not near the middle of {image.name}, {lens.width} columns wide",
-            remedy="scale the intrinsics with the images, or give --intrinsics camera=FX,FY,CX,CY",
-        )
-    return lens
+def _pose(path: Path, T_base_color: Float64) -> Float64 | None:
+    """T_world_color, None where the frame has no pose."""
+    matrix = pose_or_none(read_matrix_file(path)) if path.is_file() else None
+    return None if matrix is None else matrix @ T_base_color

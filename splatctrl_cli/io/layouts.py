@@ -6,10 +6,13 @@ from pathlib import Path
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io import (
+    layout_arkit,
     layout_bop,
     layout_frames,
+    layout_icl,
     layout_nerfstudio,
     layout_redwood,
+    layout_replica,
     layout_scannet,
     layout_tum,
 )
@@ -35,6 +38,9 @@ LAYOUTS = tuple(
         ("ScanNet export", layout_scannet),
         ("7-Scenes", layout_frames),
         ("nerfstudio", layout_nerfstudio),
+        ("ICL-NUIM", layout_icl),
+        ("Replica", layout_replica),
+        ("ARKitScenes", layout_arkit),
         ("Open3D scene", layout_redwood),
     )
 )

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ AXES = ("opencv", "opengl")
 OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 MAX_ENTRY = 1e6  # [m] of a pose
 POSE_TOLERANCE_NS = 20_000_000  # before the first and after the last pose of a trajectory
+_MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes what is no number (12-Scenes)
 MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
 
 
@@ -83,17 +84,34 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
 def read_tum(path: Path) -> dict[str, Float64]:
     """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written."""
     poses: dict[str, Float64] = {}
+    for where, words, values in read_rows(path):
+        if len(values) != 8 or not 0 < np.linalg.norm(values[4:]) < np.inf:
+            raise InputError(
+                f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",
+                remedy="check [poses] format and file",
+            )
+        poses[words[0]] = transform_from(values[1:4], values[4:8])
+    return poses
+
+
+def read_matrix_lines(path: Path) -> list[Float64]:
+    """A 4x4 matrix in each line, by rows."""
+    poses = []
+    for where, _, values in read_rows(path):
+        if len(values) != 16:
+            raise InputError(
+                f"{where}: expected the 16 numbers of a 4x4 matrix, got {len(values)}", remedy="copy the file again"
+            )
+        poses.append(np.array(values).reshape(4, 4))
+    return poses
+
+
+def read_rows(path: Path) -> Iterator[tuple[str, list[str], list[float]]]:
+    """Place, words and numbers of each line that is neither empty nor a comment."""
     for index, line in enumerate(_lines(path)):
         if line and not line.startswith("#"):
-            words = line.split()
-            values = _numbers(words, f"{path}:{index + 1}")
-            if len(values) != 8 or np.linalg.norm(values[4:]) == 0:
-                raise InputError(
-                    f"{path}:{index + 1}: expected 'stamp tx ty tz qx qy qz qw', got {line!r}",
-                    remedy="check [poses] format and file",
-                )
-            poses[words[0]] = transform_from(values[1:4], values[4:8])
-    return poses
+            words, where = line.split(), f"{path}:{index + 1}"
+            yield where, words, _numbers(words, where)
 
 
 def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
@@ -169,7 +187,7 @@ def _matrix(lines: list[str], where: str) -> Float64:
 
 def _numbers(words: list[str], where: str) -> list[float]:
     try:
-        return [float(word) for word in words]
+        return [np.nan if _MSVC_NAN.fullmatch(word) else float(word) for word in words]
     except ValueError:
         raise InputError(
             f"{where}: expected numbers, got {' '.join(words)!r}", remedy="check [poses] format and file"
