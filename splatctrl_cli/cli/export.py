@@ -1,6 +1,7 @@
 """``splatctrl export``: splats in the formats that viewers open, read back and rendered before they count."""
 
 import argparse
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     source = _splat_file(args.scene)
     out = args.out or _beside(args.scene)
     kind = _format(out, args.layout)
-    if out.resolve() == source.resolve():
+    if os.path.realpath(out) == os.path.realpath(source):
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
     splats, comments = read_splats(source)
     selected = _select(splats, args.labels)
@@ -104,7 +105,7 @@ def _decibels(psnr: float | None) -> str:
 
 
 def _beside(scene: Path) -> Path:
-    place = scene if scene.name.strip(".") else scene.resolve()  # . and .. have no name of their own
+    place = scene if scene.name.strip(".") else Path(os.path.realpath(scene))  # . and .. have no name of their own
     suffix = "" if scene.is_dir() else scene.suffix
     return place.with_name(f"{place.name.removesuffix(suffix)}.ply")
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatctrl_cli import __version__
+from splatctrl_cli.cli.inputs import refuse_endless_files
 from splatctrl_cli.cli.parser import Parser
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 
@@ -51,6 +52,7 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     verbose = 0
+    refuse_endless_files()
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
     try:
         words = sys.argv[1:] if argv is None else argv
@@ -93,11 +95,11 @@ def _keep_inputs(args: argparse.Namespace) -> None:
     out = getattr(args, "out", None)
     if out is None:
         return
-    target = out.resolve()
+    target = Path(os.path.realpath(out))  # resolve() raises RuntimeError for a link to itself
     for name, given in vars(args).items():
         if name == "out" or not isinstance(given, Path):
             continue
-        source = given.resolve()
+        source = Path(os.path.realpath(given))
         if source == target or target in source.parents:
             raise UsageError(f"{out}: would replace the input {given}", remedy="give another --out")
 

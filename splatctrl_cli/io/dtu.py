@@ -165,7 +165,7 @@ def _images(folder: Path) -> dict[int, Path]:
 
 def read_image(path: Path) -> UInt8:
     """The image (H, W, 3) as RGB. Raises InputError for what is none."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
     if image is None:
         raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
     return np.ascontiguousarray(image[:, :, ::-1])
