@@ -20,11 +20,12 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 class SplitLog:
     """Files of one recording, read one after the other."""
 
-    def __init__(self, path: Path, parts: tuple[RawLog, ...], container: str) -> None:
+    def __init__(self, path: Path, parts: tuple[RawLog, ...], container: str, note: str = "") -> None:
+        """note: what is wrong with the folder itself, counted as damage; empty where nothing."""
         self.path = path
         self.files = tuple(file for part in parts for file in part.files)
         self.container = container
-        self._parts = parts
+        self._parts, self._note = parts, note
 
     def topics(self) -> tuple[Topic, ...]:
         """The topics of all parts, each once."""
@@ -32,6 +33,8 @@ class SplitLog:
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield the messages of each part in turn."""
+        if self._note:
+            damage.add(self._note)
         for part in self._parts:
             yield from part.messages(damage, names)
 
@@ -71,20 +74,28 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def _open_folder(path: Path) -> RawLog:
-    files = _ordered_files(path)
+    told, note = _metadata(path)
+    files = _ordered_files(path, told)
     missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise InputError(f"{path}: metadata.yaml names {missing[0]}, which is not there", remedy="copy the whole bag")
     if not files:
         raise InputError(f"{path}: a bag folder without .mcap or .db3 files", remedy="copy the whole bag")
-    told = _metadata(path)
-    if told.get("compression_mode"):
+    mode = str(told.get("compression_mode", "")).lower()
+    if mode:
         check_compression(path, str(told.get("compression_format")))
     parts = tuple(open_raw_log(file) for file in files)
     kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
-    log = SplitLog(path, parts, f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})")
-    is_by_message = str(told.get("compression_mode", "")).lower() == "message"
+    container = f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})"
+    log = SplitLog(path, parts, container, note)
+    is_by_message = mode == "message" or (not told and _begins_compressed(parts))
     return UnpackedMessagesLog(log) if is_by_message else log
+
+
+def _begins_compressed(parts: tuple[RawLog, ...]) -> bool:
+    """Whether the first message is a zstd frame: CDR begins with its own four bytes, of which the first is 0."""
+    first = next((message for part in parts for message in part.messages(Damage())), None)
+    return first is not None and first.data.startswith(_ZSTD)
 
 
 def _open_compressed(path: Path) -> RawLog:
@@ -101,11 +112,11 @@ def _open_compressed(path: Path) -> RawLog:
         raise InputError(f"{path}: {message}", remedy=error.remedy) from None
 
 
-def _ordered_files(path: Path) -> list[Path]:
+def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:
     """The storage files in recording order: as metadata.yaml lists them, else by the numbers in their names."""
-    names = _metadata(path).get("relative_file_paths")
+    names = told.get("relative_file_paths")
     if names:
-        return [path / Path(name).name for name in names]
+        return [path / Path(name).name for name in dict.fromkeys(names)]
     return sorted(_storage_files(path), key=lambda p: [int(n) for n in re.findall(r"\d+", p.name)])
 
 
@@ -113,12 +124,15 @@ def _storage_files(path: Path) -> list[Path]:
     return [p for p in sorted(path.iterdir()) if p.name.endswith((".mcap", ".db3", ".mcap.zstd", ".db3.zstd"))]
 
 
-def _metadata(path: Path) -> dict[str, Any]:
+def _metadata(path: Path) -> tuple[dict[str, Any], str]:
+    """What metadata.yaml says, and what is wrong with it; a bag can be read without."""
     file = path / "metadata.yaml"
     if not file.is_file():
-        return {}
+        return {}, ""
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-        return dict(content["rosbag2_bagfile_information"])
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError):
-        raise InputError(f"{file}: not the metadata of a ROS 2 bag", remedy="try 'ros2 bag reindex'") from None
+        told = dict(yaml.safe_load(file.read_text(encoding="utf-8"))["rosbag2_bagfile_information"])
+        if not all(isinstance(name, str) for name in told.get("relative_file_paths") or ()):
+            raise ValueError("a file's name is no text")
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):  # an undecodable text is a ValueError
+        return {}, f"{file.name}: is not the metadata of a ROS 2 bag; read without it, files by their numbers"
+    return told, ""

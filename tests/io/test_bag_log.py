@@ -91,3 +91,26 @@ def test_a_bag_folder_that_lacks_a_file_is_refused(tmp_path: Path) -> None:
     (bag / "bag.db3").unlink()
     with pytest.raises(InputError, match=r"metadata.yaml names bag.db3, which is not there"):
         open_source(bag)
+
+
+@pytest.mark.parametrize("text", ["a: [", "just words", "rosbag2_bagfile_information: 3", "\0", "[" * 9000, "split"])
+def test_a_damaged_metadata_yaml_costs_a_note_and_the_files_go_by_their_numbers(tmp_path: Path, text: str) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    whole = list(open_source(log).records())
+    bag = as_ros2_folder(log, tmp_path / "bag", StoragePlugin.SQLITE3)
+    file = bag / "metadata.yaml"
+    file.write_text(file.read_text().replace("- bag.db3", "- 7") if text == "split" else text)
+    source = open_source(bag)
+    assert_same(list(source.records()), whole)
+    assert source.loss.damaged == 1
+    assert source.loss.notes == [
+        "metadata.yaml: is not the metadata of a ROS 2 bag; read without it, files by their numbers"
+    ]
+
+
+def test_a_bag_that_names_a_file_twice_is_read_once(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    bag = as_ros2_folder(log, tmp_path / "bag", StoragePlugin.SQLITE3)
+    file = bag / "metadata.yaml"
+    file.write_text(file.read_text().replace("- bag.db3", "- bag.db3\n  - bag.db3"))
+    assert_same(list(open_source(bag).records()), list(open_source(log).records()))
