@@ -7,29 +7,33 @@ All other files are attachments, by their path.
 """
 
 import csv
-import hashlib
 import io
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.bag_log import open_raw_log
 from splatctrl_cli.io.capture import CaptureSource
 from splatctrl_cli.io.capture_writer import VERSION
+from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.io.mcap_file import McapFile
+from splatctrl_cli.io.mcap_records import ATTACHMENT, BadRecordError, Metadata, parse_record
 from splatctrl_cli.io.mcap_writer import MILLIMETRES, McapLog, mcap_log
 from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.raw_log import Damage
+from splatctrl_cli.io.unpacked_folder import NewFolder, attachment_at
 from splatctrl_cli.records import JointState, RgbdFrame
 
 MARK = "splatctrl-capture"  # name of the metadata record
 SUMS = "SHA256SUMS"
 DEPTH_HEAD = bytes(12)  # of compressed_depth_image_transport: its parameters, which 16UC1 does not use
 _TYPES = {".json": "application/json", ".csv": "text/csv", ".npz": "application/zip"}
+METADATA = 0x0C
+_AGAIN = "copy the file again"
 _IMAGES = ("color", "depth", "human")  # columns of frames.csv
 
 
@@ -54,31 +58,39 @@ def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | Non
             state = _add_state(log, state, source, states)
         for name in sorted(p.relative_to(capture).as_posix() for p in capture.rglob("*") if p.is_file()):
             if name not in images:
+                _check_inside(capture, name)
                 media_type = _TYPES.get(PurePosixPath(name).suffix, "application/octet-stream")
                 log.attach(name, media_type, (capture / name).read_bytes())
     return len(source)
 
 
+def _check_inside(capture: Path, name: str) -> None:
+    """Raise InputError for a link that leads out of the capture: the file behind it would be given away."""
+    if not Path(os.path.realpath(capture / name)).is_relative_to(os.path.realpath(capture)):
+        raise InputError(f"{capture / name}: leads out of the capture", remedy="remove the link")
+
+
 def unpack_capture(packed: Path, folder: Path) -> int:
     """Write the capture that `packed` holds into the empty `folder`; returns the number of frames.
 
-    Raises InputError where it holds none, or where a file is not what SHA256SUMS of the capture says.
+    Raises InputError where it holds none, where it is damaged, where a name in it is not that of one file below a
+    folder, and where a file is not what SHA256SUMS of the capture says.
     """
-    try:
-        with packed.open("rb") as stream:
-            reader = make_reader(stream, validate_crcs=True)
-            metadata = {record.name: record.metadata for record in reader.iter_metadata()}
-            if MARK not in metadata:
-                raise InputError(f"{packed}: not a packed capture", remedy="for other logs use `splatctrl ingest`")
-            written = {SUMS: ""}
-            for attachment in reader.iter_attachments():
-                written[attachment.name] = _write(folder, attachment.name, attachment.data)
-            num_frames = _unpack_images(folder, reader, written)
-    except (McapError, SerdeError, OSError, ValueError, EOFError, KeyError, StopIteration) as error:
-        if isinstance(error, OSError) and error.filename is not None:
-            raise
-        raise InputError(f"{packed}: cannot be unpacked: {error}", remedy="copy the file again") from None
-    _check_sums(packed, folder, written)
+    damage, names, attachments = Damage(), set[str](), []
+    for part in McapFile(packed).parts(damage):
+        if part.opcode == METADATA:
+            names.add(_metadata_name(part.content))
+        elif part.opcode == ATTACHMENT:
+            attachments.append(part.offset)
+    _check_whole(packed, damage)
+    if MARK not in names:
+        raise InputError(f"{packed}: not a packed capture", remedy="for other logs use `splatctrl ingest`")
+    target = NewFolder(folder)
+    with packed.open("rb") as stream:
+        for offset in attachments:
+            target.write(*attachment_at(stream, offset))
+    num_frames = _unpack_images(folder, packed, target)
+    _check_sums(packed, folder, target.digests)
     return num_frames
 
 
@@ -117,10 +129,9 @@ def _add_frame(
         log.add_image_file(f"/{camera}/people/mask/compressed", stamp, frame_id, "png", files["human"].read_bytes())
 
 
-def _unpack_images(folder: Path, reader: Any, written: dict[str, str]) -> int:
+def _unpack_images(folder: Path, packed: Path, target: NewFolder) -> int:
     """Write the images under the names that frames.csv gives them, in its order."""
-    with (folder / "frames.csv").open(newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = _rows(packed, folder / "frames.csv")
     names: dict[str, Iterator[str]] = {}
     for camera in {row["camera"] for row in rows}:
         of_camera = [row for row in rows if row["camera"] == camera]
@@ -130,33 +141,52 @@ def _unpack_images(folder: Path, reader: Any, written: dict[str, str]) -> int:
         names[f"/{camera}/depth/file"] = iter([name for name in depth if not name.endswith(".png")])
         masks = [row["human"] for row in of_camera if row.get("human")]
         names[f"/{camera}/people/mask/compressed"] = iter(masks)
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for _, channel, message in reader.iter_messages(topics=list(names), log_time_order=False):
-        data = bytes(store.deserialize_cdr(message.data, "sensor_msgs/msg/CompressedImage").data)
-        name = next(names[channel.topic])
-        head = len(DEPTH_HEAD) if channel.topic.endswith("/compressedDepth") else 0
-        written[name] = _write(folder, name, data[head:])
+    damage, decoder = Damage(), MessageDecoder()
+    for message in open_raw_log(packed).messages(damage, set(names)):
+        topic = message.topic.name
+        try:
+            data = bytes(decoder.decode(message).data)
+        except (UndecodableMessageError, AttributeError, TypeError, ValueError) as error:
+            raise InputError(f"{packed}: cannot be unpacked: {error}", remedy=_AGAIN) from None
+        name = next(names[topic], None)
+        if name is None:
+            raise InputError(f"{packed}: {topic} has more images than frames.csv has rows", remedy=_AGAIN)
+        target.write(name, [data[len(DEPTH_HEAD) :] if topic.endswith("/compressedDepth") else data])
+    _check_whole(packed, damage)
     return len(rows)
 
 
-def _write(folder: Path, name: str, data: bytes) -> str:
-    """Write a file below `folder`; its sha256. Raises InputError for a name that leads elsewhere."""
-    parts = PurePosixPath(name).parts
-    if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
-        raise InputError(f"{name!r}: not the name of a file of a capture", remedy="do not trust this file")
-    path = folder / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
-    return hashlib.sha256(data).hexdigest()
+def _metadata_name(content: bytes) -> str:
+    try:
+        record = parse_record(METADATA, content)
+    except BadRecordError:
+        return ""
+    return record.name if isinstance(record, Metadata) else ""
+
+
+def _rows(packed: Path, file: Path) -> list[dict[str, str]]:
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+    except (FileNotFoundError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{packed}: its frames.csv cannot be read: {error}", remedy=_AGAIN) from None
+    if any(row.get(name) is None for row in rows for name in ("camera", "color", "depth")):
+        raise InputError(f"{packed}: its frames.csv lacks a camera or an image", remedy=_AGAIN)
+    return rows
+
+
+def _check_whole(packed: Path, damage: Damage) -> None:
+    if damage.count:
+        raise InputError(f"{packed}: cannot be unpacked: {damage.notes[0]}", remedy=_AGAIN)
 
 
 def _check_sums(packed: Path, folder: Path, written: Mapping[str, str]) -> None:
     """Raise InputError where a file that SHA256SUMS names is missing or another."""
     file = folder / SUMS
     if not file.is_file():
-        raise InputError(f"{packed}: {SUMS} is missing", remedy="copy the file again")
+        raise InputError(f"{packed}: {SUMS} is missing", remedy=_AGAIN)
     for line in io.StringIO(file.read_text(encoding="utf-8", errors="replace")):
         digest, name = line[:64], line[66:].rstrip("\n")
         if written.get(name) != digest:
             what = "is missing" if name not in written else "differs from what was packed"
-            raise InputError(f"{packed}: {name} {what}", remedy="copy the file again")
+            raise InputError(f"{packed}: {name} {what}", remedy=_AGAIN)

@@ -120,22 +120,54 @@ def test_the_command_packs_and_unpacks(tmp_path: Path, capsys: pytest.CaptureFix
     assert "frames: 10" in capsys.readouterr().out
 
 
-def _with_attachment(path: Path, name: str) -> None:
+def _with_attachments(path: Path, *names: str) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         writer.add_metadata(MARK, {"version": "1"})
-        writer.add_attachment(0, 0, name, "", b"content")
+        for name in names:
+            writer.add_attachment(0, 0, name, "", b"content")
         writer.finish()
 
 
-@pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "a/../../evil", "a\\..\\evil", ""])
+@pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "a/../../evil", "a\\..\\evil", "", "a\nevil", "e" * 256])
 def test_a_name_that_leads_out_of_the_folder_is_refused(tmp_path: Path, name: str) -> None:
-    _with_attachment(tmp_path / "evil.mcap", name)
+    _with_attachments(tmp_path / "evil.mcap", name)
     (tmp_path / "out").mkdir()
     with pytest.raises(InputError, match="not the name of a file of a capture"):
         unpack_capture(tmp_path / "evil.mcap", tmp_path / "out")
     assert not [p for p in tmp_path.rglob("evil") if p.is_file()]
+
+
+@pytest.mark.parametrize(
+    "names", [("a.csv", "a.csv"), ("a.csv", "A.CSV"), ("a/b", "a//b"), ("a", "a/b"), ("a/b", "a")]
+)
+def test_names_that_one_file_system_takes_for_the_same_are_refused(tmp_path: Path, names: tuple[str, ...]) -> None:
+    _with_attachments(tmp_path / "evil.mcap", *names)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(InputError, match="two files of that name"):
+        unpack_capture(tmp_path / "evil.mcap", tmp_path / "out")
+
+
+def test_a_link_out_of_a_capture_is_not_packed(tmp_path: Path) -> None:
+    folder = captured(tmp_path, RECIPE)
+    (tmp_path / "secret").write_text("x")
+    (folder / "notes.txt").symlink_to("../secret")
+    with pytest.raises(InputError, match=r"notes.txt: leads out of the capture"):
+        pack_capture(folder, tmp_path / "packed.mcap")
+
+
+@pytest.mark.parametrize("frames", ["", "camera\n0\n", "\xff", 'a,"'])
+def test_a_pack_whose_frames_cannot_be_read_is_refused(tmp_path: Path, frames: str) -> None:
+    with (tmp_path / "evil.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata(MARK, {"version": "1"})
+        writer.add_attachment(0, 0, "frames.csv", "", frames.encode("latin-1"))
+        writer.finish()
+    (tmp_path / "out").mkdir()
+    with pytest.raises(InputError, match=r"frames.csv|SHA256SUMS is missing"):
+        unpack_capture(tmp_path / "evil.mcap", tmp_path / "out")
 
 
 def test_other_logs_and_damaged_packs_are_refused(tmp_path: Path) -> None:
