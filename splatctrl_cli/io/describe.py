@@ -20,7 +20,7 @@ from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig import camera_topics, missing
 from splatctrl_cli.io.rig_folder import RigFolderSource, open_image_folder
-from splatctrl_cli.io.scene_folder import read_occupancy
+from splatctrl_cli.io.scene_folder import read_occupancy, run_value
 from splatctrl_cli.io.shot import Shot
 from splatctrl_cli.io.summary import Grid, Summary
 from splatctrl_cli.io.survey import Survey, TopicSurvey
@@ -150,14 +150,22 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
 def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
     """What is known at the end of a scene, by the thresholds it was made with."""
     run: Mapping[str, Any] = describe_file(path / "run.json").facts if has_run else {}
+
+    def used(name: str, default: float) -> float:
+        return run_value(run, ("config", "occupancy", name), _probability, default, where=str(path / "run.json"))
+
     thresholds = OccupancyConfig()
-    used = run.get("config", {}).get("occupancy", {})
-    thresholds = replace(
-        thresholds,
-        free_below=used.get("free_below", thresholds.free_below),
-        occupied_above=used.get("occupied_above", thresholds.occupied_above),
+    low, high = used("free_below", thresholds.free_below), used("occupied_above", thresholds.occupied_above)
+    return known_space(
+        read_occupancy(path / "occupancy.npz"), replace(thresholds, free_below=low, occupied_above=high)
     )
-    return known_space(read_occupancy(path / "occupancy.npz"), thresholds)
+
+
+def _probability(value: Any) -> float:
+    number = float(value)
+    if not 0.0 < number < 1.0:
+        raise ValueError(f"{number}, no probability between 0 and 1")
+    return number
 
 
 def _field_facts(path: Path) -> dict[str, object]:

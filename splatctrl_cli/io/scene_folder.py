@@ -5,10 +5,11 @@ splats.ply  occupancy.npz  audit.jsonl  snapshots.csv  snapshots/NNNNNN.ply and 
 
 import csv
 import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +105,40 @@ def read_occupancy(path: Path) -> OccupancyGrid:
         raise InputError(f"{path}: not an occupancy grid of ours: {error}") from error
 
 
+T = TypeVar("T")
+
+
+def run_value(
+    run: Mapping[str, Any], keys: Sequence[str], kind: Callable[[Any], T], default: object = None, *, where: str
+) -> T:
+    """What `kind` makes of the value at `keys` of a ``run.json``; of the default where it is not there.
+
+    Raises InputError naming `where` for a value that is missing without a default, or of another kind.
+    """
+    value: Any = run
+    try:
+        for key in keys:
+            if default is not None and key not in value:
+                return kind(default)
+            value = value[key]
+        return kind(value)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        said = "nothing" if isinstance(error, KeyError) else str(error)
+        raise InputError(
+            f"{where}: {'.'.join(keys)}: expected what reconstruct writes, got {said}",
+            remedy="reconstruct the scene again",
+        ) from None
+
+
+def _names(value: list[Any]) -> tuple[str, ...]:
+    return tuple(str(name) for name in value)
+
+
+def _color(value: list[Any]) -> tuple[float, float, float]:
+    red, green, blue = (float(part) for part in value)
+    return red, green, blue
+
+
 @dataclass(frozen=True)
 class SceneFolder:
     """A scene that `reconstruct` wrote."""
@@ -112,43 +147,49 @@ class SceneFolder:
 
     @cached_property
     def run(self) -> dict[str, Any]:
-        """``run.json``."""
+        """``run.json``. Raises InputError where it is none."""
+        file = self.path / "run.json"
         try:
-            run: dict[str, Any] = json.loads((self.path / "run.json").read_text(encoding="utf-8"))
+            run = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise InputError(f"{self.path / 'run.json'}: cannot be read: {error}") from None
-        return run
+            raise InputError(f"{file}: cannot be read: {error}") from None
+        for name in ("metrics", "inputs", "config"):
+            if not isinstance(run, dict) or not isinstance(run.get(name, {}), dict):
+                raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
+        return dict(run)
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that trained the scene."""
-        return tuple(self.run["metrics"]["cameras"])
+        return self._metric("cameras", _names)
 
     @property
     def training_stamps_ns(self) -> frozenset[int]:
         """The views that trained a scene without a clock, by their made-up stamps."""
-        return frozenset(self.run["metrics"].get("training_stamps_ns", ()))
+        return self._metric("training_stamps_ns", frozenset[int], ())
 
     @property
     def has_clock(self) -> bool:
         """False where the stamps are made up."""
-        return bool(self.run["metrics"]["has_clock"])
+        return self._metric("has_clock", bool)
 
     @property
     def stamp_ns(self) -> int:
         """Of the last frame."""
-        return int(self.run["metrics"]["stamp_ns"])
+        return self._metric("stamp_ns", int)
 
     @property
     def background(self) -> tuple[float, float, float]:
         """What is seen where no splat is: a colour in [0, 1]; black in a scene of an older version."""
-        red, green, blue = (float(value) for value in self.run["metrics"].get("background", (0.0, 0.0, 0.0)))
-        return red, green, blue
+        return self._metric("background", _color, (0.0, 0.0, 0.0))
 
     @property
     def is_anisotropic(self) -> bool:
         """True for what `reconstruct --method 3dgs` made: `gaussians` instead of splats and occupancy."""
-        return bool(self.run["metrics"].get("method") == "3dgs")
+        return self._metric("method", "3dgs".__eq__, "")
+
+    def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:
+        return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
 
     def gaussians(self) -> GaussianSet:
         """The Gaussians of a scene that is anisotropic."""

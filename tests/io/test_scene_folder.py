@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.output import write_json
 from splatctrl_cli.io.scene_folder import open_scene, read_occupancy, read_states, write_occupancy, write_states
 from splatctrl_cli.io.scene_writer import CHECKPOINT, SceneWriter, read_checkpoint
@@ -141,6 +142,32 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
     (tmp_path / "b.npz").write_bytes(b"PK")
     with pytest.raises(InputError, match="not the voxel states"):
         read_states(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize(
+    ("run", "said"),
+    [
+        ("[]", "metrics: expected an object"),
+        ('{"metrics": 3}', "metrics: expected an object"),
+        ('{"metrics": {}}', "metrics.cameras: expected what reconstruct writes, got nothing"),
+        ('{"metrics": {"cameras": 3}}', "metrics.cameras: expected what reconstruct writes, got 'int' object"),
+        ('{"metrics": {"cameras": [], "background": [1]}}', "metrics.background: expected what reconstruct writes"),
+        ("{", "cannot be read"),
+    ],
+)
+def test_a_run_json_that_reconstruct_did_not_write_is_named(tmp_path: Path, run: str, said: str) -> None:
+    (written(tmp_path / "scene") / "run.json").write_text(run)
+    with pytest.raises(InputError, match=said):
+        scene = open_scene(tmp_path / "scene")
+        assert scene.cameras == scene.background
+
+
+@pytest.mark.parametrize("value", ["1", "0", "-1", "NaN", '"x"', "[]"])
+def test_a_threshold_that_is_no_probability_is_named(tmp_path: Path, value: str) -> None:
+    run = f'{{"metrics": {{"cameras": []}}, "config": {{"occupancy": {{"free_below": {value}}}}}}}'
+    (written(tmp_path / "scene") / "run.json").write_text(run)
+    with pytest.raises(InputError, match=r"run.json: config.occupancy.free_below: expected what reconstruct writes"):
+        describe(tmp_path / "scene")
 
 
 def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
