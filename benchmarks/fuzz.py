@@ -13,6 +13,8 @@ import random
 import resource
 import shutil
 import signal
+import stat
+import subprocess
 import sys
 import tempfile
 import time
@@ -98,9 +100,28 @@ def _mutated_copy(sample: Sample, folder: Path, rng: random.Random) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         if file not in chosen:
             target.write_bytes(file.read_bytes())
+        elif rng.random() < 0.05:
+            no_file(target, rng)
         elif len(sample.files) == 1 or rng.random() > 0.05:
             target.write_bytes(mutated(file.read_bytes(), rng))
     return folder / root.name / sample.path.relative_to(root)
+
+
+def no_file(path: Path, rng: random.Random) -> None:
+    """Something of that name that is no file: reading it may wait for ever, or never end."""
+    match rng.choice(["fifo", "folder", "loop", "endless", "nowhere", "socket"]):
+        case "fifo":
+            os.mkfifo(path)
+        case "folder":
+            path.mkdir()
+        case "loop":
+            path.symlink_to(path.name)
+        case "endless":
+            path.symlink_to("/dev/zero")
+        case "nowhere":
+            path.symlink_to("nothing")
+        case "socket":
+            os.mknod(path, stat.S_IFSOCK | 0o600)
 
 
 def _in_child(arguments: list[str], box: Path) -> tuple[int, int]:
@@ -155,7 +176,7 @@ def _states(path: Path) -> int:
     except SplatCtrlError as error:
         print(f"splatctrl: {error}", file=sys.stderr)
         return error.exit_code
-    except (MemoryError, RecursionError):
+    except (MemoryError, RecursionError, OSError):
         return 4  # as the command line has it
     return 3 if source.loss.damaged else 0
 
@@ -188,6 +209,13 @@ def fault_of(code: int, seconds: float, said: str, new: set[Path], box: Path) ->
     return ""
 
 
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Nothing is printed in the block."""
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):  # noqa: PTH123
+        yield
+
+
 def warm_up(samples: Sequence[Sample], folder: Path) -> None:
     """Import what the commands need, so that each child starts with it; each valid sample has to be read."""
     box = folder / "box"
@@ -195,11 +223,17 @@ def warm_up(samples: Sequence[Sample], folder: Path) -> None:
         for command in sample.commands:
             shutil.rmtree(box, ignore_errors=True)
             (box / "out").mkdir(parents=True)
-            with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):  # noqa: PTH123
+            with quiet():
                 arguments = [_filled(part, sample.path, box) for part in command]
                 code = _states(sample.path) if command[0] == "states" else main(arguments)
             if code not in {0, 1}:
                 raise SystemExit(f"the valid sample {sample.name} is not read by {' '.join(command)}: {code}")
+
+
+def _keep(box: Path, kept: Path) -> None:
+    """Copy an input, whatever it is made of."""
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    subprocess.run(["cp", "-a", str(box), str(kept)], check=True)
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -233,7 +267,7 @@ def run(argv: Sequence[str] | None = None) -> int:
                 faults.append(outcome)
                 kept = args.keep / str(outcome.seed)
                 shutil.rmtree(kept, ignore_errors=True)
-                shutil.copytree(folder / "box" / "in", kept)
+                _keep(folder / "box" / "in", kept)
                 print(
                     f"seed {outcome.seed}: {outcome.sample} {outcome.command}: {outcome.fault}\n{outcome.said}",
                     flush=True,

@@ -9,7 +9,9 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 
+from benchmarks.fuzz_folders import Commands, layout_folders, lpips_weights, scans, scene_folder
 from splatctrl_cli.io.bag_log import open_raw_log
+from splatctrl_cli.io.capture_pack import pack_capture
 from splatctrl_cli.io.capture_writer import write_capture
 from splatctrl_cli.io.grid_formats import write_grid
 from splatctrl_cli.io.raw_log import Damage
@@ -33,7 +35,7 @@ class Sample:
     name: str
     path: Path
     files: tuple[Path, ...]
-    commands: tuple[tuple[str, ...], ...]
+    commands: Commands
 
 
 def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
@@ -48,10 +50,18 @@ def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
         _file("mcap-plain", _plain(log, folder / "plain.mcap"), as_log),
         _file("bag", as_ros1_bag(log, folder / "log.bag"), as_log),
         _folder("db3", as_ros2_folder(log, folder / "bag", StoragePlugin.SQLITE3), as_log),
-        _folder("capture", _capture(log, folder / "c.capture"), as_log),
+        _folder("capture", _capture(log, folder / "c.capture"), (*as_log, ("capture", "pack", "IN", "-o", "OUT"))),
         _images(folder / "images", as_log),
         _table(folder / "table"),
     ]
+    made += [_folder(name, *found) for name, found in layout_folders(folder / "layouts").items()]
+    scene, of_scene = scene_folder(folder / "scene")
+    made.append(_folder("scene", scene, of_scene))
+    made += [_folder(name, *found) for name, found in scans(folder, scene).items()]
+    scan = ("--dtu", str(folder / "idr"), "--holdout", "2", "--threads", "1")
+    score = ("score", str(scene), *scan, "--allow-other-recording")
+    made.append(_file("lpips", lpips_weights(folder / "lpips.npz"), ((*score, "--lpips", "IN"),)))
+    made.append(_file("packed", _packed(folder), (("info", "IN"), ("capture", "unpack", "IN", "-o", "OUT"))))
     splats = (("info", "IN"), ("export", "IN", "-o", "OUT.ply"))
     made += [_file(p.suffix[1:], p, splats) for p in _splats(folder)]
     made += [_file(p.suffix[1:], p, (("info", "IN"),)) for p in _grids(folder / "field")]
@@ -65,11 +75,11 @@ def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
     return made
 
 
-def _file(name: str, path: Path, commands: tuple[tuple[str, ...], ...]) -> Sample:
+def _file(name: str, path: Path, commands: Commands) -> Sample:
     return Sample(name=name, path=path, files=(path,), commands=commands)
 
 
-def _folder(name: str, path: Path, commands: tuple[tuple[str, ...], ...]) -> Sample:
+def _folder(name: str, path: Path, commands: Commands) -> Sample:
     files = tuple(p for p in sorted(path.rglob("*")) if p.is_file())
     return Sample(name=name, path=path, files=files, commands=commands)
 
@@ -96,7 +106,12 @@ def _capture(log: Path, path: Path) -> Path:
     return path
 
 
-def _images(folder: Path, commands: tuple[tuple[str, ...], ...]) -> Sample:
+def _packed(folder: Path) -> Path:
+    pack_capture(folder / "c.capture", folder / "packed.mcap")
+    return folder / "packed.mcap"
+
+
+def _images(folder: Path, commands: Commands) -> Sample:
     """An image folder with its description beside it, poses as a trajectory.log."""
     for name in ("rgb", "depth"):
         (folder / name).mkdir(parents=True)

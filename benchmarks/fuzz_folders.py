@@ -1,0 +1,126 @@
+"""Small valid folders for `benchmarks.fuzz`: dataset layouts, scans, scenes, packed captures."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.geometry import look_at
+from splatctrl_cli.io.dtu import DtuView, write_dtu
+from splatctrl_cli.io.output import write_json
+from splatctrl_cli.io.scene_writer import SceneWriter
+from splatctrl_cli.records import Intrinsics, OccupancyGrid, SplatSet
+from tests.io.make_idr import write_idr
+from tests.io.test_layouts import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
+
+Commands = tuple[tuple[str, ...], ...]
+
+LAYOUTS: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "tum": ("rgbd_dataset_freiburg3_x", make_tum),  # whose camera is known by the folder's name
+    "open3d": ("scene", make_redwood),
+    "7-scenes": ("scene", make_frames),
+    "scannet": ("scene", make_scannet),
+    "bop": ("scene", make_bop),
+    "nerfstudio": ("scene", make_nerfstudio),
+}
+INFO, CHECK, INGEST = ("info", "IN"), ("check", "IN"), ("ingest", "IN", "-o", "OUT.capture")
+LENS = ("--intrinsics", "camera=10,11,3.5,2.5")  # for layouts that have none of their own
+
+
+@dataclass(frozen=True)
+class Row:
+    """Of an audit."""
+
+    stamp_ns: int
+
+
+def layout_folders(folder: Path) -> dict[str, tuple[Path, Commands]]:
+    """A folder of each dataset layout, and what reads it."""
+    made = {}
+    for name, (leaf, make) in LAYOUTS.items():
+        path = folder / name / leaf
+        path.mkdir(parents=True)
+        lens = LENS if name == "7-scenes" else ()
+        made[name] = (make(path), (INFO, (*CHECK, *lens), (*INGEST, *lens)))
+    return made
+
+
+def scans(folder: Path, scene: Path) -> dict[str, tuple[Path, Commands]]:
+    """A scan of three views in MVSNet's and in IDR's layout, scored against the scene."""
+    views = [_view(number) for number in range(3)]
+    write_dtu(folder / "mvsnet", "scan7", views)
+    write_idr(folder / "idr", "scan7", views)
+    score = ("score", str(scene), "--dtu", "IN", "--holdout", "2", "--allow-other-recording", "--threads", "1")
+    with_out = (*score, "-o", "OUT")
+    return {
+        "mvsnet": (folder / "mvsnet", ((*score, "--allow-training"), with_out)),
+        "idr": (folder / "idr", ((*score, "--allow-training"), with_out)),
+    }
+
+
+def scene_folder(folder: Path) -> tuple[Path, Commands]:
+    """A scene as `reconstruct` leaves it, and what reads it."""
+    folder.mkdir()
+    writer = SceneWriter(folder, {"frame": "world"})
+    grid, splats = _occupancy(), _splats()
+    for stamp in (100, 200):
+        writer.audit(Row(stamp))
+        writer.snapshot(stamp, splats, grid, grid.states(0.3, 0.7))
+    writer.finish(200, splats, grid)
+    writer.checkpoint({}, {"a": np.arange(4)}, is_last=True)
+    metrics = {"cameras": ["camera"], "has_clock": False, "stamp_ns": 200}
+    config = {"occupancy": {"free_below": 0.3}}
+    write_json(folder / "run.json", {"command": "reconstruct", "metrics": metrics, "inputs": {}, "config": config})
+    bake = ("sdf-bake", "IN", "-o", "OUT", "--voxel", "0.2", "--no-report", "--threads", "1")
+    return folder, (INFO, ("export", "IN", "-o", "OUT.ply"), bake, bake, (*bake, "--at", "0"))
+
+
+def lpips_weights(path: Path) -> Path:
+    """Weights of a network of AlexNet's form with two channels a layer."""
+    arrays = {}
+    for part, (number, before, size) in enumerate(((0, 3, 5), (3, 2, 3), (6, 2, 3), (8, 2, 3), (10, 2, 3)), 1):
+        arrays[f"net.slice{part}.{number}.weight"] = np.full((2, before, size, size), 0.1, np.float32)
+        arrays[f"net.slice{part}.{number}.bias"] = np.zeros(2, np.float32)
+        arrays[f"lin{part - 1}.model.1.weight"] = np.ones((1, 2, 1, 1), np.float32)
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    return path
+
+
+def _view(number: int) -> DtuView:
+    depth = np.full((48, 64), 0.6, np.float32)
+    depth[:5] = 0
+    mask = np.zeros((48, 64), np.bool_)
+    mask[10:-10, 10:-10] = True
+    return DtuView(
+        name=f"view{number}",
+        color=np.full((48, 64, 3), 90 + number, np.uint8),
+        depth=depth,
+        intrinsics=Intrinsics(fx=90.0, fy=92.0, cx=33.0, cy=23.0, width=64, height=48),
+        T_world_camera=look_at([0.1 * number, -0.3, 0.1], [0.0, 0.0, 0.6]),
+        mask=mask,
+    )
+
+
+def _splats() -> SplatSet:
+    y, x = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.2, 0.2, 6), np.linspace(-0.2, 0.2, 6)))
+    num = len(x)
+    return SplatSet(
+        centers=np.column_stack([x, y, np.full(num, 0.6)]).astype(np.float32),
+        radii=np.full(num, 0.03, np.float32),
+        colors=np.full((num, 3), 0.4, np.float32),
+        opacities=np.full(num, 0.9, np.float32),
+        labels=np.zeros(num, np.uint8),
+        density=np.ones(num, np.float32),
+    )
+
+
+def _occupancy() -> OccupancyGrid:
+    shape = (4, 4, 8)
+    return OccupancyGrid(
+        origin=np.array([-0.4, -0.4, -0.4]),
+        voxel=0.2,
+        log_odds=np.full(shape, -1.0, np.float32),
+        num_updates=np.full(shape, 3, np.uint16),
+        entity=np.zeros(shape, np.uint8),
+    )
