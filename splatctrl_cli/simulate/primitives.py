@@ -200,5 +200,8 @@ def _round_span(origin: Float64, directions: Float64, radius: float) -> tuple[Fl
 
 def _slab_span(origin: Float64, directions: Float64, half: Float64) -> tuple[Float64, Float64]:
     """Where rays are between the faces at -half and half of every axis: t from, t to."""
-    a, b = (-half - origin) / directions, (half - origin) / directions
-    return np.max(np.minimum(a, b), axis=1), np.min(np.maximum(a, b), axis=1)
+    near, far = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
+    for axis, size in enumerate(half):
+        a, b = (-size - origin[axis]) / directions[:, axis], (size - origin[axis]) / directions[:, axis]
+        near, far = np.maximum(near, np.minimum(a, b)), np.minimum(far, np.maximum(a, b))
+    return near, far
