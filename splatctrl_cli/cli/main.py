@@ -54,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verbose = 0
     refuse_endless_files()
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of numpy; more wait for each other, and round otherwise
     try:
         words = sys.argv[1:] if argv is None else argv
         args = build_parser(words).parse_args(words)
