@@ -2,6 +2,7 @@
 
 import re
 import struct
+from functools import lru_cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -26,6 +27,7 @@ _KNOWN = frozenset(  # what is read by its fields
 )
 _MOST_TEXT = 1 << 20  # characters of a definition
 _MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is no number
+_MOST_STORES = 32  # of definitions that were compiled and are kept
 _ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
 
 
@@ -104,27 +106,38 @@ def _type_store(topic: Topic) -> Any:
     if not topic.definition:
         return get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
     _check_definition(topic.definition)
+    return _store_of(topic.definition, topic.definition_format, topic.schema or topic.type_name)
+
+
+@lru_cache(maxsize=_MOST_STORES)
+def _store_of(definition: str, form: str, type_name: str) -> Any:
+    """The types of a definition; kept, as to compile them takes some ten milliseconds."""
     store = get_typestore(Stores.EMPTY)
-    if topic.definition_format == "idl":
+    if form == "idl":
         separator = "=" * 80 + "\n"
-        parts = [part for part in topic.definition.split(separator) if part.strip()]
+        parts = [part for part in definition.split(separator) if part.strip()]
         for part in parts:
             body = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
             store.register(get_types_from_idl(body))
     else:
-        store.register(get_types_from_msg(topic.definition, topic.schema or topic.type_name))
+        store.register(get_types_from_msg(definition, type_name))
     _check_fields(store)
     return store
 
 
 def _check_fields(store: Any) -> None:
     """Raise ValueError where a type with a standard name lacks a standard field; cases, lengths and more are free."""
-    standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    standard = _standard().fielddefs
     for name in sorted(_KNOWN & store.fielddefs.keys()):
         there = {field.lower(): _kind(description) for field, description in store.fielddefs[name][1]}
         for field, description in standard[name][1]:
             if there.get(field) != _kind(description):
                 raise ValueError(f"{name} has not the field {field} of the standard")
+
+
+@lru_cache(maxsize=1)
+def _standard() -> Any:
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def _kind(description: Any) -> object:
