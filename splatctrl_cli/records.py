@@ -74,7 +74,8 @@ class RgbdFrame:
 
     color (H, W, 3) uint8 RGB; depth (H, W) float32 [m] along the optical axis, 0 = none;
     T_world_camera (4, 4) float64 maps optical camera coordinates (z forward) to world; human (H, W) uint8, not 0
-    where the pixel shows a person, None where nobody looked for one.
+    where the pixel shows a person, None where nobody looked for one; valid (H, W), False where the pixel shows
+    nothing (the lens did not see it), None where all show something. What is not valid has no depth, and no colour.
     """
 
     stamp_ns: int
@@ -84,6 +85,7 @@ class RgbdFrame:
     intrinsics: Intrinsics
     T_world_camera: Float64
     human: UInt8 | None = None
+    valid: Bool | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ Perceptual = Callable[[Float64, Float64], float]
 
 PROTOCOL = {
     "average": "mean over views of each view's own figure; a view without a pixel of the region is left out",
-    "all": "every pixel of the view",
+    "all": "every pixel of the view that its lens saw",
     "seen": "pixels whose reference depth, back-projected, lies within 2 cm of a depth that the newest frame of some "
     "training camera measured (any training frame where the recording has no clock)",
     "mask": "only pixels of the region enter a sum or a share; nothing is zero-filled",
@@ -104,13 +104,17 @@ def score_view(
 
     color (H, W, 3) in [0, 1], depth (H, W) [m] normalised by accumulated opacity, 0 = none; seen (H, W): pixels
     that a training camera saw; mask (H, W): pixels that the mask rule selects, `fill` the grey outside it for
-    ssim_published; perceptual: LPIPS. `PROTOCOL` says what each figure means.
+    ssim_published; perceptual: LPIPS. What is not valid in `frame` is in no region. `PROTOCOL` says what each figure
+    means.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
+    valid = np.ones(frame.depth.shape, dtype=np.bool_) if frame.valid is None else frame.valid
+    rendered[~valid] = photo[~valid]  # so that windows across the border see no difference there
     similarity = ssim_map(rendered, photo).mean(axis=-1)
 
-    def score_region(mask: Bool) -> RegionScore:
+    def score_region(region: Bool) -> RegionScore:
+        mask = region & valid
         errors = depth_errors(depth, frame.depth, mask)
         num_reference = int(np.count_nonzero(mask & (frame.depth > 0)))
         return RegionScore(
@@ -129,7 +133,7 @@ def score_view(
         size=(frame.intrinsics.width, frame.intrinsics.height),
         valid_share=float(np.mean(frame.depth > 0)),
         seen=score_region(seen),
-        all=score_region(np.ones(frame.depth.shape, dtype=np.bool_)),
+        all=score_region(valid),
         masked=None if mask is None else score_region(mask),
         ssim_published=math.nan if mask is None else published_ssim(rendered, photo, mask, fill),
         lpips=None if perceptual is None else perceptual(rendered, photo),

@@ -16,7 +16,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.io.arrays import DAMAGE, npy_of
 from splatctrl_cli.io.capture_joints import read_joints
-from splatctrl_cli.io.capture_writer import COLUMNS, FORMAT, MASKED_COLUMNS, VERSION, write_capture
+from splatctrl_cli.io.capture_writer import COLUMNS, FORMAT, MASKS, VERSION, write_capture
 from splatctrl_cli.io.joint_topics import (
     joints_again,
     read_topics,
@@ -28,7 +28,17 @@ from splatctrl_cli.io.messages import decode_file, metres
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.shot import Shot, merged
-from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
+from splatctrl_cli.records import (
+    Bool,
+    Float32,
+    Float64,
+    Intrinsics,
+    JointState,
+    LossReport,
+    Record,
+    RgbdFrame,
+    UInt8,
+)
 
 __all__ = ["CaptureSource", "is_capture", "read_capture_header", "write_capture"]
 
@@ -37,6 +47,7 @@ _NOT_FOR_CAPTURES = (
     *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
     *("depth_scale", "root", "holdout", "stamps"),
 )
+_FURTHER = (*((mask,) for mask in MASKS), MASKS)  # columns of frames.csv
 _AGAIN = "run `splatctrl ingest` again"
 
 
@@ -126,9 +137,10 @@ class CaptureSource:
         """The frame of a row; None, and counted, where an image is not as it was written."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
-        if color_bytes is None or depth_bytes is None:
-            return None
         camera = self._cameras[row["camera"]]
+        valid = self._valid(row["valid"], camera) if row.get("valid") else None
+        if color_bytes is None or depth_bytes is None or (row.get("valid") and valid is None):
+            return None
         bgr, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
         if bgr is None or depth is None:
             self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
@@ -143,11 +155,20 @@ class CaptureSource:
                 intrinsics=intrinsics,
                 T_world_camera=_pose(row),
                 human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
+                valid=valid,
             ),
             color_file=color_bytes,
             depth_unit=camera["depth_scale"] if row["depth"].endswith(".png") else None,
             origin=row["source"],
         )
+
+    def _valid(self, name: str, camera: Mapping[str, Any]) -> Bool | None:
+        data = self._read(name)
+        pixels = None if data is None else decode_file(data, color=False)
+        if data is not None and (pixels is None or pixels.shape != (camera["height"], camera["width"])):
+            self._damaged.append(f"{name}: not a mask of the images' size")
+            return None
+        return None if pixels is None else np.asarray(pixels > 0)
 
     def _human(self, name: str, data: bytes, intrinsics: Intrinsics) -> UInt8 | None:
         pixels = decode_file(data, color=False)
@@ -235,13 +256,14 @@ def _read_frames(path: Path) -> list[dict[str, str]]:
             rows = list(reader)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
-    if tuple(reader.fieldnames or ()) not in (COLUMNS, MASKED_COLUMNS):
+    further = tuple(reader.fieldnames or ())[len(COLUMNS) :]
+    if tuple(reader.fieldnames or ())[: len(COLUMNS)] != COLUMNS or further not in ((), *_FURTHER):
         raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy="run `splatctrl ingest` again")
     try:
         for row in rows:
             int(row["stamp_ns"])
             [float(row[key]) for key in COLUMNS[4:11]]
-            for name in (row["color"], row["depth"], row.get("human") or ""):
+            for name in (row["color"], row["depth"], *(row.get(mask) or "" for mask in MASKS)):
                 if Path(name).is_absolute() or ".." in Path(name).parts:
                     raise ValueError(f"{name} lies outside the capture")
     except (ValueError, TypeError) as error:

@@ -34,7 +34,8 @@ class Journal:
         self._path = folder / JOURNAL
         self._files = ExitStack()
         self.num_entries = 0
-        self.has_mask = self.has_provenance = False
+        self.masks: set[str] = set()  # the columns that some frame has
+        self.has_provenance = False
         folder.mkdir(parents=True, exist_ok=True)
         if not self._path.is_file():
             self._path.write_text(json.dumps({"identity": identity}) + "\n", encoding="utf-8")
@@ -77,7 +78,7 @@ class Journal:
 
     def _count(self, entry: Entry) -> None:
         self.num_entries += 1
-        self.has_mask |= "human" in entry.row
+        self.masks |= {"human", "valid"} & entry.row.keys()
         self.has_provenance |= bool(entry.provenance)
 
     def _cut(self) -> None:

@@ -27,13 +27,13 @@ from splatctrl_cli.records import Float32, JointState, LossReport
 
 FORMAT, VERSION = "splatctrl-capture", 1
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
-MASKED_COLUMNS = (*COLUMNS, "human")  # where the recording has masks
+MASKS = ("human", "valid")  # further columns, where the recording has such masks
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
 FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
 FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
-PNG_LEVEL = 3  # zlib; 3 is half the time of OpenCV's default 6 and 5 % larger on apc_shelf depth
+PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ def write_capture(
 def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None) -> None:
     """frames.csv, provenance.csv, joint topics, capture.json and SHA256SUMS, which names everything but itself."""
     names = ["joints.npz", "frames.csv"]
-    columns = MASKED_COLUMNS if journal.has_mask else COLUMNS
+    columns = (*COLUMNS, *(name for name in MASKS if name in journal.masks))
     with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
         writer.writeheader()
@@ -124,8 +124,8 @@ def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics:
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
     write_json(folder / "capture.json", header)
-    sums = [pair for entry in journal.entries() for pair in entry.sums]
-    sums += [(sha256(folder / name), name) for name in [*names, "capture.json"]]
+    sums = {pair for entry in journal.entries() for pair in entry.sums}  # frames share the mask of their lens
+    sums |= {(sha256(folder / name), name) for name in [*names, "capture.json"]}
     with (folder / "SHA256SUMS").open("w", encoding="ascii") as stream:
         stream.writelines(f"{digest}  {name}\n" for digest, name in sorted(sums, key=lambda pair: pair[1]))
 
@@ -135,8 +135,9 @@ def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
     if shot.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(shot.camera):
         raise InputError(f"{shot.origin}: camera {shot.camera!r}: cannot name a folder", remedy="name it otherwise")
     unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
-    camera = cameras.setdefault(shot.camera, {**asdict(shot.intrinsics), "depth_scale": unit, "num_frames": 0})
-    if any(camera[name] != value for name, value in asdict(shot.intrinsics).items()):
+    lens = vars(shot.intrinsics)
+    camera = cameras.setdefault(shot.camera, {**lens, "depth_scale": unit, "num_frames": 0})
+    if any(camera[name] != value for name, value in lens.items()):
         raise InputError(
             f"{shot.origin}: camera {shot.camera} changes its lens, and a capture holds one of each camera",
             remedy="leave --holdout to `reconstruct` and `score`",
@@ -168,6 +169,10 @@ def _write_shot(folder: Path, shot: Shot, row: dict[str, str], camera: Mapping[s
     if shot.human is not None:
         named["human"] = f"human/{shot.camera}/{stem}.png"
         files[named["human"]] = encoded(shot.human * np.uint8(255))
+    if shot.valid is not None:
+        mask = encoded(shot.valid * np.uint8(255))
+        named["valid"] = f"valid/{shot.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
+        files[named["valid"]] = mask
     for name, data in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -206,7 +211,7 @@ def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, n
 
 def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
     """The PNG file of an image."""
-    is_written, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
+    is_written, data = cv2.imencode(".png", pixels, PNG)
     if not is_written:
         raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
     return bytes(data)

@@ -150,6 +150,7 @@ class ImageFolderSource:
                 intrinsics=lens.intrinsics,
                 T_world_camera=view.T_world_camera,
                 human=human,
+                valid=None if lens.undistortion is None else lens.undistortion.valid,
             ),
             color_file=color_bytes if is_plain else None,
             depth_unit=view.depth_scale if is_counts else None,
@@ -160,22 +161,17 @@ class ImageFolderSource:
         """That of a view's camera, made once."""
         table = view.lens
         if table.name not in self._lenses:
-            depth_camera, intrinsics, undistortion = self._description.depth_camera, table.intrinsics, None
-            if np.any(table.distortion):
-                undistortion = Undistortion(intrinsics, table.distortion_model, np.array(table.distortion))
-                intrinsics = undistortion.intrinsics
+            undistortion, depth_camera = _undistortion(table), self._description.depth_camera
+            registration = None
+            if depth_camera is not None:
+                registration = DepthToColor(
+                    depth_intrinsics=depth_camera.intrinsics,
+                    color_intrinsics=table.intrinsics,
+                    T_color_depth=self._description.T_color_depth,
+                    undistortion=_undistortion(depth_camera),
+                )
             self._lenses[table.name] = _Lens(
-                intrinsics=intrinsics,
-                undistortion=undistortion,
-                registration=(
-                    DepthToColor(
-                        depth_intrinsics=depth_camera.intrinsics,
-                        color_intrinsics=intrinsics,
-                        T_color_depth=self._description.T_color_depth,
-                    )
-                    if depth_camera is not None
-                    else None
-                ),
+                intrinsics=table.intrinsics, undistortion=undistortion, registration=registration
             )
         return self._lenses[table.name]
 
@@ -207,6 +203,12 @@ class ImageFolderSource:
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
         return metres(np.where(counts == table.invalid, np.uint16(0), counts), view.depth_scale)
+
+
+def _undistortion(camera: CameraTable) -> Undistortion | None:
+    if not np.any(camera.distortion):
+        return None
+    return Undistortion(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, dtype=np.float64))
 
 
 def _check_names(path: Path, lenses: set[str], options: SourceOptions) -> None:

@@ -1,6 +1,6 @@
 """Depth seen from the colour camera, and images without lens distortion."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,7 +10,8 @@ from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
-STEP, MOST_STEPS = 1.01, 240  # of the focal length of an undistorted image, up to ten times
+LEAST_SEEN = 0.25  # of an undistorted image
+FARTHEST = 20.0  # from the optical axis, at a depth of one: 87 degrees
 SAME_MODELS = {  # what others call them
     "Brown Conrady": "plumb_bob",
     "radtan": "plumb_bob",
@@ -22,11 +23,12 @@ SAME_MODELS = {  # what others call them
 
 @dataclass(frozen=True, kw_only=True)
 class DepthToColor:
-    """Warps depth images of one camera into another's view."""
+    """Warps depth images of one camera into another's view; undistortion: of the depth camera's own lens."""
 
     depth_intrinsics: Intrinsics
     color_intrinsics: Intrinsics
     T_color_depth: Float64
+    undistortion: "Undistortion | None" = None
 
     def warp(self, depth: Float32) -> Float32:
         """Depth (H', W') [m] of the depth camera -> (H, W) [m] in the colour camera, 0 = none.
@@ -35,6 +37,7 @@ class DepthToColor:
         of several that land on a pixel, the nearest counts.
         """
         target = self.color_intrinsics
+        depth = depth if self.undistortion is None else self.undistortion.depth(depth)
         valid = depth > 0
         points = transform_points(self.T_color_depth, back_project(self.depth_intrinsics, depth)[valid])
         points = points[points[:, 2] > 0]
@@ -63,24 +66,26 @@ class DepthToColor:
 
 
 class Undistortion:
-    """Removes a lens distortion, so that the lens saw every pixel of the result.
+    """Removes a lens distortion; the result has the lens's own focal lengths and centre.
 
-    intrinsics: those of the result. They are the lens's own where these leave no pixel unseen (barrel distortion);
-    else the focal lengths grow by steps of 1 % until they do: black corners would be taken for the scene's colour.
+    intrinsics: those of the result. valid: (H, W), False where the lens did not see the pixel, as in the corners of a
+    pincushion; None where it saw all. There colour is black, and depth and labels are 0.
     """
 
     def __init__(self, intrinsics: Intrinsics, model: str, coefficients: Float64) -> None:
-        for step in range(MOST_STEPS):
-            growth = STEP**step
-            self.intrinsics = replace(intrinsics, fx=intrinsics.fx * growth, fy=intrinsics.fy * growth)
-            self._map_u, self._map_v = _maps(intrinsics, self.intrinsics, model, coefficients)
-            inside_u = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
-            if (inside_u & (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)).all():
-                return
-        raise InputError(
-            f"distortion {model} {np.round(coefficients, 6).tolist()}: no part of the image is seen whole",
-            remedy="correct the calibration, or undistort the images first",
-        )
+        self.intrinsics = intrinsics
+        self._map_u, self._map_v = _maps(intrinsics, model, coefficients)
+        is_seen = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
+        is_seen &= (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)
+        is_seen &= _radii(intrinsics) < _largest_radius(model, coefficients)
+        if is_seen.mean() < LEAST_SEEN:
+            raise InputError(
+                f"distortion {model} {np.round(coefficients, 6).tolist()}: the lens saw {is_seen.mean():.0%} of the"
+                f" pinhole's image, expected at least {LEAST_SEEN:.0%}",
+                remedy="correct the calibration, or undistort the images first",
+            )
+        self.valid = None if is_seen.all() else is_seen
+        self._map_u[~is_seen] = -10.0  # folded back into the image, or outside of it
 
     def color(self, image: UInt8) -> UInt8:
         """Colour (H, W, 3), interpolated."""
@@ -95,12 +100,32 @@ class Undistortion:
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
 
 
-def _maps(lens: Intrinsics, result: Intrinsics, model: str, coefficients: Float64) -> tuple[Float32, Float32]:
+def _maps(lens: Intrinsics, model: str, coefficients: Float64) -> tuple[Float32, Float32]:
     """Column and row in the distorted image of each pixel of the result."""
-    K, K_new = (np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]]) for k in (lens, result))
+    K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]], dtype=np.float64)
     size = (lens.width, lens.height)
     if model == "equidistant":
-        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], np.eye(3), K_new, size, cv2.CV_32FC1)
+        maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], np.eye(3), K, size, cv2.CV_32FC1)
     else:
-        maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), K_new, size, cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     return np.asarray(maps[0]), np.asarray(maps[1])
+
+
+def _radii(lens: Intrinsics) -> Float64:
+    """Distance of each pixel (H, W) from the optical axis, at a depth of one."""
+    u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
+    return np.asarray(np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy))
+
+
+def _largest_radius(model: str, coefficients: Float64) -> float:
+    """Up to which distance from the axis a lens's polynomial still grows: beyond, it would show things twice."""
+    r = np.linspace(0.0, FARTHEST, 20001)
+    k = np.zeros(8)
+    k[: min(len(coefficients), 8)] = coefficients[:8]
+    if model == "equidistant":
+        a = np.arctan(r)
+        bent = a * (1 + k[0] * a**2 + k[1] * a**4 + k[2] * a**6 + k[3] * a**8)
+    else:
+        bent = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
+    folds = np.flatnonzero(np.diff(bent) <= 0)
+    return float(r[folds[0]]) if folds.size else np.inf

@@ -143,8 +143,7 @@ class _Builder:
         topics = self._topics
         calibration = self._calibration(topics.info, topics.color)
         intrinsics = intrinsics_of(calibration)
-        undistortion = self._undistortion(calibration, intrinsics)
-        intrinsics = intrinsics if undistortion is None else undistortion.intrinsics
+        undistortion = self._undistortion(calibration, topics.info)
         fixed = self._options.camera_poses.get(topics.name)
         world = self._check_world()
         return Camera(
@@ -255,16 +254,19 @@ class _Builder:
             )
         return world
 
-    def _undistortion(self, calibration: Calibration, intrinsics: Intrinsics) -> Undistortion | None:
+    def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
         if not np.any(np.abs(calibration.distortion) > 1e-9):
             return None
         model = SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
         if model not in DISTORTION_MODELS:
             raise InputError(
-                f"{self._where}: {self._topics.info}: distortion model {calibration.distortion_model!r} is unknown",
+                f"{self._where}: {info}: distortion model {calibration.distortion_model!r} is unknown",
                 remedy=f"rectify the images first; known models: {', '.join(DISTORTION_MODELS)}",
             )
-        return Undistortion(intrinsics, model, calibration.distortion)
+        try:
+            return Undistortion(intrinsics_of(calibration), model, calibration.distortion)
+        except InputError as error:
+            raise InputError(f"{self._where}: {info}: {error.message}", remedy=error.remedy) from None
 
     def _registration(self, color: Intrinsics) -> DepthToColor:
         """How raw depth reaches the colour camera. Raises InputError where K or the transform is not known."""
@@ -294,7 +296,10 @@ class _Builder:
                 remedy=f"record /tf_static, or {remedy}",
             )
         return DepthToColor(
-            depth_intrinsics=intrinsics_of(calibration), color_intrinsics=color, T_color_depth=T_color_depth
+            depth_intrinsics=intrinsics_of(calibration),
+            color_intrinsics=color,
+            T_color_depth=T_color_depth,
+            undistortion=self._undistortion(calibration, topics.depth_info),
         )
 
 

@@ -289,6 +289,7 @@ def _shot(
         read_color=partial(_color, camera, color),
         read_depth=partial(_depth, camera, depth),
         human=human,
+        valid=None if camera.undistortion is None else camera.undistortion.valid,
         color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
         depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
         depth_unit=_scale(depth, camera.depth_scale) if is_counts else None,

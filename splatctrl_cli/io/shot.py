@@ -10,7 +10,7 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.decoder import UndecodableMessageError
-from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RecordSource, RgbdFrame, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, RecordSource, RgbdFrame, UInt8
 
 PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
 
@@ -48,6 +48,7 @@ class Shot:
     depth_unit: float | None
     origin: str
     human: UInt8 | None = None
+    valid: Bool | None = None
     places: tuple[Place, ...] = ()
     depth_file: bytes | None = None
 
@@ -62,6 +63,7 @@ class Shot:
             read_color=lambda: frame.color,
             read_depth=lambda: frame.depth,
             human=frame.human,
+            valid=frame.valid,
             **stored,
         )
 
@@ -88,6 +90,7 @@ class Shot:
             intrinsics=self.intrinsics,
             T_world_camera=self.T_world_camera,
             human=self.human,
+            valid=self.valid,
         )
 
     @contextmanager

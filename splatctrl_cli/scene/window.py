@@ -33,10 +33,12 @@ class View:
 def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None) -> View:
     """A view of `frame`; `mappable` (H, W) are its pixels with a depth inside the workspace.
 
-    Pixels without depth count in the colour loss; pixels whose depth lies outside the workspace, or that show what is
-    `mounted` on the camera, do not count at all.
+    Pixels without depth count in the colour loss; pixels that are not valid, whose depth lies outside the workspace,
+    or that show what is `mounted` on the camera, do not count at all.
     """
     counted = mappable | (frame.depth <= 0)
+    if frame.valid is not None:
+        mappable, counted = mappable & frame.valid, counted & frame.valid
     if mounted is not None:
         mappable, counted = mappable & ~mounted, counted & ~mounted
     color = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0).astype(np.float32) / np.float32(255.0))

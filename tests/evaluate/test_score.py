@@ -70,6 +70,21 @@ def test_a_mask_is_a_region_of_its_own() -> None:
     assert "psnr_masked" not in score(perfect(), np.ones((H, W), np.float32), NONE).figures()
 
 
+def test_what_the_lens_did_not_see_is_in_no_region() -> None:
+    valid = ~NONE
+    valid[:, :4] = False
+    frame = replace(photo(), valid=valid)
+    frame.color[~valid], frame.depth[~valid] = 0, 0.0
+    color = perfect()
+    color[~valid] = 1.0  # whatever the render shows there
+    depth = np.ones((H, W), np.float32)
+    result = score_view(view="v", color=color, depth=depth, frame=frame, seen=left_half(), mask=left_half())
+    assert min(result.all.psnr, result.seen.psnr) > 150.0
+    assert result.all.ssim == pytest.approx(1.0) and result.ssim_published == pytest.approx(1.0)
+    assert result.all.share == pytest.approx((W - 4) / W)
+    assert result.seen.share == pytest.approx((W // 2 - 4) / W)
+
+
 def test_regions_are_scored_apart_and_none_is_zero_filled() -> None:
     color, depth = perfect(), np.full((H, W), 1.004, np.float32)
     color[left_half()] += 0.1

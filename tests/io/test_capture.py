@@ -24,6 +24,10 @@ def captured(tmp_path: Path, recipe: LogRecipe, name: str = "x.capture") -> tupl
     return list(source.records()), folder
 
 
+def frames_of(records: list[Record]) -> list[RgbdFrame]:
+    return [record for record in records if isinstance(record, RgbdFrame)]
+
+
 def assert_same(before: list[Record], after: list[Record]) -> None:
     assert len(before) == len(after) > 0
     for a, b in zip(before, after, strict=True):
@@ -182,6 +186,28 @@ def test_masks_come_back_and_frames_without_one_stay_without(tmp_path: Path) -> 
              and isinstance(b, RgbdFrame)]  # fmt: skip
     assert [a is not None for a, _ in masks] == [True, False, True, False, True]
     assert all((a is None and b is None) or np.array_equal(a, b) for a, b in masks)
+
+
+PINCUSHION = LogRecipe(color_format="png", distortion=(0.4, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_what_the_lens_did_not_see_comes_back_and_is_stored_once(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, PINCUSHION)
+    after = list(open_source(folder).records())
+    assert_same(before, after)
+    valid = frames_of(before)[0].valid
+    assert valid is not None and not valid.all()
+    assert all(frame.valid is not None and np.array_equal(frame.valid, valid) for frame in frames_of(after))
+    assert len(list((folder / "valid/cam0").iterdir())) == 1
+    sums = (folder / "SHA256SUMS").read_text().splitlines()
+    assert sum("valid/cam0/" in line for line in sums) == 1 and len(set(sums)) == len(sums)
+
+
+def test_a_frame_whose_valid_pixels_are_not_known_is_left_out(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, PINCUSHION)
+    next((folder / "valid/cam0").iterdir()).write_bytes(b"no image")
+    source = open_source(folder)
+    assert frames_of(list(source.records())) == [] and source.loss.damaged == 5
 
 
 def test_a_damaged_mask_is_counted_and_its_frame_kept(tmp_path: Path) -> None:

@@ -43,8 +43,9 @@ def contents(folder: Path) -> dict[str, bytes]:
         (replace(RECIPE, depth_counts=12500), SourceOptions(depth_scale=1e-4)),
         (replace(RECIPE, has_joints=False), None),
         (LogRecipe(mask_every=2), MASKS),
+        (LogRecipe(mask_every=2, distortion=(0.4, 0.0, 0.0, 0.0, 0.0)), MASKS),
     ],
-    ids=["jpeg", "png", "float depth", "0.1 mm", "no joints", "masks"],
+    ids=["jpeg", "png", "float depth", "0.1 mm", "no joints", "masks", "valid pixels"],
 )
 def test_unpacking_gives_the_same_bytes(tmp_path: Path, recipe: LogRecipe, options: SourceOptions | None) -> None:
     folder, packed = captured(tmp_path, recipe, options), tmp_path / "packed.mcap"

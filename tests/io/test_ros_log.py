@@ -140,14 +140,17 @@ def test_a_distorted_lens_is_undone_on_colour_and_depth(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(color_format="png", distortion=(0.4, 0.0, 0.0, 0.0, 0.0)))
     frame = frames_of(log)[0]
     k = frame.intrinsics
-    assert k.fx > 30.0  # with the lens's own, the corners were outside the image
+    assert (k.fx, k.fy, k.cx, k.cy) == (30.0, 30.0, 15.5, 11.5)  # the lens's own
+    assert frame.valid is not None
     x, y = (np.arange(WIDTH) - k.cx) / k.fx, (np.arange(HEIGHT)[:, None] - k.cy) / k.fy
-    column = 30.0 * x * (1 + 0.4 * (x**2 + y**2)) + 15.5
-    assert 0.0 <= column.min() < 0.5  # no more is cut off than must be
+    column, row = (30.0 * value * (1 + 0.4 * (x**2 + y**2)) + centre for value, centre in ((x, 15.5), (y, 11.5)))
+    seen = (column >= 0) & (column <= WIDTH - 1) & (row >= 0) & (row <= HEIGHT - 1)
+    assert np.array_equal(frame.valid, seen) and not seen[0, 0]
     green = np.interp(column, np.arange(WIDTH), color_pixels(0)[0, :, 1])
-    assert frame.color[..., 1] == pytest.approx(green, abs=1.0)
-    assert (frame.color[..., 0] == 40).all()
-    assert (frame.depth > 0).mean() > 0.99  # all but what the first pixel without depth covers
+    assert frame.color[seen, 1] == pytest.approx(green[seen], abs=1.0)
+    assert (frame.color[seen, 0] == 40).all() and not frame.color[~seen].any()
+    assert (frame.depth[seen] > 0).mean() > 0.99  # all but what the first pixel without depth covers
+    assert not frame.depth[~seen].any()
     assert frame.depth[12, 16] == np.float32(1.25)
     assert next(s for s in open_source(log).shots() if not isinstance(s, JointState)).color_file is None
 

@@ -66,6 +66,16 @@ def test_pixels_without_depth_count_and_pixels_outside_the_workspace_do_not() ->
     assert not target.depth[50:].any()
 
 
+def test_pixels_that_the_lens_did_not_see_count_neither_for_colour_nor_for_depth() -> None:
+    seen = frame()
+    valid = np.ones(seen.depth.shape, bool)
+    valid[:, :7] = False
+    made = make_view(replace(seen, valid=valid), seen.depth > 0)
+    assert np.array_equal(made.target.counted > 0, valid)
+    assert np.array_equal(made.mappable, valid & (seen.depth > 0))
+    assert not made.target.depth[:, :7].any()
+
+
 def test_a_halved_view_looks_along_the_same_rays_with_mean_colours_and_nearest_depths() -> None:
     seen = frame(0, block=0.2)
     seen.depth[10, 10] = 0.0
