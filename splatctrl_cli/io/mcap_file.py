@@ -53,10 +53,19 @@ class McapFile:
         self.path = path
         self.size = path.stat().st_size
 
-    def parts(self, damage: Damage) -> Iterator[Part]:
-        """Yield the records in order; what is lost or wrong goes to `damage`, checksums of the file included."""
+    def parts(self, damage: Damage, *, is_known: bool = False) -> Iterator[Part]:
+        """Yield the records in order; what is lost or wrong goes to `damage`, checksums of the file included.
+
+        is_known: leave out these checksums, as they were compared before.
+        """
         with self.path.open("rb") as stream:
-            yield from _Walk(stream, self.path.name, self.size, damage, self._places()).parts()
+            walk = _Walk(stream, self.path.name, self.size, damage, self._places(), has_crc=not is_known)
+            yield from walk.parts()
+
+    def state(self) -> tuple[int, int]:
+        """What changes with the file: its size and when it was written [ns]."""
+        stat = self.path.stat()
+        return stat.st_size, stat.st_mtime_ns
 
     def summary(self) -> list[Part]:
         """The records of the summary section; empty where there is none that can be read."""
@@ -95,10 +104,12 @@ class McapFile:
 class _Walk:
     """One pass over a file."""
 
-    def __init__(self, stream: BinaryIO, name: str, size: int, damage: Damage, places: list[int]) -> None:
+    def __init__(
+        self, stream: BinaryIO, name: str, size: int, damage: Damage, places: list[int], *, has_crc: bool
+    ) -> None:
         self._stream, self._name, self._size = stream, name, size
         self._damage, self._places = damage, sorted(places)
-        self._crc: int | None = 0  # of the data section so far; None once a part of it was skipped
+        self._crc: int | None = 0 if has_crc else None  # of the data section so far; None once a part was skipped
 
     def parts(self) -> Iterator[Part]:
         """Yield the records up to the footer, or to what is left of the last one."""

@@ -47,6 +47,7 @@ class McapLog:
         self._channels: dict[int, Topic] = {}
         self._statistics: Statistics | None = None
         self._budget = Budget(self._file.size)
+        self._whole: tuple[int, int] | None = None  # the file's state when a pass found all its checksums right
         for part in self._file.summary():  # so that a damaged chunk hides no channel of others
             if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
                 self._declare(part.opcode, part.content, Damage())
@@ -75,9 +76,13 @@ class McapLog:
         return self._channels.get(channel)
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes."""
+        """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes.
+
+        Checksums are compared until one pass, to the end, has found all of them right.
+        """
         self._budget = Budget(self._file.size)
-        for part in self._file.parts(damage):
+        state, count = self._forget_changed(), damage.count
+        for part in self._file.parts(damage, is_known=self._whole is not None):
             if part.opcode == CHUNK and part.content:
                 yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
             elif part.opcode == MESSAGE and part.content:
@@ -86,14 +91,22 @@ class McapLog:
                     yield message
             elif part.opcode in {SCHEMA, CHANNEL}:
                 self._declare(part.opcode, part.content, damage)
+        self._whole = state if damage.count == count else None
 
     def messages_of(
         self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
     ) -> Iterator[RawMessage]:
         """Yield the messages of these chunks only, wherever in the file they lie."""
+        self._forget_changed()
         for index in chunks:
             content = self._file.chunk_at(index)
             yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
+
+    def _forget_changed(self) -> tuple[int, int]:
+        """The state of the file; its checksums count as unknown where it is another than when they were compared."""
+        state = self._file.state()
+        self._whole = self._whole if state == self._whole else None
+        return state
 
     def _chunk_messages(
         self, content: bytes, offset: int, damage: Damage, names: Collection[str] | None, *, is_cut: bool
@@ -122,7 +135,8 @@ class McapLog:
             if is_cut or len(chunk.records) < chunk.compressed_size:
                 return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
             records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
-            if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
+            is_known = self._whole is not None
+            if chunk.uncompressed_crc and not is_known and zlib.crc32(records) != chunk.uncompressed_crc:
                 raise BadBlockError("checksum differs")
         except (BadRecordError, BadBlockError) as error:
             if not is_cut:  # the cut has been counted

@@ -1,8 +1,10 @@
 """Damaged and hostile MCAP files: what is whole is read, what is lost is counted, memory stays bounded."""
 
+import os
 import struct
 import subprocess
 import sys
+import zlib
 from io import BytesIO
 from pathlib import Path
 
@@ -254,3 +256,42 @@ def test_what_is_no_log_is_refused_by_its_bytes(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"")
     with pytest.raises(InputError, match=r"the file is empty \(0 bytes\)"):
         open_raw_log(tmp_path / "x.mcap")
+
+
+def test_checksums_are_compared_once_and_again_where_the_file_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(small_log(CompressionType.NONE))
+    log, num_sums, crc32 = McapLog(path), 0, zlib.crc32
+
+    def counting(data: bytes, value: int = 0) -> int:
+        nonlocal num_sums
+        num_sums += len(data) > 1000  # not those of the short heads and of the summary
+        return crc32(data, value)
+
+    monkeypatch.setattr(zlib, "crc32", counting)
+    sums = []
+    for _ in range(3):
+        num_sums = 0
+        assert len(list(log.messages(Damage()))) == 40
+        sums.append(num_sums)
+    assert sums[0] > 4 and sums[1:] == [0, 0]
+    data = bytearray(path.read_bytes())
+    data[data.index(payload(30, 100)) + 50] ^= 1
+    path.write_bytes(data)
+    os.utime(path, ns=(1, 1))
+    for _ in range(2):
+        damage = Damage()
+        assert len(list(log.messages(damage))) < 40
+        assert "checksum differs" in damage.notes[0]
+
+
+def test_a_pass_that_was_not_finished_says_nothing_of_the_checksums(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    data = bytearray(small_log(CompressionType.NONE))
+    data[data.index(payload(30, 100)) + 50] ^= 1
+    path.write_bytes(data)
+    log = McapLog(path)
+    assert next(log.messages(Damage())).log_time_ns == 1
+    assert len(list(log.messages(Damage()))) < 40
