@@ -98,7 +98,8 @@ class ListedView:
     """A view by its files, where a layout names them one by one instead of by globs.
 
     matrix: its pose as the layout writes it, None where it has none; camera: its lens, None for [camera];
-    depth_scale: metres per count, None for that of [depth].
+    depth_scale: metres per count, None for that of [depth]; valid: an 8-bit grey image, 0 where a pixel is not to be
+    used, None where all are.
     """
 
     name: str
@@ -109,6 +110,7 @@ class ListedView:
     stamp_ns: int | None = None
     camera: CameraTable | None = None
     depth_scale: float | None = None
+    valid: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,8 @@ _SECOND = 1_000_000_000
 class View:
     """One pair of files, and a mask where there is one; name is the text that `*` stood for.
 
-    camera: its name, or HOLDOUT; lens: the camera that took it; depth_scale: metres per count.
+    camera: its name, or HOLDOUT; lens: the camera that took it; depth_scale: metres per count; valid: a mask of the
+    pixels to use.
     """
 
     name: str
@@ -39,6 +40,7 @@ class View:
     camera: str
     lens: CameraTable
     depth_scale: float
+    valid: Path | None = None
 
 
 def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:
@@ -63,6 +65,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
                     camera=HOLDOUT if view.name in held else lens.name,
                     lens=lens,
                     depth_scale=_scale(description, view, options),
+                    valid=view.valid,
                 )
             )
     loss.without_pose += len(listed) - len(views)
@@ -88,13 +91,13 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
     """Listed views whose files are there; others are counted as unpaired. Raises InputError for a file outside."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
-        for path in (view.color, view.depth):
+        for path in (view.color, view.depth, *([] if view.valid is None else [view.valid])):
             if not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)):
                 raise InputError(
                     f"{description.path}: {path} is not in {description.root}",
                     remedy="give the folder that holds all files",
                 )
-        missing = [path for path in (view.color, view.depth) if not path.is_file()]
+        missing = [path for path in (view.color, view.depth, view.valid) if path is not None and not path.is_file()]
         absent += missing[:1]
         present += [] if missing else [view]
         loss.unpaired_color += view.depth in missing and view.color not in missing

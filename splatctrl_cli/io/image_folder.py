@@ -21,7 +21,7 @@ from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.registration import DepthToColor, Undistortion
 from splatctrl_cli.io.shot import Shot, check_depth, is_kept
-from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
 
@@ -112,7 +112,8 @@ class ImageFolderSource:
     @cached_property
     def _digests(self) -> dict[str, str]:
         description = self._description
-        files = [path for view in self._views for path in (view.color, view.depth, view.human) if path is not None]
+        of_views = ((view.color, view.depth, view.human, view.valid) for view in self._views)
+        files = [path for paths in of_views for path in paths if path is not None]
         if description.poses is not None:
             files.extend(path for _, path in find_files(description.root, description.poses.file))
         named = {str(path.relative_to(description.root)): path for path in files}
@@ -139,7 +140,9 @@ class ImageFolderSource:
             color = lens.undistortion.color(np.asarray(color))
             depth = lens.undistortion.depth(depth) if lens.registration is None else depth
         human = None if view.human is None else self._human(view.human, lens)
-        is_counts = lens.registration is None and self._description.depth.encoding != "float32"
+        valid = self._valid(view, lens)
+        depth = depth if valid is None else np.where(valid, depth, np.float32(0))
+        is_counts = lens.registration is None and not _is_float(self._description.depth.encoding, view.depth)
         is_plain = lens.undistortion is None and is_kept(color_bytes)
         return Shot.of(
             RgbdFrame(
@@ -150,7 +153,7 @@ class ImageFolderSource:
                 intrinsics=lens.intrinsics,
                 T_world_camera=view.T_world_camera,
                 human=human,
-                valid=None if lens.undistortion is None else lens.undistortion.valid,
+                valid=valid,
             ),
             color_file=color_bytes if is_plain else None,
             depth_unit=view.depth_scale if is_counts else None,
@@ -175,6 +178,16 @@ class ImageFolderSource:
             )
         return self._lenses[table.name]
 
+    def _valid(self, view: View, lens: _Lens) -> Bool | None:
+        """Pixels that the lens saw and the view's mask leaves; a mask that cannot be read leaves none."""
+        seen = None if lens.undistortion is None else lens.undistortion.valid
+        if view.valid is None:
+            return seen
+        mask = self._human(view.valid, lens)
+        if mask is None:
+            return np.zeros((lens.intrinsics.height, lens.intrinsics.width), np.bool_)
+        return np.asarray((mask > 0) if seen is None else (mask > 0) & seen)
+
     def _human(self, path: Path, lens: _Lens) -> UInt8 | None:
         pixels = decode_file(path.read_bytes(), color=False)
         if pixels is None:
@@ -185,7 +198,7 @@ class ImageFolderSource:
 
     def _depth(self, view: View) -> Float32 | None:
         table, path = self._description.depth, view.depth
-        if table.encoding == "float32":
+        if _is_float(table.encoding, path):
             pixels = _float_pixels(path)
             if pixels is None:
                 return None
@@ -203,6 +216,11 @@ class ImageFolderSource:
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
         return metres(np.where(counts == table.invalid, np.uint16(0), counts), view.depth_scale)
+
+
+def _is_float(encoding: str, path: Path) -> bool:
+    """Whether a depth file holds floats; a .npy does, whatever the others of its folder are (nerfstudio)."""
+    return encoding == "float32" or path.suffix == ".npy"
 
 
 def _undistortion(camera: CameraTable) -> Undistortion | None:

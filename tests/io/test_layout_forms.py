@@ -1,6 +1,9 @@
 """Datasets as they are published: forms of a layout, and what each says of its cameras."""
 
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, project, transform_points
+from splatctrl_cli.io import layout_nerfstudio
 from splatctrl_cli.io.layout_frames import COLOR_LENS, DEPTH_LENS, T_COLOR_DEPTH
 from splatctrl_cli.io.layout_tum import marker_to_camera
 from splatctrl_cli.io.options import SourceOptions
@@ -22,8 +26,10 @@ from tests.io.make_layout import (
     counts_of,
     frames_of,
     make_arkit,
+    make_bop,
     make_frames,
     make_icl,
+    make_nerfstudio,
     make_redwood,
     make_replica,
     make_scannet,
@@ -224,3 +230,120 @@ def test_open3d_scenes_are_known_by_the_names_of_its_downloads(tmp_path: Path, t
     (folder / trajectory).parent.mkdir(exist_ok=True)
     (folder / "trajectory.log").rename(folder / trajectory)
     check(frames_of(folder))
+
+
+def of_transforms(folder: Path, **changed: Any) -> Path:
+    """make_nerfstudio with other values of the file; None takes a value out."""
+    make_nerfstudio(folder)
+    content = json.loads((folder / "transforms.json").read_text()) | changed
+    content = {key: value for key, value in content.items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_transforms_of_instant_ngp_have_their_own_names(tmp_path: Path) -> None:
+    """camera_angle_x for fl_x, no centre and size, depth_path, its unit in the file, names without suffix."""
+    folder = make_nerfstudio(tmp_path)
+    content = json.loads((folder / "transforms.json").read_text())
+    for entry in content["frames"]:
+        entry["depth_path"] = entry.pop("depth_file_path")
+        entry["file_path"] = entry["file_path"].removesuffix(".png")
+    short = {"camera_angle_x": 2 * math.atan(4 / 10.0), "fl_y": 11.0, "integer_depth_scale": 1e-3 / 2}
+    (folder / "transforms.json").write_text(json.dumps({**short, "aabb_scale": 4, "frames": content["frames"]}))
+    frame = frames_of(folder)[1]
+    i = frame.intrinsics
+    assert (i.fx, i.fy, i.cx, i.cy, i.width, i.height) == pytest.approx((10.0, 11.0, 3.5, 2.5, WIDTH, HEIGHT))
+    assert frame.depth == pytest.approx(counts_of(1) * 0.5e-3, abs=1e-6)
+    assert frame.T_world_camera == pytest.approx(POSES[1], abs=1e-12)
+
+
+def test_poses_that_were_scaled_are_scaled_back(tmp_path: Path) -> None:
+    folder = of_transforms(tmp_path, applied_scale=0.5)
+    assert frames_of(folder)[0].T_world_camera[:3, 3] == pytest.approx(POSES[0][:3, 3] / 0.5)
+
+
+def test_masks_of_nerfstudio_leave_pixels_out(tmp_path: Path) -> None:
+    folder = make_nerfstudio(tmp_path)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :3] = 0
+    cv2.imwrite(str(folder / "mask.png"), mask)
+    content = json.loads((folder / "transforms.json").read_text())
+    for entry in content["frames"]:
+        entry["mask_path"] = "mask.png"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    source = open_source(folder)
+    frame = next(r for r in source.records() if isinstance(r, RgbdFrame))
+    assert frame.valid is not None and np.array_equal(frame.valid, mask > 0)
+    assert not frame.depth[:, :3].any() and (frame.depth[:, 3:] > 0).all()
+    assert "mask.png" in source.digests()
+    (folder / "mask.png").write_bytes(b"no image")
+    damaged = open_source(folder)
+    assert not any(r.valid.any() for r in damaged.records() if isinstance(r, RgbdFrame) and r.valid is not None)
+    assert damaged.loss.damaged == 3
+
+
+def test_depth_of_nerfstudio_may_be_smaller_or_float(tmp_path: Path) -> None:
+    folder = make_nerfstudio(tmp_path)
+    cv2.imwrite(str(folder / "depths/d_0.png"), counts_of(0)[::2, ::2])
+    np.save(folder / "depths/d_1.npy", counts_of(1).astype(np.float32) + np.float32(0.25))
+    text = (folder / "transforms.json").read_text().replace("depths/d_1.png", "depths/d_1.npy")
+    (folder / "transforms.json").write_text(text)
+    small, floats, _ = frames_of(folder)
+    nearest = cv2.resize(counts_of(0)[::2, ::2], (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
+    assert np.array_equal(small.depth, nearest.astype(np.float32) * np.float32(1e-3))
+    assert floats.depth[1:] == pytest.approx((counts_of(1)[1:] + 0.25) * 1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "model"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.02, "k3": 0.03, "k4": 0.04}, "equidistant"),
+        ({"is_fisheye": True, "k1": 0.01, "k2": 0.02, "k3": 0.03, "k4": 0.04}, "equidistant"),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.01}, "plumb_bob"),
+    ],
+)
+def test_lens_models_of_nerfstudio_are_those_of_opencv(tmp_path: Path, changed: dict[str, Any], model: str) -> None:
+    folder = of_transforms(tmp_path, **changed)
+    views = layout_nerfstudio.read(folder, SourceOptions()).listed
+    assert views[0].camera is not None and views[0].camera.distortion_model == model
+    values = [value for key, value in changed.items() if key.startswith("k")]
+    assert views[0].camera.distortion[: len(values)] == values
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model: expected one of SIMPLE_PINHOLE.*got 'EQUIRECTANGULAR'"),
+        ({"k4": 0.1}, "expected no k4, got 0.1"),
+        ({"fl_x": None}, "no usable 'camera_angle_x' of the lens"),
+        ({"applied_scale": 0.0}, "expected numbers, got float division by zero"),
+    ],
+)
+def test_a_transforms_file_that_cannot_be_used_is_refused(
+    tmp_path: Path, changed: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        open_source(of_transforms(tmp_path, **changed))
+
+
+def test_a_bop_scene_of_several_sensors_gives_a_camera_each(tmp_path: Path) -> None:
+    for sensor in ("cam1", "photoneo"):
+        folder = make_bop(tmp_path / sensor)
+        for name in ("rgb", "depth"):
+            (folder / name).rename(tmp_path / f"{name}_{sensor}")
+        (folder / "scene_camera.json").rename(tmp_path / f"scene_camera_{sensor}.json")
+        folder.rmdir()
+    source = open_source(tmp_path)
+    assert source.cameras == ("cam1", "photoneo")
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    check([frame for frame in frames if frame.camera == "photoneo"], 1e-4)
+
+
+def test_grey_tiff_images_of_bop_are_read(tmp_path: Path) -> None:
+    folder = make_bop(tmp_path)
+    (folder / "rgb").rename(folder / "gray")
+    for path in [*(folder / "gray").iterdir(), *(folder / "depth").iterdir()]:
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path.with_suffix(".tif")), pixels)
+        path.unlink()
+    check(frames_of(folder), 1e-4)
