@@ -112,7 +112,7 @@ def _gated() -> tuple[str, ...]:
     from splatctrl_cli.evaluate.cloud import cloud_names
     from splatctrl_cli.evaluate.score import metric_names
 
-    return (*metric_names(), *cloud_names(), "free_mass", "num_skipped")
+    return (*metric_names(), *cloud_names(), "free_mass", "num_skipped", "num_warnings")
 
 
 def score_scene(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Reference:
     """source: the recording with all its cameras. protocol and split where one was named; training_stamps_ns: of the
     views that it trains on. mask: of a frame, the pixels that the mask rule selects; mask_rule says it in words.
-    Without depth, nothing says what a training camera saw.
+    Without depth, nothing says what a training camera saw. doubts: what speaks against the scores, in words.
     """
 
     source: "RecordSource"
@@ -33,6 +33,7 @@ class Reference:
     mask_rule: str = "none"
     numbered_by_stamp: bool = False
     has_depth: bool = True
+    doubts: tuple[str, ...] = ()
 
     @property
     def scores_training(self) -> bool:
@@ -143,7 +144,24 @@ def _dtu_reference(args: argparse.Namespace, console: Console) -> Reference:
         mask_rule=rule,
         numbered_by_stamp=True,
         has_depth=source.has_depth,
+        doubts=tuple(_missing_views(source, protocol)),
     )
+
+
+def _missing_views(source: "DtuSource", protocol: "ScoreProtocol | None") -> list[str]:
+    """In words, which views of the scan are not there, where that changes which are scored, or that lack depth."""
+    numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
+    missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
+    lines = []
+    if missing and protocol is not None and protocol.every:
+        listed = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
+        lines.append(
+            f"{source.name}: views {listed} are not there: '{protocol.name}' counts those that are, and scores others"
+            " than of a whole scan; add the views, or name those to score as holdout:0,8"
+        )
+    if source.has_depth and source.loss.notes:
+        lines.append(f"{len(source.loss.notes)} views lack depth, such as {source.loss.notes[0]}")
+    return lines
 
 
 def _mask_of(source: "DtuSource", wanted: str) -> "tuple[Callable[[RgbdFrame], Bool | None] | None, str]":

@@ -33,6 +33,7 @@ def result_of(
 
     metrics = total_score(scores.views) | (cloud[1] if cloud else {})
     metrics |= {"free_mass": _free_mass(args.scene, scene), "num_skipped": len(scores.skipped)}
+    metrics["num_warnings"] = len(scores.doubts) + len(recording["differences"])
     definitions = PROTOCOL | ({"cloud": cloud[0].words()} if cloud else {})
     return {
         "scene": str(args.scene),
@@ -44,6 +45,7 @@ def result_of(
         "recording": recording,
         "protocol": _protocol(reference, scene, scores, lpips) | {"definitions": definitions},
         "metrics": as_json(metrics),
+        "warnings": [*(f"another recording: {line}" for line in recording["differences"]), *scores.doubts],
         "skipped_views": scores.skipped,
         "views": [
             {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scores.views
@@ -155,7 +157,7 @@ def lines_of(result: dict[str, Any]) -> list[str]:
     )
     if "chamfer" in metrics:
         lines += _cloud_lines(metrics, result["protocol"]["definitions"]["cloud"])
-    lines += [f"warning: another recording: {line}" for line in result["recording"]["differences"]]
+    lines += [f"warning: {line}" for line in result["warnings"]]
     lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
     if metrics["free_mass"] is not None:
         lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")

@@ -12,6 +12,7 @@ from splatctrl_cli.cli.score_reference import Reference
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
+    from splatctrl_cli.evaluate.doubts import Doubts
     from splatctrl_cli.evaluate.pictures import ComparisonRow
     from splatctrl_cli.evaluate.score import Perceptual, ViewScore
     from splatctrl_cli.evaluate.views import View
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 class Scores:
     """What scoring gathers: the views, the names of those before the first snapshot, each camera's extremes.
 
-    training: the frames that count as known at the last view.
+    training: the frames that count as known at the last view; doubts: what speaks against the scores, in words.
     """
 
     has_clock: bool
@@ -34,6 +35,7 @@ class Scores:
     best: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
     worst: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
     training: tuple["RgbdFrame", ...] = ()
+    doubts: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,7 @@ class Scorer:
 
     def run(self, console: Console, stopwatch: "Stopwatch") -> Scores:
         """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
+        from splatctrl_cli.evaluate.doubts import Doubts
         from splatctrl_cli.evaluate.views import views_to_score
 
         args, scene, source = self.args, self.scene, self.reference.source
@@ -63,6 +66,7 @@ class Scorer:
             numbered_by_stamp=self.reference.numbered_by_stamp,
         )
         may_train = args.allow_training or self.reference.scores_training
+        doubts = Doubts(is_still=not has_clock, may_train=may_train, mask_rule=self.reference.mask_rule)
         for view in views:
             if view.frame.stamp_ns in scene.training_stamps_ns and not may_train:
                 raise UsageError(
@@ -73,10 +77,11 @@ class Scorer:
                 scores.skipped.append(view.name)
                 continue
             with stopwatch.stage("score"):
-                self._score_one(scores, view, splats_at(view.frame.stamp_ns))
+                self._score_one(scores, doubts, view, splats_at(view.frame.stamp_ns))
             if len(scores.views) % 20 == 0:
                 console.log(f"scored {len(scores.views)} views")
         self._check(scores)
+        scores.doubts += [*self.reference.doubts, *doubts.lines()]
         return scores
 
     def _check(self, scores: Scores) -> None:
@@ -93,7 +98,7 @@ class Scorer:
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",
             )
 
-    def _score_one(self, scores: Scores, view: "View", splats: "SplatSet | GaussianSet") -> None:
+    def _score_one(self, scores: Scores, doubts: "Doubts", view: "View", splats: "SplatSet | GaussianSet") -> None:
         from splatctrl_cli.evaluate.pictures import ComparisonRow
         from splatctrl_cli.evaluate.score import score_view
         from splatctrl_cli.evaluate.visibility import seen_pixels
@@ -102,13 +107,15 @@ class Scorer:
         rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.args.threads)
         rendering = rendering.before(self.scene.background)
         depth = rendering.normalised_depth()
+        mask = None if self.reference.mask is None else self.reference.mask(frame)
+        doubts.look(view, rendering.color, mask)
         score = score_view(
             view=view.name,
             color=rendering.color,
             depth=depth,
             frame=frame,
             seen=seen_pixels(frame, view.training),
-            mask=None if self.reference.mask is None else self.reference.mask(frame),
+            mask=mask,
             fill=0.0 if protocol is None else protocol.fill,
             perceptual=self.perceptual,
         )

@@ -72,16 +72,22 @@ def ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Boo
     return float(selected.mean()) if selected.size else math.nan
 
 
+def filled(image: NDArray[np.floating], mask: Bool, fill: float) -> Float64:
+    """The image (H, W, 3) with `fill` outside the mask (H, W)."""
+    return np.where(mask[:, :, None], image, fill).astype(np.float64)
+
+
 def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Bool, fill: float) -> float:
     """SSIM of images (H, W, 3) in [0, 1] that are `fill` outside the mask (H, W), as NeRF's papers print it.
 
     They call scikit-image with its defaults (skimage/metrics/_structural_similarity.py before 0.20): box window of
     7 pixels, sample moments, the data range of floats taken as 2, and a border of 3 pixels left out of the mean.
-    That range lifts the figure: compare it only with figures of the same kind. nan for images below 7 pixels.
+    That range lifts the figure: compare it only with figures of the same kind. nan for images below 7 pixels and for
+    an empty mask.
     """
-    x, y = (np.where(mask[:, :, None], picture, fill).astype(np.float64) for picture in (image, reference))
-    if min(x.shape[:2]) < BOX:
+    if min(mask.shape) < BOX or not mask.any():
         return math.nan
+    x, y = (filled(picture, mask, fill) for picture in (image, reference))
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
         uniform_filter(picture, size=(BOX, BOX, 1)) for picture in (x, y, x * x, y * y, x * y)
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.free_space import in_front
-from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, psnr, published_ssim, ssim_map
+from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, filled, psnr, published_ssim, ssim_map
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
 Perceptual = Callable[[Float64, Float64], float]
@@ -31,6 +31,8 @@ PROTOCOL = {
     "masked": "the pixels that the mask rule selects; its share of the view is mask_share",
     "ssim_published": "of the whole view with render and photo set to one colour outside the mask, as scikit-image's "
     "default has it: 7x7 box, sample moments, data range 2, border of 3 pixels left out",
+    "lpips": "of the whole view, colours scaled to [-1, 1]; lpips_published: with render and photo set to one colour "
+    "outside the mask",
     "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
     "centre lies in a voxel that was observed free; null where the scene has no occupancy grid",
 }
@@ -55,8 +57,8 @@ class RegionScore:
 class ViewScore:
     """One view: `valid_share` of its pixels have a reference depth; `all` and `seen` are its regions.
 
-    Where there is a mask: `masked` is its region, ssim_published that of the view with the rest filled. lpips where
-    weights were given. size: width and height [px].
+    Where there is a mask: `masked` is its region, ssim_published and lpips_published are those of the view with the
+    rest filled. lpips where weights were given. size: width and height [px].
     """
 
     view: str
@@ -69,6 +71,7 @@ class ViewScore:
     masked: RegionScore | None = None
     ssim_published: float = math.nan
     lpips: float | None = None
+    lpips_published: float | None = None
 
     def figures(self) -> dict[str, float]:
         """The view's figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
@@ -79,6 +82,8 @@ class ViewScore:
             regions["masked"] = self.masked
         if self.lpips is not None:
             figures["lpips"] = self.lpips
+        if self.lpips_published is not None:
+            figures["lpips_published"] = self.lpips_published
         for name, region in regions.items():
             figures |= {f"psnr_{name}": region.psnr, f"ssim_{name}": region.ssim}
             depth = asdict(region.depth)
@@ -104,8 +109,8 @@ def score_view(
 
     color (H, W, 3) in [0, 1], depth (H, W) [m] normalised by accumulated opacity, 0 = none; seen (H, W): pixels
     that a training camera saw; mask (H, W): pixels that the mask rule selects, `fill` the grey outside it for
-    ssim_published; perceptual: LPIPS. What is not valid in `frame` is in no region. `PROTOCOL` says what each figure
-    means.
+    the published figures; perceptual: LPIPS. What is not valid in `frame` is in no region. `PROTOCOL` says what each
+    figure means.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
     photo = frame.color.astype(np.float64) / 255.0
@@ -126,6 +131,9 @@ def score_view(
             in_front=in_front(depth, frame.depth, mask),
         )
 
+    def of_the_mask(perceptual: Perceptual, mask: Bool) -> float:
+        return perceptual(filled(rendered, mask, fill), filled(photo, mask, fill)) if mask.any() else math.nan
+
     return ViewScore(
         view=view,
         camera=frame.camera,
@@ -137,6 +145,7 @@ def score_view(
         masked=None if mask is None else score_region(mask),
         ssim_published=math.nan if mask is None else published_ssim(rendered, photo, mask, fill),
         lpips=None if perceptual is None else perceptual(rendered, photo),
+        lpips_published=None if perceptual is None or mask is None else of_the_mask(perceptual, mask),
     )
 
 
@@ -145,7 +154,7 @@ def metric_names() -> tuple[str, ...]:
     they were given.
     """
     depth = ("pixels", *(f.name for f in fields(DepthErrors) if f.name != "num_pixels"), "coverage")
-    names = ["num_views", "valid_share", "seen_share", "mask_share", "ssim_published", "lpips"]
+    names = ["num_views", "valid_share", "seen_share", "mask_share", "ssim_published", "lpips", "lpips_published"]
     for region in ("seen", "all", "masked"):
         names += [f"psnr_{region}", f"ssim_{region}", *(f"depth_{name}_{region}" for name in depth)]
         names.append(f"in_front_{region}")

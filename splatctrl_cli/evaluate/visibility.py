@@ -33,9 +33,14 @@ def surface_points(frame: RgbdFrame) -> tuple[Float64, Bool]:
 
 
 def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float = 0.02) -> Bool:
-    """(H, W) True where the frame's own depth lies on a surface that one of the `others` measured."""
+    """(H, W) True where the frame's own depth lies on a surface that one of the `others` measured.
+
+    The nearest cameras are asked first: they saw most of it, and what was seen is not asked again.
+    """
     points_world, seen = surface_points(frame)
-    seen[seen] = seen_by(points_world, others, tolerance)
+    center = frame.T_world_camera[:3, 3]
+    nearest = sorted(others, key=lambda other: float(np.linalg.norm(other.T_world_camera[:3, 3] - center)))
+    seen[seen] = seen_by(points_world, nearest, tolerance)
     return seen
 
 

@@ -142,6 +142,19 @@ def test_pictures_of_every_view_of_the_extremes_or_none(place: Path, tmp_path: P
     assert names("none") == set()
 
 
+def test_warnings_are_printed_counted_and_can_be_gated(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in (place / "masks").iterdir():
+        cv2.imwrite(str(tmp_path / path.name), 255 - cv2.imread(str(path)))  # type: ignore[operator]
+    arguments = ("--protocol", HOLDOUT, "--masks", tmp_path, "--require", "num_warnings<=0")
+    assert run(place, "mvsnet", *arguments) == 1
+    said = capsys.readouterr()
+    assert "\nwarning: holdout-0000 has its mask on 100% of the image's border" in said.out
+    assert "num_warnings is 1, required <= 0" in said.err
+    assert scored(capsys, place, "mvsnet", "--require", "num_warnings<=0")["warnings"] == []
+
+
 def surface(views: list[DtuView]) -> Float64:
     """What the views' depth measured [m], world."""
     parts = []

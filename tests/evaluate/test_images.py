@@ -110,4 +110,5 @@ def test_published_ssim_is_the_box_window_of_scikit_image_on_filled_images() -> 
                     / ((a.mean() ** 2 + b.mean() ** 2 + c1) * (covariance[0, 0] + covariance[1, 1] + c2))
                 )
     assert published_ssim(image, reference, mask, 1.0) == pytest.approx(np.mean(values), abs=1e-12)
+    assert np.isnan(published_ssim(image, reference, mask & False, 1.0)), "not the 1 of two white images"
     assert math.isnan(published_ssim(image[:5], reference[:5], mask[:5], 1.0))

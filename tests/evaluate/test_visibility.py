@@ -60,6 +60,14 @@ def test_a_frame_sees_all_its_own_surface_from_any_pose() -> None:
     assert np.array_equal(seen_pixels(frame, [frame]), valid)
 
 
+def test_what_is_seen_does_not_hang_on_the_order_of_the_cameras() -> None:
+    frame = wall_frame(look_at([0.5, -2.0, 0.4], [0.0, 0.0, 0.5]))
+    others = [wall_frame(look_at([0.1 * n, -2.0, 0.4], [0.2, 0.0, 0.5])) for n in (4, 0, 6)]
+    seen = seen_pixels(frame, others)
+    assert 0 < seen.sum() < seen.size
+    assert np.array_equal(seen, seen_pixels(frame, others[::-1]))
+
+
 def test_any_frame_suffices_and_no_frame_sees_nothing() -> None:
     away = wall_frame(look_at([0.0, 0.0, 0.0], [0.0, 0.0, -1.0], up=(0.0, 1.0, 0.0)))
     target = points([[0.5, 0.0, 2.0]])
