@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.io.decoder import IMAGE, UndecodableMessageError, stamp_ns
-from splatctrl_cli.io.encodings import BAYER, COLOR_CONVERSIONS, DEPTH_ENCODINGS, raw_pixels, to_rgb
+from splatctrl_cli.io.encodings import BAYER, BAYER_16, COLOR_CONVERSIONS, DEPTH_ENCODINGS, raw_pixels, to_rgb
 from splatctrl_cli.io.image_file import JPEG, PNG, TAIL, image_head
 from splatctrl_cli.io.rvl import decode_rvl
 from splatctrl_cli.records import Float32, UInt8
@@ -29,6 +29,7 @@ __all__ = [
 MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
 _CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
+_MOSAICS = frozenset({*BAYER, *BAYER_16})
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 
 
@@ -111,7 +112,7 @@ def _plain(form: str, data: bytes) -> tuple[str, tuple[int, int], bytes, bool] |
         return None
     file = data[_DEPTH_HEAD:] if is_depth else data
     head = image_head(file)
-    if head is None or (is_depth and head.channels != 1) or recorded in BAYER:
+    if head is None or (is_depth and head.channels != 1) or recorded in _MOSAICS:
         return None
     size = (head.height, head.width)
     if is_depth or (head.channels, head.bits) == (1, 16):
@@ -176,13 +177,19 @@ def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes
     if "compressedDepth" in form:
         return _compressed_depth(form, data)
     pixels = _decoded(form, data, color=False)
+    recorded = form.partition(";")[0].strip()
+    if pixels.ndim == 2 and recorded in _MOSAICS and pixels.dtype == (np.uint8 if recorded in BAYER else np.uint16):
+        return pixels, recorded, None  # a mosaic in a file: its bytes are no colour image
     if pixels.ndim == 2 and pixels.dtype == np.uint16:
         return pixels, "16UC1", data
+    if pixels.ndim == 2 and pixels.dtype == np.float32:  # TIFF, as compressed_image_transport stores 32FC1
+        return pixels, "32FC1", None
     if pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] != 3):
         pixels = _decoded(form, data, color=pixels.ndim != 2)  # to three channels of eight bits
-    recorded = form.partition(";")[0].strip()
-    if pixels.ndim == 2 and recorded in BAYER:
-        return pixels, recorded, None  # a mosaic in a file: its bytes are no colour image
+    if pixels.dtype != np.uint8:
+        raise UndecodableMessageError(
+            f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth"
+        )
     return pixels, "mono8" if pixels.ndim == 2 else "bgr8", data
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.io.decoder import COMPRESSED_IMAGE, IMAGE, UndecodableMessageError
-from splatctrl_cli.io.messages import color_of, depth_of, read_image
+from splatctrl_cli.io.messages import color_of, decode_file, depth_of, read_image
 from splatctrl_cli.io.rvl import decode_rvl
 from tests.io.make_log import header
 
@@ -101,7 +101,7 @@ def test_compressed_depth_transport_is_read() -> None:
 
 
 def test_an_unknown_encoding_is_neither_color_nor_depth() -> None:
-    assert read_image(message(RGB[..., 0], "rgb16"), IMAGE).kind == "other"
+    assert read_image(message(RGB[..., 0], "p010"), IMAGE).kind == "other"
 
 
 def test_bytes_that_are_no_image_are_refused() -> None:
@@ -130,15 +130,43 @@ def mosaic(rgb: tuple[int, int, int], pattern: str) -> np.ndarray[Any, np.dtype[
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_a_bayer_mosaic_of_one_colour_is_that_colour(pattern: str) -> None:
-    image = read_image(message(mosaic((200, 100, 30), PATTERNS[pattern]), f"bayer_{pattern}8", padding=3), IMAGE)
+    pixels = mosaic((200, 100, 30), PATTERNS[pattern])
+    for deep, encoding in ((pixels, f"bayer_{pattern}8"), (pixels.astype(np.uint16) * 257, f"bayer_{pattern}16")):
+        image = read_image(message(deep, encoding, padding=4), IMAGE)
+        assert image.kind == "color"
+        assert (color_of(image)[2:-2, 2:-2] == [200, 100, 30]).all()
+
+
+DEEP = RGB.astype(np.uint16) * 257
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixels"),
+    [
+        ("rgb16", DEEP),
+        ("bgr16", DEEP[..., ::-1]),
+        ("16UC3", DEEP[..., ::-1]),
+        ("rgba16", np.dstack([DEEP, DEEP[..., 0]])),
+        ("bgra16", np.dstack([DEEP[..., ::-1], DEEP[..., 0]])),
+    ],
+)
+@pytest.mark.parametrize("big", [False, True])
+def test_colour_of_sixteen_bits_becomes_eight(encoding: str, pixels: np.ndarray[Any, Any], big: bool) -> None:
+    image = read_image(message(pixels, encoding, big=big, padding=2), IMAGE)
     assert image.kind == "color"
-    assert (color_of(image)[2:-2, 2:-2] == [200, 100, 30]).all()
+    assert np.array_equal(color_of(image), RGB)
+    half = read_image(message(pixels - (pixels > 300).astype(np.uint16) * 100, encoding, big=big), IMAGE)
+    assert np.array_equal(color_of(half), RGB)  # rounded, not cut
 
 
-def test_a_bayer_mosaic_in_an_image_file_is_interpolated_too() -> None:
-    data = cv2.imencode(".png", mosaic((200, 100, 30), "GRBG"))[1].ravel()
-    form = "bayer_grbg8; png compressed bayer_grbg8"
-    image = read_image(SimpleNamespace(header=header(5, "o"), format=form, data=data), COMPRESSED_IMAGE)
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("lazily", [False, True])
+def test_a_bayer_mosaic_in_an_image_file_is_interpolated_too(bits: int, lazily: bool) -> None:
+    pixels = mosaic((200, 100, 30), "GRBG").astype(np.uint16) * (1 if bits == 8 else 257)
+    data = cv2.imencode(".png", pixels.astype(f"u{bits // 8}"))[1].ravel()
+    form = f"bayer_grbg{bits}; png compressed bayer_grbg{bits}"
+    recorded = SimpleNamespace(header=header(5, "o"), format=form, data=data)
+    image = read_image(recorded, COMPRESSED_IMAGE, lazily=lazily)
     assert (color_of(image)[2:-2, 2:-2] == [200, 100, 30]).all()
     assert image.compressed is None
 
@@ -246,3 +274,101 @@ def test_the_rvl_transport_is_depth_and_a_cut_or_bloated_one_is_refused() -> Non
         read(stream[:12] + b"\xff\xff\xff\x7f" * 2 + stream[20:])
     with pytest.raises(UndecodableMessageError, match="33 bits"):
         read(stream[:20] + b"\xff" * 36 + bytes(4))
+
+
+def test_nv24_has_colour_for_every_pixel() -> None:
+    rows = np.full((12, 6), Y, np.uint8)
+    rows[4:] = np.tile(np.array([U, V], np.uint8), 3)
+    full = message(rows, "nv24")
+    full.height = 4
+    image = read_image(full, IMAGE)
+    assert (image.width, image.height, image.kind) == (6, 4, "color")
+    assert color_of(image)[..., :2] == pytest.approx(np.broadcast_to(EXPECTED, (4, 6, 2)), abs=1.0)
+    full.data = full.data[:-1]
+    with pytest.raises(UndecodableMessageError, match="71 bytes with a row step of 6 do not hold it"):
+        read_image(full, IMAGE)
+
+
+def file_message(form: str, suffix: str, pixels: np.ndarray[Any, Any], flags: list[int] | None = None) -> Any:
+    data = cv2.imencode(suffix, pixels, flags or [])[1].ravel()
+    return SimpleNamespace(header=header(5, "o"), format=form, data=data)
+
+
+FORMS = [  # of image_transport's plugins, as the distributions write them, and of drivers
+    ("jpeg", ".jpg", "color"),
+    ("png", ".png", "color"),
+    ("bgr8; jpeg compressed bgr8", ".jpg", "color"),
+    ("rgb8; jpeg compressed bgr8", ".jpg", "color"),
+    ("rgb8; png compressed ", ".png", "color"),
+    ("rgba8; png compressed rgba8", ".png", "color"),
+    ("mono8; jpeg compressed ", ".jpg", "color"),
+    ("16UC1; png compressed ", ".png", "depth"),
+    ("16UC1; png compressed", ".png", "depth"),
+    ("mono16; png compressed mono16", ".png", "depth"),
+    ("png", ".png", "depth"),
+    ("16UC1; compressedDepth", ".png", "transport"),
+    ("16UC1; compressedDepth png", ".png", "transport"),
+    ("mono16; compressedDepth png", ".png", "transport"),
+]
+
+
+@pytest.mark.parametrize(("form", "suffix", "kind"), FORMS)
+@pytest.mark.parametrize("lazily", [False, True])
+def test_every_form_of_a_compressed_image_is_told_apart(form: str, suffix: str, kind: str, lazily: bool) -> None:
+    recorded = file_message(form, suffix, RGB[..., ::-1] if kind == "color" else COUNTS)
+    if kind == "transport":
+        recorded.data = np.concatenate([np.zeros(12, np.uint8), recorded.data])
+    image = read_image(recorded, COMPRESSED_IMAGE, lazily=lazily)
+    assert image.kind == ("color" if kind == "color" else "depth")
+    if kind != "color":
+        assert np.array_equal(depth_of(image, None), COUNTS.astype(np.float32) * np.float32(1e-3))
+    elif suffix == ".png":
+        assert np.array_equal(color_of(image), RGB)
+
+
+def test_float_depth_in_a_tiff_is_metres() -> None:
+    metres = np.array([[0.5, np.nan], [2.25, 0.0]], np.float32)
+    image = read_image(file_message("32FC1; tiff compressed ", ".tiff", metres), COMPRESSED_IMAGE)
+    assert image.kind == "depth" and image.compressed is None
+    assert np.array_equal(depth_of(image, None), np.array([[0.5, 0], [2.25, 0]], np.float32))
+
+
+@pytest.mark.parametrize("lazily", [False, True])
+def test_colour_png_of_sixteen_bits_or_with_alpha_keeps_bytes_that_decode_alike(lazily: bool) -> None:
+    for pixels in (DEEP[..., ::-1], np.dstack([RGB[..., ::-1], RGB[..., 0]])):
+        image = read_image(file_message("png", ".png", pixels), COMPRESSED_IMAGE, lazily=lazily)
+        assert np.array_equal(color_of(image), RGB)
+        assert image.compressed is not None
+        again = decode_file(image.compressed, color=True)
+        assert again is not None and np.array_equal(again[..., ::-1], RGB)
+
+
+def with_orientation(jpeg: bytes) -> bytes:
+    """With an EXIF segment that says: turn by 90 degrees (6)."""
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
+    tiff = b"II*\x00" + struct.pack("<IH", 8, 1) + entry + bytes(4)
+    exif = b"Exif\x00\x00" + tiff
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
+
+
+@pytest.mark.parametrize("color", [False, True])
+def test_a_turned_camera_keeps_the_pixels_that_its_lens_is_of(color: bool) -> None:
+    """OpenCV alone would turn the image, and with it leave the intrinsics behind."""
+    jpeg = with_orientation(bytes(cv2.imencode(".jpg", RGB)[1]))
+    turned = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert turned is not None and turned.shape == (6, 4, 3)
+    pixels = decode_file(jpeg, color=color)
+    assert pixels is not None and pixels.shape == (4, 6, 3)
+
+
+def test_a_progressive_jpeg_is_read() -> None:
+    flags = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_QUALITY, 100]
+    smooth = np.full((16, 16, 3), (90, 120, 30), np.uint8)
+    image = read_image(file_message("jpeg", ".jpg", smooth, flags), COMPRESSED_IMAGE, lazily=True)
+    assert color_of(image) == pytest.approx(smooth[..., ::-1], abs=3)
+
+
+def test_other_pixels_in_a_file_are_neither_colour_nor_depth() -> None:
+    recorded = file_message("64FC1; tiff compressed ", ".tiff", np.ones((4, 4), np.float64))
+    with pytest.raises(UndecodableMessageError, match="pixels of float64, neither colour nor depth"):
+        read_image(recorded, COMPRESSED_IMAGE)
