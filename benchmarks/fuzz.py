@@ -248,7 +248,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     found: collections.Counter[tuple[str, str]] = collections.Counter()
     codes: collections.Counter[int] = collections.Counter()
     faults: list[Outcome] = []
-    slowest, which, peak = 0.0, 0, 0
+    slowest, which, peak, largest = 0.0, 0, 0, 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "samples").mkdir()
@@ -262,7 +262,8 @@ def run(argv: Sequence[str] | None = None) -> int:
             codes[outcome.code] += 1
             if outcome.seconds > slowest:
                 slowest, which = outcome.seconds, outcome.seed
-            peak = max(peak, outcome.peak_mib)
+            if outcome.peak_mib > peak:
+                peak, largest = outcome.peak_mib, outcome.seed
             if outcome.fault:
                 faults.append(outcome)
                 kept = args.keep / str(outcome.seed)
@@ -274,7 +275,7 @@ def run(argv: Sequence[str] | None = None) -> int:
                 )
     print("\n".join(table(["input", "command", "tried"], [[*key, n] for key, n in sorted(found.items())])))
     print(f"exit codes: {', '.join(f'{code}: {n}' for code, n in sorted(codes.items()))}")
-    print(f"{codes.total()} inputs in {time.monotonic() - start:.0f} s, peak {peak} MiB")
+    print(f"{codes.total()} inputs in {time.monotonic() - start:.0f} s, peak {peak} MiB, seed {largest}")
     print(f"slowest: {slowest:.1f} s, seed {which}")
     print(f"{len(faults)} faults")
     return 1 if faults else 0

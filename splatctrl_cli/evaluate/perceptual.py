@@ -17,6 +17,7 @@ from splatctrl_cli.records import Float32, Float64
 
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)  # richzhang/PerceptualSimilarity, lpips/lpips.py, ScalingLayer
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
+MOST = 1 << 28  # bytes of weights: those of VGG take 59 MB
 ROWS = 32  # of the output that are made at a time
 
 
@@ -78,6 +79,9 @@ class Lpips:
 def _read(path: Path) -> dict[str, Float32]:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            size = sum(entry.file_size for entry in archive.zip.infolist())
+            if size > MOST:
+                raise ValueError(f"{size} bytes of arrays, expected at most {MOST}")
             return {name: np.asarray(archive[name], np.float32) for name in archive.files}
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None

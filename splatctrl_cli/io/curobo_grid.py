@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.io.arrays import Pieces, savez
+from splatctrl_cli.io.arrays import DAMAGE, Pieces, savez
 from splatctrl_cli.io.grid_channels import check_grid, header_text, slabs
 from splatctrl_cli.records import DistanceGrid, Float64
 
@@ -96,5 +96,5 @@ def is_curobo_npz(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return {"features.npy", "dims.npy", "voxel_size.npy", "pose.npy", "curobo.npy"} <= set(archive.namelist())
-    except (zipfile.BadZipFile, OSError):
+    except (*DAMAGE, OSError):
         return False

@@ -3,6 +3,7 @@
 import json
 import zipfile
 from collections.abc import Callable
+from math import prod
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import ParseError
@@ -13,6 +14,7 @@ from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.io.curobo_grid import is_curobo_npz
 from splatctrl_cli.io.describe_grid import (
     describe_curobo,
@@ -31,6 +33,7 @@ from splatctrl_cli.io.summary import Grid, Summary
 from splatctrl_cli.io.vdb import MAGIC
 
 _HEAD = 1 << 16  # bytes in which a text header must end
+_MOST_SHOWN = 1 << 24  # bytes of texts and short lists
 _LIST_LIMIT = 12  # longer lists are counted, not shown
 
 
@@ -76,17 +79,15 @@ def _npz(path: Path, _head: bytes) -> Summary:
         return describe_grid_npz(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            arrays = {name: _npy_header(archive, name) for name in archive.namelist() if name.endswith(".npy")}
+            arrays = {n: _npy_header(archive, n) for n in archive.namelist() if n.endswith(".npy")}
         if not arrays:
             raise InputError(f"{path}: a zip file without arrays", remedy="expected .npz")
-        facts: dict[str, object] = {}
-        with np.load(path, allow_pickle=False) as content:
-            for name, (shape, dtype) in arrays.items():
-                if dtype.kind in "US" and shape == ():
-                    facts[name.removesuffix(".npy")] = _text_or_json(str(content[name.removesuffix(".npy")]))
-                elif dtype.kind in "fiub" and int(np.prod(shape)) <= _LIST_LIMIT:
-                    facts[name.removesuffix(".npy")] = content[name.removesuffix(".npy")].tolist()
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
+        short = [name.removesuffix(".npy") for name, (shape, dtype) in arrays.items() if _is_short(shape, dtype)]
+        facts: dict[str, object] = {
+            name: _text_or_json(str(array)) if array.dtype.kind in "US" else array.tolist()
+            for name, array in read_arrays(path, short, most=_MOST_SHOWN).items()
+        }
+    except (*DAMAGE, OSError) as error:
         raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
     rows = [
         [name.removesuffix(".npy"), "x".join(map(str, shape)) or "-", str(dtype)]
@@ -100,12 +101,14 @@ def _npz(path: Path, _head: bytes) -> Summary:
 _ARRAY = ("array", "shape", "dtype")
 
 
-def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], Any]:
+def _npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
     with archive.open(name) as stream:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    return tuple(shape), dtype
+        shape, _, dtype = npy_head(stream)
+    return shape, dtype
+
+
+def _is_short(shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
+    return shape == () if dtype.kind in "US" else dtype.kind in "fiub" and prod(shape) <= _LIST_LIMIT
 
 
 def _npy(path: Path, _head: bytes) -> Summary:

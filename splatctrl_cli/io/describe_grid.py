@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.arrays import DAMAGE
+from splatctrl_cli.io.arrays import DAMAGE, read_arrays
 from splatctrl_cli.io.grid import read_npz_head
 from splatctrl_cli.io.grid_channels import CHANNELS, FORMAT, GridHead
 from splatctrl_cli.io.moveit_field import read_moveit_head
@@ -22,6 +22,7 @@ FIELD_FACTS = (
     *("distance", "kernel", "length_scale", "weights", "unknown", "probability", "sign", "frame", "labels"),
     *("splats_used", "observed", "stamp_ns"),
 )
+_MOST_HEAD = 1 << 20  # bytes of a grid's arrays but for its values
 _CHANNEL_COLUMNS = ("channel", "dtype", "unit")
 
 
@@ -90,16 +91,18 @@ def describe_vdb(path: Path, _head: bytes) -> Summary:
 def describe_curobo(path: Path) -> Summary:
     """A ``field.curobo.npz``. Raises InputError for one that is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as content:
-            facts: dict[str, object] = {
-                "curobo": str(content["curobo"]),
-                "channel": str(content["channel"]),
-                "shape": content["shape"].tolist(),
-                "voxel": float(content["voxel_size"]),
-                "dims": content["dims"].tolist(),
-                "pose_xyz_qwxyz": content["pose"].tolist(),
-                **header_facts(json.loads(str(content["header"]))),
-            }
+        content = read_arrays(
+            path, ("curobo", "channel", "shape", "voxel_size", "dims", "pose", "header"), most=_MOST_HEAD
+        )
+        facts: dict[str, object] = {
+            "curobo": str(content["curobo"]),
+            "channel": str(content["channel"]),
+            "shape": content["shape"].tolist(),
+            "voxel": float(np.asarray(content["voxel_size"], np.float64)),
+            "dims": content["dims"].tolist(),
+            "pose_xyz_qwxyz": content["pose"].tolist(),
+            **header_facts(json.loads(str(content["header"]))),
+        }
     except (*DAMAGE, OSError, TypeError) as error:
         raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
     return Summary(path=str(path), kind="cuRobo voxel grid", facts=facts)

@@ -6,16 +6,17 @@ Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () st
 
 import errno
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.arrays import DAMAGE, savez
+from splatctrl_cli.io.arrays import DAMAGE, check_numbers, npy_head, savez
 from splatctrl_cli.io.grid_channels import (
     GridHead,
     check_finite,
@@ -30,6 +31,9 @@ from splatctrl_cli.records import DistanceGrid
 __all__ = ["is_grid_npz", "read_npz", "read_npz_head", "write_npz", "write_vti"]
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
+
+
+MOST_PACKED = 1 << 29  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +79,7 @@ def is_grid_npz(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return {"origin.npy", "voxel.npy", "header.npy", "sdf.npy"} <= set(archive.namelist())
-    except (zipfile.BadZipFile, OSError):
+    except (*DAMAGE, OSError):
         return False
 
 
@@ -102,19 +106,27 @@ def _members(archive: zipfile.ZipFile) -> dict[str, _Member]:
         if name in members or name == entry.filename:
             raise ValueError(f"{entry.filename}: expected one .npy of each name")
         with archive.open(entry) as stream:
-            version = np.lib.format.read_magic(stream)
-            if version not in {(1, 0), (2, 0)}:
-                raise ValueError(f"{entry.filename}: expected .npy version 1 or 2, got {version}")
-            read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(stream)
-            start = stream.tell()
-        if dtype.hasobject:
-            raise ValueError(f"{entry.filename}: Object arrays cannot be loaded when allow_pickle=False")
-        size = start + dtype.itemsize * int(np.prod([int(n) for n in shape], dtype=object))
+            shape, _, dtype = npy_head(stream)
+            check_numbers(dtype)
+            size = stream.tell() + dtype.itemsize * prod(shape)
         if entry.file_size != size:
             raise ValueError(f"{entry.filename}: expected {size} bytes, got {entry.file_size}")
-        members[name] = _Member(dtype=dtype, shape=tuple(shape))
+        members[name] = _Member(dtype=dtype, shape=shape)
+    _check_size(archive.infolist())
     return members
+
+
+def _check_size(entries: Sequence[zipfile.ZipInfo]) -> None:
+    """Raise ValueError for a file whose compressed arrays hold more than a grid that is stored would.
+
+    Stored arrays, as `write_npz` writes them, are as large as the file.
+    """
+    packed = [entry for entry in entries if entry.compress_type != zipfile.ZIP_STORED]
+    size = sum(entry.file_size for entry in packed)
+    if size > MOST_PACKED:
+        raise ValueError(
+            f"{size} bytes in compressed arrays, expected at most {MOST_PACKED}, or arrays not compressed"
+        )
 
 
 def _head(path: Path, archive: zipfile.ZipFile, members: dict[str, _Member]) -> GridHead:

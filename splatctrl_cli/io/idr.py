@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.arrays import read_arrays
 from splatctrl_cli.io.dtu import MILLIMETRES, DtuScan, DtuView, Shrink, read_depth, read_image, read_mask
 from splatctrl_cli.records import Float64, Intrinsics
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
+_MOST = 1 << 24  # bytes of cameras: 500 each
 MAX_SKEW = 1.0  # [px] our cameras have none
 PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
 
@@ -134,10 +136,10 @@ def _numbered(folder: Path, num: int) -> dict[int, Path]:
 def _projections(path: Path) -> list[Float64]:
     """World points [mm] to pixels (3, 4), of each camera in the file."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            num = sum(1 for name in archive.files if re.fullmatch(r"world_mat_\d+", name))
-            world = [np.asarray(archive[f"world_mat_{i}"], np.float64)[:3, :4] for i in range(max(num, 1))]
-            radius = float(archive["scale_mat_0"][0, 0]) / MILLIMETRES
+        arrays = read_arrays(path, most=_MOST)
+        num = sum(1 for name in arrays if re.fullmatch(r"world_mat_\d+", name))
+        world = [np.asarray(arrays[f"world_mat_{i}"], np.float64)[:3, :4] for i in range(max(num, 1))]
+        radius = float(np.asarray(arrays["scale_mat_0"], np.float64)[0, 0]) / MILLIMETRES
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]}; expected world_mat_0 and so on, and scale_mat_0") from None
     except Exception as error:  # numpy raises many kinds for a file that is no archive

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.arrays import npy_of
 from splatctrl_cli.io.joint_log import COLUMNS, JointLog, JointStream
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.options import SourceOptions
@@ -115,7 +116,8 @@ def _topic(entry: Mapping[str, Any], checked: Callable[[str], Path]) -> TopicSur
     for stream in entry["streams"]:
         place = stream["folder"]
         stamps, log_times = (
-            np.load(checked(f"{place}/{name}.npy"), allow_pickle=False) for name in ("stamp_ns", "log_time_ns")
+            np.asarray(npy_of(checked(f"{place}/{name}.npy").read_bytes()), dtype=np.int64)
+            for name in ("stamp_ns", "log_time_ns")
         )
         columns = {name: _blocks(checked(f"{place}/{name}.npy")) for name in stream["columns"]}
         streams.append(JointStream.of(tuple(stream["joints"]), stamps, log_times, columns))

@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.arrays import DAMAGE, npy_head
 from splatctrl_cli.io.rows import BLOCK, RowFile, Rows
 
 Stamps = NDArray[np.int64]
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+FREE_BYTES = 1 << 30  # of an array, unpacked, and beside it:
+MOST_RATIO = 100  # times the file's size; joint states as recorded compress 2 to 20 times
+_MOST_BY_COLUMNS = 1 << 28  # bytes, as they are in memory at once
+_DAMAGE = (OSError, *DAMAGE)
 
 
 class NpzFile:
@@ -86,6 +89,8 @@ class NpzFile:
             shape, dtype, is_by_columns, stream = self._opened(stack, name)
             try:
                 if is_by_columns:
+                    if prod(shape) * dtype.itemsize > _MOST_BY_COLUMNS:
+                        raise ValueError(f"{name}: over {_MOST_BY_COLUMNS} bytes by columns, expected rows")
                     whole = np.frombuffer(_read(stream, prod(shape) * dtype.itemsize), dtype).reshape(
                         shape, order="F"
                     )
@@ -103,12 +108,17 @@ class NpzFile:
         try:
             archive = stack.enter_context(zipfile.ZipFile(self._path))
             stream = stack.enter_context(archive.open(f"{name}.npy"))
-            version = npy.read_magic(stream)
-            read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-            shape, is_by_columns, dtype = read(stream)
+            shape, is_by_columns, dtype = npy_head(stream)
+            self._check_size(name, prod(shape) * dtype.itemsize)
         except _DAMAGE as error:
             raise self._unreadable(error) from None
         return shape, dtype, is_by_columns and len(shape) > 1, stream
+
+    def _check_size(self, name: str, size: int) -> None:
+        """Raise ValueError for an array that no recording packs so small: it is kept on disk, unpacked."""
+        most = FREE_BYTES + MOST_RATIO * self._path.stat().st_size
+        if size > most:
+            raise ValueError(f"{name}: {size} bytes unpacked, over {MOST_RATIO} times the size of the file")
 
     def _unreadable(self, error: Exception) -> InputError:
         return InputError(f"{self._path}: cannot be read as NPZ: {error}", remedy="check the file")

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.io.arrays import savez
+from splatctrl_cli.io.arrays import read_arrays, savez
 from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.io.output import PARTIAL
 from splatctrl_cli.io.splats import read_ply
 from splatctrl_cli.records import GaussianSet, OccupancyGrid, SplatSet, UInt8, VoxelState
 
 FORMAT = "splatctrl-scene 1"
+MOST_VOXELS = 400_000_000  # as many as reconstruct makes
+_HEADER = 1 << 20  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,10 +81,10 @@ def write_states(path: Path, grid: OccupancyGrid, states: UInt8) -> None:
 def read_states(path: Path) -> OccupancyGrid:
     """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            origin = np.array(header["origin"], np.float64)
-            return OccupancyGrid.from_states(origin, float(header["voxel"]), archive["states"])
+        arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
+        header = json.loads(str(arrays["header"]))
+        states = _voxels(arrays["states"], "states", np.uint8, header)
+        return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
     except Exception as error:
         raise InputError(f"{path}: not the voxel states of a snapshot: {error}") from error
 
@@ -90,15 +92,14 @@ def read_states(path: Path) -> OccupancyGrid:
 def read_occupancy(path: Path) -> OccupancyGrid:
     """Read ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            return OccupancyGrid(
-                origin=np.array(header["origin"], np.float64),
-                voxel=float(header["voxel"]),
-                log_odds=archive["log_odds"],
-                num_updates=archive["num_updates"],
-                entity=archive["entity"],
-            )
+        kinds: dict[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
+        arrays = read_arrays(path, ("header", *kinds), most=_HEADER + 7 * MOST_VOXELS)
+        header = json.loads(str(arrays["header"]))
+        return OccupancyGrid(
+            origin=np.array(header["origin"], np.float64),
+            voxel=float(header["voxel"]),
+            **{name: _voxels(arrays[name], name, kind, header) for name, kind in kinds.items()},
+        )
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except Exception as error:
@@ -137,6 +138,14 @@ def _names(value: list[Any]) -> tuple[str, ...]:
 def _color(value: list[Any]) -> tuple[float, float, float]:
     red, green, blue = (float(part) for part in value)
     return red, green, blue
+
+
+def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
+    """An array of one value a voxel. Raises ValueError for one of another type or shape than the header's."""
+    wanted = (np.dtype(kind), tuple(header["shape"]))
+    if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
+        raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
+    return values
 
 
 @dataclass(frozen=True)

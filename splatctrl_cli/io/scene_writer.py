@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.arrays import savez
+from splatctrl_cli.io.arrays import read_arrays, savez
 from splatctrl_cli.io.output import flush, write_durably
 from splatctrl_cli.io.scene_folder import Snapshot, write_occupancy, write_states
 from splatctrl_cli.io.splats import write_ply
@@ -19,6 +19,7 @@ from splatctrl_cli.records import OccupancyGrid, SplatSet, UInt8
 
 CHECKPOINT = "checkpoint/state.npz"
 AUDIT = "audit.jsonl"
+_MOST_STATE = 1 << 32  # bytes: a grid of as many voxels as reconstruct makes takes 2.8e9, its splats the rest
 
 State = Mapping[str, NDArray[np.generic]]
 
@@ -39,14 +40,14 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     """The checkpoint in a partial scene folder. Raises InputError where it cannot be read."""
     path = folder / CHECKPOINT
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            header = json.loads(str(archive["progress"]))
-            return Checkpoint(
-                progress=header["progress"],
-                state={name: archive[name] for name in archive.files if name != "progress"},
-                audit_bytes=int(header["audit_bytes"]),
-                snapshots=tuple((int(stamp_ns), int(count)) for stamp_ns, count in header["snapshots"]),
-            )
+        state = read_arrays(path, most=_MOST_STATE)
+        header = json.loads(str(state.pop("progress")))
+        return Checkpoint(
+            progress=header["progress"],
+            state=state,
+            audit_bytes=int(header["audit_bytes"]),
+            snapshots=tuple((int(stamp_ns), int(count)) for stamp_ns, count in header["snapshots"]),
+        )
     except Exception as error:
         raise InputError(
             f"{path}: cannot be read: {error}", remedy="start over: the same command without --resume"

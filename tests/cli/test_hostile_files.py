@@ -1,6 +1,7 @@
 """Files made to take memory or time, or to reach outside: each is refused in one line, within 1 GiB and seconds."""
 
 import io
+import json
 import os
 import pickle
 import struct
@@ -19,10 +20,12 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.arrays import npy_of
 from splatctrl_cli.robot.solids import mesh_path
 from splatctrl_cli.robot.urdf import MeshShape
+from tests.io.make_npz import write_zeros
 
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
 LAUGHS = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
 HUGE = (1 << 40,)
+BIG, MANY = (1 << 14, 1 << 9, 1 << 9), (1 << 9, 1 << 9, 1 << 10)  # voxels; the latter are 1.75 GiB
 
 
 def npy(shape: tuple[int, ...], dtype: str = "<f4", data: bytes = bytes(64)) -> bytes:
@@ -69,6 +72,22 @@ def saved(path: Path, data: bytes) -> list[str]:
     return ["info", str(path)]
 
 
+def scene(folder: Path, **zeros: tuple[tuple[int, ...], str]) -> list[str]:
+    """A scene with an occupancy of really packed zeros."""
+    (folder / "splats.ply").write_bytes(PLY)
+    shape = next(iter(zeros.values()))[0]
+    write_zeros(folder / "occupancy.npz", zeros, header=json.dumps({"shape": shape, "origin": [0, 0, 0], "voxel": 1}))
+    return ["info", str(folder)]
+
+
+def states(folder: Path, shape: tuple[int, ...]) -> list[str]:
+    """A table of joint states of really packed zeros."""
+    write_zeros(folder / "x.npz", {"t": ((shape[0],), "<f8"), "q": (shape, "<f8")})
+    table = '[states]\nfile = "x.npz"\njoints = ["a", "b"]\ntime = "t"\nposition = "q"\n'
+    (folder / "x.toml").write_text(table)
+    return ["check", str(folder / "x.toml")]
+
+
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
 CASES: dict[str, Callable[[Path], list[str]]] = {
     "billion laughs": lambda d: xml(d, f'<!DOCTYPE robot [<!ENTITY a0 "ha">{LAUGHS}]><robot name="&a11;"/>'),
@@ -85,8 +104,15 @@ CASES: dict[str, Callable[[Path], list[str]]] = {
     "deep JSON": lambda d: saved(d / "x.json", b"[" * 100_000),
     "deep YAML": lambda d: saved(d / "x.yaml", b"[" * 100_000),
     "deep TOML": lambda d: saved(d / "x.toml", b"a = " + b"[" * 100_000),
+    "occupancy of 28 GiB": lambda d: scene(d, log_odds=(BIG, "<f4"), num_updates=(BIG, "<u2"), entity=(BIG, "|u1")),
+    "occupancy of as many voxels as may be": lambda d: scene(
+        d, log_odds=(MANY, "<f4"), num_updates=(MANY, "<u2"), entity=(MANY, "|u1")
+    ),
+    "states of 16 GiB": lambda d: states(d, (1 << 30, 2)),
     "splats announced": lambda d: saved(d / "x.ply", PLY),
 }
+
+CODES = {"grid announced": {0, 4}, "splats announced": {0, 4}, "states of 16 GiB": {1}}  # 1: a finding of check
 
 RUN = """
 import resource, sys
@@ -112,7 +138,7 @@ def test_a_hostile_file_is_refused_or_described_within_bounds(tmp_path: Path, na
         timeout=60,
         env=environment,
     )
-    assert done.returncode in ({0, 4} if name in {"grid announced", "splats announced"} else {4}), done.stderr
+    assert done.returncode in CODES.get(name, {4}), done.stderr
     assert "Traceback" not in done.stderr
     assert "internal error" not in done.stderr
     assert set(tmp_path.rglob("*")) == there
