@@ -1,4 +1,7 @@
-"""The command line as a person meets it, one process per test: help, exit codes, one line per error, nothing left."""
+"""The command line as a person meets it: help, exit codes, one line per error, nothing left.
+
+Each subcommand runs as a process of its own in some tests; what only asks for another line of it runs in this one.
+"""
 
 import json
 import signal
@@ -15,6 +18,7 @@ from splatctrl_cli.cli import demo
 from splatctrl_cli.cli.main import COMMANDS, main
 from splatctrl_cli.io.capture import write_capture
 from splatctrl_cli.io.source import open_source
+from tests.cli import here
 from tests.io.make_log import LogRecipe, make_log
 
 WRITERS = [command for command in COMMANDS if command not in {"info", "check"}]
@@ -162,22 +166,26 @@ def test_wrong_arguments_are_one_line_with_a_remedy(
 @pytest.mark.parametrize("command", ["reconstruct", "sdf-bake", "replay"])
 def test_an_unknown_configuration_key_names_the_nearest(work: Work, tmp_path: Path, command: str) -> None:
     arguments = work.arguments(command, tmp_path / "out")
-    assert_refused(splatctrl(*arguments, "--set", "scene.max_splat=9"), 2, "did you mean scene.max_splats?")
+    assert_refused(here.splatctrl(*arguments, "--set", "scene.max_splat=9"), 2, "did you mean scene.max_splats?")
     (tmp_path / "my.toml").write_text("[contrl]\nmargin = 0.1\n")
-    assert_refused(splatctrl(*arguments, "--config", tmp_path / "my.toml"), 2, "my.toml", "did you mean control?")
+    assert_refused(
+        here.splatctrl(*arguments, "--config", tmp_path / "my.toml"), 2, "my.toml", "did you mean control?"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["my.toml"]
 
 
 def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_path: Path) -> None:
     arguments = work.arguments("reconstruct", tmp_path / "out")
-    assert_refused(splatctrl(*arguments, "--config", tmp_path / "none.toml"), 4, "none.toml: no such file")
+    assert_refused(here.splatctrl(*arguments, "--config", tmp_path / "none.toml"), 4, "none.toml: no such file")
     (tmp_path / "bad.toml").write_text("[scene\n")
-    assert_refused(splatctrl(*arguments, "--config", tmp_path / "bad.toml"), 2, "bad.toml: not valid TOML")
-    assert_refused(splatctrl(*arguments, "--config", tmp_path), 4, "cannot be read: Is a directory; check the path")
-    assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, got 'many'")
-    assert_refused(splatctrl(*arguments, "--set", "scene.max_splats=-5"), 2, "expected above 0, got -5")
-    assert_refused(splatctrl(*arguments, "--seed=-1"), 2, "--seed: expected 0 to 2147483647, got -1")
-    assert_refused(splatctrl(*arguments, "--seed", 2**32), 2, "--seed: expected 0 to 2147483647, got 4294967296")
+    assert_refused(here.splatctrl(*arguments, "--config", tmp_path / "bad.toml"), 2, "bad.toml: not valid TOML")
+    assert_refused(
+        here.splatctrl(*arguments, "--config", tmp_path), 4, "cannot be read: Is a directory; check the path"
+    )
+    assert_refused(here.splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, got 'many'")
+    assert_refused(here.splatctrl(*arguments, "--set", "scene.max_splats=-5"), 2, "expected above 0, got -5")
+    assert_refused(here.splatctrl(*arguments, "--seed=-1"), 2, "--seed: expected 0 to 2147483647, got -1")
+    assert_refused(here.splatctrl(*arguments, "--seed", 2**32), 2, "--seed: expected 0 to 2147483647, got 4294967296")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 
 
@@ -205,7 +213,7 @@ def test_an_output_that_exists_is_kept_without_force(work: Work, tmp_path: Path,
     file = out if command in FILE_WRITERS else out / "run.json"
     file.parent.mkdir(exist_ok=True)
     file.write_text("precious")
-    done = splatctrl(*work.arguments(command, out), "-q")
+    done = here.splatctrl(*work.arguments(command, out), "-q")
     assert_refused(done, 2, "out: already exists; give --force")
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
     assert file.read_text() == "precious"
@@ -217,7 +225,9 @@ def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: 
     precious.parent.mkdir()
     precious.write_text("mine")
     said = "is a folder, expected a file" if command in FILE_WRITERS else "was not written by splatctrl (no run.json)"
-    assert_refused(splatctrl(*work.arguments(command, precious.parent), "-q", "--force"), 2, said, "another --out")
+    assert_refused(
+        here.splatctrl(*work.arguments(command, precious.parent), "-q", "--force"), 2, said, "another --out"
+    )
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [precious]
 
 
@@ -238,7 +248,7 @@ def test_force_replaces_what_the_demo_wrote(
 @pytest.mark.parametrize("command", WRITERS)
 def test_an_output_below_a_file_cannot_be_written(work: Work, tmp_path: Path, command: str) -> None:
     (tmp_path / "file").write_text("no folder")
-    done = splatctrl(*work.arguments(command, tmp_path / "file" / "out"), "-q")
+    done = here.splatctrl(*work.arguments(command, tmp_path / "file" / "out"), "-q")
     assert_refused(done, 2, "cannot be written", "another --out")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
@@ -252,7 +262,7 @@ def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path:
 
 
 def test_cuda_is_refused_where_there_is_none(work: Work, tmp_path: Path) -> None:
-    done = splatctrl(*work.arguments("reconstruct", tmp_path / "out"), "--device", "cuda")
+    done = here.splatctrl(*work.arguments("reconstruct", tmp_path / "out"), "--device", "cuda")
     assert_refused(done, 2, "--device cuda", "give --device cpu")
     assert not list(tmp_path.iterdir())
 
@@ -273,7 +283,7 @@ def test_a_log_that_cannot_be_reconstructed_is_one_line_and_leaves_nothing(
     tmp_path: Path, recipe: LogRecipe, words: str
 ) -> None:
     log = make_log(tmp_path / "log.mcap", recipe)
-    assert_refused(splatctrl("reconstruct", log, *QUICK, "-o", tmp_path / "scene"), 4, "log.mcap", words, "; ")
+    assert_refused(here.splatctrl("reconstruct", log, *QUICK, "-o", tmp_path / "scene"), 4, "log.mcap", words, "; ")
     assert [path.name for path in tmp_path.iterdir()] == ["log.mcap"]
 
 
@@ -292,7 +302,7 @@ def test_a_robot_without_joints_is_refused(work: Work, tmp_path: Path, command: 
         for part in work.arguments(command, tmp_path / "out")
     ]
     given = [] if command == "replay" else ["--urdf", tmp_path / "bad.urdf"]
-    assert_refused(splatctrl(*arguments, *given), 4, "bad.urdf", words)
+    assert_refused(here.splatctrl(*arguments, *given), 4, "bad.urdf", words)
     assert [path.name for path in tmp_path.iterdir()] == ["bad.urdf"]
 
 
@@ -304,7 +314,7 @@ def test_joints_that_are_not_in_the_log_are_named(work: Work, tmp_path: Path, co
         other if part == work.folder / "robot.urdf" else part for part in work.arguments(command, tmp_path / "out")
     ]
     given = [] if command == "replay" else ["--urdf", other]
-    assert_refused(splatctrl(*arguments, *given), 4, "joints not in the log: shoulder", "; ", "joint_a")
+    assert_refused(here.splatctrl(*arguments, *given), 4, "joints not in the log: shoulder", "; ", "joint_a")
     assert [path.name for path in tmp_path.iterdir()] == ["other.urdf"]
 
 
@@ -337,7 +347,7 @@ def test_results_that_cannot_be_printed_are_exit_6(work: Work) -> None:
 
 
 def test_a_failed_gate_is_exit_1_and_keeps_the_output(work: Work, tmp_path: Path) -> None:
-    done = splatctrl(*work.arguments("reconstruct", tmp_path / "scene"), "-q", "--require", "splats>1000000")
+    done = here.splatctrl(*work.arguments("reconstruct", tmp_path / "scene"), "-q", "--require", "splats>1000000")
     assert done.returncode == 1
     assert "splats is " in done.stderr
     assert (tmp_path / "scene" / "run.json").is_file()

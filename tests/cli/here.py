@@ -1,0 +1,47 @@
+"""The command line in this process: what one of its own would print and return, without the wait for its start."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO
+
+import pytest
+
+from splatctrl_cli.cli.main import main
+
+
+def splatctrl(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command; what compiled modules print is caught too."""
+    words = [str(argument) for argument in arguments]
+    with (
+        tempfile.TemporaryFile("w+") as out,
+        tempfile.TemporaryFile("w+") as err,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        with _sent_to(out, 1), _sent_to(err, 2):
+            patch.setattr(sys, "stdout", out)
+            patch.setattr(sys, "stderr", err)
+            code = main(words)
+        texts = [_text(out), _text(err)]
+    return subprocess.CompletedProcess(words, code, *texts)
+
+
+@contextmanager
+def _sent_to(stream: IO[str], number: int) -> Iterator[None]:
+    """File descriptor `number` leads to the stream's file meanwhile."""
+    kept = os.dup(number)
+    os.dup2(stream.fileno(), number)
+    try:
+        yield
+    finally:
+        stream.flush()
+        os.dup2(kept, number)
+        os.close(kept)
+
+
+def _text(stream: IO[str]) -> str:
+    stream.seek(0)
+    return stream.read()
