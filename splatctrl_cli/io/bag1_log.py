@@ -17,6 +17,7 @@ from splatctrl_cli.io.bag_file import (
     number,
     records_in,
 )
+from splatctrl_cli.io.foxglove import standing_in
 from splatctrl_cli.io.mcap_log import ros_type_name
 from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.io.unpacking import BadBlockError, Budget, unpacked_start
@@ -100,9 +101,10 @@ class Bag1Log:
         if told is None or "topic" not in fields or "type" not in told:
             damage.add(f"{self.path.name}: a connection without topic or type")
             return
-        self._topics[number(fields, "conn")] = Topic(
+        topic = Topic(
             name=fields["topic"].decode("utf-8", "replace"),
             type_name=ros_type_name(told["type"].decode("utf-8", "replace")),
             encoding="ros1",
             definition=told.get("message_definition", b"").decode("utf-8", "replace"),
         )
+        self._topics[number(fields, "conn")] = standing_in(topic)

@@ -11,6 +11,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.io.foxglove import standing_in
 from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.io.unpacking import MAX_BLOCK
 
@@ -90,11 +91,12 @@ def _topics(database: sqlite3.Connection) -> dict[object, Topic]:
     topics: dict[object, Topic] = {}
     for number, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
         definition_format, text = definitions.get(kind, ("", ""))
-        topics[number] = Topic(
+        topic = Topic(
             name=str(name),
             type_name=str(kind),
             encoding=str(encoding),
             definition=str(text) if definition_format in {"ros2msg", "ros2idl"} else "",
             definition_format="idl" if definition_format == "ros2idl" else "msg",
         )
+        topics[number] = standing_in(topic)
     return topics

@@ -8,7 +8,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from splatctrl_cli.io.foxglove import as_ros, read_foxglove
+from splatctrl_cli.io.foxglove import DEFINITIONS, as_ros, read_foxglove
 from splatctrl_cli.io.raw_log import RawMessage, Topic
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -103,6 +103,8 @@ def stamp_ns(header: Any) -> int:
 
 
 def _type_store(topic: Topic) -> Any:
+    if not topic.definition and topic.schema in DEFINITIONS:
+        return _foxglove_store()
     if not topic.definition:
         return get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
     _check_definition(topic.definition)
@@ -133,6 +135,14 @@ def _check_fields(store: Any) -> None:
         for field, description in standard[name][1]:
             if there.get(field) != _kind(description):
                 raise ValueError(f"{name} has not the field {field} of the standard")
+
+
+@lru_cache(maxsize=1)
+def _foxglove_store() -> Any:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, name))
+    return store
 
 
 @lru_cache(maxsize=1)

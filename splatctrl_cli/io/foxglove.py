@@ -7,7 +7,7 @@ are google.protobuf.Timestamp.
 import base64
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.io.protobuf import MessageTypes
+from splatctrl_cli.io.raw_log import Topic
 
 _STANDS_FOR = {
     "CompressedImage": "sensor_msgs/msg/CompressedImage",
@@ -22,6 +23,20 @@ _STANDS_FOR = {
     "CameraCalibration": "sensor_msgs/msg/CameraInfo",
     "FrameTransform": "tf2_msgs/msg/TFMessage",
     "FrameTransforms": "tf2_msgs/msg/TFMessage",
+    "JointStates": "sensor_msgs/msg/JointState",
+}
+_VECTORS = "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+_TRANSFORM = f"builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n{_VECTORS}"
+_STAMPED = "builtin_interfaces/Time timestamp\nstring frame_id\n"
+_SIZED = f"{_STAMPED}uint32 width\nuint32 height\n"
+DEFINITIONS = {  # for bags without any; foxglove/schemas, ros_foxglove_msgs/ros2
+    "foxglove_msgs/msg/CompressedImage": f"{_STAMPED}uint8[] data\nstring format\n",
+    "foxglove_msgs/msg/RawImage": f"{_SIZED}string encoding\nuint32 step\nuint8[] data\n",
+    "foxglove_msgs/msg/CameraCalibration": (
+        f"{_SIZED}string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n"
+    ),
+    "foxglove_msgs/msg/FrameTransform": _TRANSFORM,
+    "foxglove_msgs/msg/FrameTransforms": "foxglove_msgs/FrameTransform[] transforms\n",
 }
 _PREFIXES = ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/")
 
@@ -30,6 +45,12 @@ def stands_for(schema: str) -> str:
     """The ROS type of a Foxglove schema, "" for any other type."""
     prefix = next((prefix for prefix in _PREFIXES if schema.startswith(prefix)), None)
     return "" if prefix is None else _STANDS_FOR.get(schema.removeprefix(prefix), "")
+
+
+def standing_in(topic: Topic) -> Topic:
+    """A topic of a ROS bag, with the type that its messages stand for where that is Foxglove's (foxglove_msgs)."""
+    ros_type = stands_for(topic.type_name)
+    return replace(topic, type_name=ros_type, schema=topic.type_name) if ros_type else topic
 
 
 def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> Any:
@@ -137,10 +158,21 @@ def _transform(message: Any) -> Any:
     )
 
 
+def _joint_states(message: Any) -> Any:
+    """Without velocities: one that is not set cannot be told from zero."""
+    return SimpleNamespace(
+        header=_header(message, ""),
+        name=[str(joint.name) for joint in message.joints],
+        position=np.array([float(_either(joint, "position")) for joint in message.joints]),
+        velocity=np.zeros(0),
+    )
+
+
 _READERS: dict[str, Callable[[Any], Any]] = {
     "CompressedImage": _compressed_image,
     "RawImage": _raw_image,
     "CameraCalibration": _calibration,
     "FrameTransform": lambda message: SimpleNamespace(transforms=[_transform(message)]),
+    "JointStates": _joint_states,
     "FrameTransforms": lambda message: SimpleNamespace(transforms=[_transform(item) for item in message.transforms]),
 }

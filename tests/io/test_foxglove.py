@@ -2,22 +2,30 @@
 
 import base64
 import json
+import re
+import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from splatctrl_cli.io.bag_log import open_raw_log
-from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, MessageDecoder
+from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
 from splatctrl_cli.io.describe import describe
+from splatctrl_cli.io.foxglove import DEFINITIONS
 from splatctrl_cli.io.protobuf import MessageTypes
 from splatctrl_cli.io.raw_log import Damage
 from splatctrl_cli.io.source import open_source
-from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.records import JointState, RgbdFrame
 from tests.io.make_log import LogRecipe, make_log
 from tests.io.test_bag_log import assert_same
 
@@ -59,6 +67,11 @@ TYPES: dict[str, Fields] = {  # name, number, type (and message) of each field, 
         "rotation": (5, MESSAGE, ".foxglove.Quaternion"),
     },
     "foxglove.FrameTransforms": {"transforms": (1, MESSAGE, ".foxglove.FrameTransform repeated")},
+    "foxglove.JointState": {"name": (1, STRING, ""), "position": (2, DOUBLE, "")},
+    "foxglove.JointStates": {
+        "timestamp": (1, MESSAGE, TIME),
+        "joints": (2, MESSAGE, ".foxglove.JointState repeated"),
+    },
 }
 
 
@@ -121,6 +134,9 @@ def foxglove_of(kind: str, message: Any) -> tuple[str, dict[str, Any]]:
     def times(header: Any) -> dict[str, Any]:
         return {"timestamp": {"seconds": header.stamp.sec, "nanos": header.stamp.nanosec}}
 
+    if kind == JOINT_STATE:
+        joints = [{"name": n, "position": float(p)} for n, p in zip(message.name, message.position, strict=True)]
+        return "foxglove.JointStates", {**times(message.header), "joints": joints}
     if kind not in {COMPRESSED_IMAGE, IMAGE, CAMERA_INFO}:
         return "foxglove.FrameTransforms", {
             "transforms": [
@@ -195,6 +211,76 @@ def test_foxglove_schemas_give_the_records_of_the_same_ros_log(
     assert source.loss.damaged == 0
     rows = {str(row[0]): row[1:3] for row in describe(converted).grids[0].rows}
     assert rows["/cam0/depth/image_raw"] == ["foxglove.RawImage", encoding]
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_joint_states_of_foxglove_give_positions_and_their_differences(tmp_path: Path, encoding: str) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    source = open_source(convert(log, tmp_path / "foxglove.mcap", encoding))
+    before = [r for r in open_source(log).records() if isinstance(r, JointState)]
+    after = [r for r in source.records() if isinstance(r, JointState)]
+    assert [(a.stamp_ns, a.position.tolist()) for a in after] == [(b.stamp_ns, b.position.tolist()) for b in before]
+    assert source.loss.differentiated_velocities == len(after) > 0
+
+
+def in_ros_types(log: Path, folder: Path, kind: str, has_definitions: bool = True) -> Path:
+    """The images, calibrations and transforms of a log as foxglove_msgs in a ROS 2 .db3 or a ROS 1 .bag."""
+    store = get_typestore(Stores.ROS2_HUMBLE if kind == "db3" else Stores.ROS1_NOETIC)
+    for name, definition in DEFINITIONS.items():
+        capital = re.sub(r" ([dkrp])\n", lambda m: f" {m[1].upper()}\n", definition)
+        of_ros1 = capital.replace("builtin_interfaces/Time", "time")
+        store.register(get_types_from_msg(of_ros1 if kind == "bag" else definition, name))
+    path = folder / "log.bag" if kind == "bag" else folder / "bag"
+    decoder = MessageDecoder()
+    with Writer2(path, version=8) if kind == "db3" else Writer1(path) as writer:
+        connections: dict[str, Any] = {}
+        for message in open_raw_log(log).messages(Damage()):
+            name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
+            name = name.replace("foxglove.", "foxglove_msgs/msg/")
+            topic = message.topic.name
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            data = built(store, name, fields)
+            write = store.serialize_cdr if kind == "db3" else store.serialize_ros1
+            writer.write(connections[topic], message.log_time_ns, write(data, name))
+    if kind == "db3" and not has_definitions:
+        with closing(sqlite3.connect(path / "bag.db3")) as database:
+            database.execute("DROP TABLE IF EXISTS message_definitions")
+            database.commit()
+    return path
+
+
+def built(store: Any, name: str, fields: dict[str, Any]) -> Any:
+    """A message of a store; fields that are not given are zero."""
+    kinds = dict(store.fielddefs[name][1])
+    values: dict[str, Any] = {}
+    for field, (_, detail) in kinds.items():
+        value = fields.get(field, fields.get(field.upper(), fields.get(field.lower())))
+        if field == "timestamp":
+            value = store.types["builtin_interfaces/msg/Time"](sec=value["seconds"], nanosec=value["nanos"])
+        elif isinstance(value, dict):
+            value = built(store, detail, value)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            value = [built(store, detail[0][1], item) for item in value]
+        elif isinstance(value, list):
+            value = np.array(value, dtype=np.float64)
+        elif isinstance(value, bytes):
+            value = np.frombuffer(value, np.uint8)
+        values[field] = value
+    return store.types[name](**values)
+
+
+@pytest.mark.parametrize(("kind", "has_definitions"), [("db3", True), ("db3", False), ("bag", True)])
+def test_foxglove_msgs_in_a_bag_give_the_records_of_the_same_ros_log(
+    tmp_path: Path, kind: str, has_definitions: bool
+) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_joints=False))
+    bag = in_ros_types(log, tmp_path, kind, has_definitions)
+    source = open_source(bag)
+    assert_same(list(open_source(log).records()), list(source.records()))
+    assert source.loss.damaged == 0
+    rows = {str(row[0]): row[1] for row in describe(bag).grids[0].rows}
+    assert rows["/cam0/depth/image_raw"] == "foxglove_msgs/msg/RawImage"
 
 
 def test_a_transform_that_comes_once_holds_always(tmp_path: Path) -> None:
