@@ -1,9 +1,11 @@
 """Images of one topic that came twice, or did not come, by their stamps."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+Stamps = NDArray[np.int64]
 
 STEADY = 0.25  # largest departure from the period, in periods, of an interval that counts as steady
 GAP = 1.5  # [periods] from which on an interval is a gap
@@ -19,20 +21,17 @@ class Drops:
     period_ns: float
 
 
-def first_of_each(stamps_ns: Sequence[int]) -> list[int]:
-    """Numbers of the images whose stamp none before them has."""
-    first: dict[int, int] = {}
-    for index, stamp in enumerate(stamps_ns):
-        first.setdefault(stamp, index)
-    return list(first.values())
+def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
+    """Numbers (K,) of the images whose stamp none before them has."""
+    return np.sort(np.unique(stamps_ns, return_index=True)[1]).astype(np.int64)
 
 
-def dropped(stamps_ns: Sequence[int]) -> Drops:
+def dropped(stamps_ns: Stamps) -> Drops:
     """What is missing between different stamps; nothing where there are few, or most intervals are no steady rate.
 
     The period is the median interval, and steady within a quarter of it must be three intervals of four.
     """
-    intervals = np.diff(np.array(sorted(set(stamps_ns)), dtype=np.int64)).astype(np.float64)
+    intervals = np.diff(np.unique(stamps_ns)).astype(np.float64)
     if len(intervals) < FEWEST:
         return Drops(num_gaps=0, num_images=0, period_ns=0.0)
     period = float(np.median(intervals))

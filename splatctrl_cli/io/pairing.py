@@ -2,30 +2,28 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
 
-def pair_by_stamp(color_ns: Sequence[int], depth_ns: Sequence[int], tolerance_ns: int) -> list[tuple[int, int]]:
+Stamps = Sequence[int] | NDArray[np.int64]
+
+
+def pair_by_stamp(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> list[tuple[int, int]]:
     """Index pairs (colour, depth) at most `tolerance_ns` apart, each index once, the closest pairs first.
 
     Returned by colour stamp. Of equally close pairs the earlier one wins.
     """
-    color_order = sorted(range(len(color_ns)), key=lambda i: color_ns[i])
-    depth_order = sorted(range(len(depth_ns)), key=lambda i: depth_ns[i])
-    candidates: list[tuple[int, int, int, int, int]] = []
-    start = 0
-    for i in color_order:
-        while start < len(depth_order) and depth_ns[depth_order[start]] < color_ns[i] - tolerance_ns:
-            start += 1
-        for k in range(start, len(depth_order)):
-            j = depth_order[k]
-            if depth_ns[j] > color_ns[i] + tolerance_ns:
-                break
-            candidates.append((abs(color_ns[i] - depth_ns[j]), color_ns[i], depth_ns[j], i, j))
-    used_color: set[int] = set()
-    used_depth: set[int] = set()
+    color, depth = np.asarray(color_ns, dtype=np.int64), np.asarray(depth_ns, dtype=np.int64)
+    order = np.argsort(depth, kind="stable")
+    first = np.searchsorted(depth[order], color - tolerance_ns, side="left")
+    count = np.searchsorted(depth[order], color + tolerance_ns, side="right") - first
+    i = np.repeat(np.arange(len(color)), count)  # every pair that is close enough
+    j = order[np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)]
+    closest = np.lexsort((j, i, depth[j], color[i], np.abs(color[i] - depth[j])))
+    is_free_color, is_free_depth = np.ones(len(color), dtype=np.bool_), np.ones(len(depth), dtype=np.bool_)
     pairs: list[tuple[int, int]] = []
-    for *_, i, j in sorted(candidates):
-        if i not in used_color and j not in used_depth:
-            used_color.add(i)
-            used_depth.add(j)
-            pairs.append((i, j))
-    return sorted(pairs, key=lambda pair: (color_ns[pair[0]], pair[0]))
+    for a, b in zip(i[closest].tolist(), j[closest].tolist(), strict=True):
+        if is_free_color[a] and is_free_depth[b]:
+            is_free_color[a] = is_free_depth[b] = False
+            pairs.append((a, b))
+    return sorted(pairs, key=lambda pair: (color[pair[0]], pair[0]))

@@ -5,39 +5,30 @@ frame; the second takes only planned images and holds no more of them than the l
 files that a capture can hold as they are stay undecoded.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 
+import numpy as np
+
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.io.frame_plan import FramePlan, Index, Planned
 from splatctrl_cli.io.image_rate import dropped, first_of_each
 from splatctrl_cli.io.joint_topics import topics_of, with_joints
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.masks import human_mask, mask_by_color
-from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid, read_image
+from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid
 from splatctrl_cli.io.options import SourceOptions, still_note
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.pairing import pair_by_stamp
-from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage
+from splatctrl_cli.io.planned_images import PlannedImages, keeps_files
+from splatctrl_cli.io.raw_log import Damage, RawLog
 from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.io.shot import Place, Shot, check_depth, is_kept, is_png, merged
 from splatctrl_cli.io.survey import Survey, survey
 from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8
 
 _SECOND = 1_000_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Planned:
-    """A frame to be: message numbers within the colour, depth and mask topics (None: no mask), and the pose."""
-
-    stamp_ns: int
-    camera: Camera
-    color_index: int
-    depth_index: int
-    human_index: int | None
-    T_world_camera: Float64
 
 
 class RosLogSource:
@@ -105,29 +96,30 @@ class RosLogSource:
             file.name if is_unique else f"{file.parent.name}/{file.name}": sha256(file) for file in self._log.files
         }
 
-    def _planned(self, found: Survey) -> list[_Planned]:
-        plan: list[_Planned] = []
+    def _planned(self, found: Survey) -> FramePlan:
+        plan = FramePlan(self._rig)
         for camera in self._rig:
-            colors, depths = self._images(found, camera.color_topic), self._images(found, camera.depth_topic)
-            color_ns, depth_ns = [stamp for _, stamp in colors], [stamp for _, stamp in depths]
+            (color, color_ns), (depth, depth_ns) = (
+                self._images(found, topic) for topic in (camera.color_topic, camera.depth_topic)
+            )
             tolerance_ns = round(self._options.pairing_tolerance_s * _SECOND)
-            pairs = [(colors[i][0], depths[j][0]) for i, j in pair_by_stamp(color_ns, depth_ns, tolerance_ns)]
-            if not pairs:
-                gap = nearest_gap_ns(color_ns, depth_ns) / _SECOND
+            pairs = np.array(pair_by_stamp(color_ns, depth_ns, tolerance_ns), dtype=np.int64).reshape(-1, 2)
+            if not len(pairs):
+                gap = nearest_gap_ns(color_ns.tolist(), depth_ns.tolist()) / _SECOND
                 raise InputError(
                     f"{self._log.path}: camera {camera.name}: no colour and depth image within"
                     f" {tolerance_ns / 1e6:g} ms of each other, the closest are {gap * 1e3:.4g} ms apart",
                     remedy=f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right",
                 )
-            self._loss.unpaired_color += len(color_ns) - len(pairs)
-            self._loss.unpaired_depth += len(depth_ns) - len(pairs)
-            plan.extend(self._with_pose(found, camera, pairs))
-        return sorted(plan, key=lambda planned: (planned.stamp_ns, planned.camera.name, planned.color_index))
+            self._loss.unpaired_color += len(color) - len(pairs)
+            self._loss.unpaired_depth += len(depth) - len(pairs)
+            self._add(plan, found, camera, color_ns[pairs[:, 0]], color[pairs[:, 0]], depth[pairs[:, 1]])
+        return plan
 
-    def _images(self, found: Survey, topic: str) -> list[tuple[int, int]]:
+    def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
         """Number and stamp of each image but those that came again; these and missing ones are counted."""
-        stamps = found.topics[topic].stamps_ns
-        if len(stamps) > 1 and not any(stamps):
+        stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
+        if len(stamps) > 1 and not stamps.any():
             raise InputError(
                 f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
                 remedy="give --stamps log to take the times of logging",
@@ -141,39 +133,27 @@ class RosLogSource:
                 f"{topic}: about {drops.num_images} images were dropped in {drops.num_gaps} gaps of a period of"
                 f" {drops.period_ns / 1e6:.4g} ms"
             )
-        return [(index, stamps[index]) for index in kept]
+        return kept, stamps[kept]
 
-    def _with_pose(self, found: Survey, camera: Camera, pairs: list[tuple[int, int]]) -> list[_Planned]:
+    def _add(
+        self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
+    ) -> None:
+        """Plan the pairs of a camera, those without a pose counted. Raises InputError where none has one."""
         tolerance_ns = round(self._options.pose_tolerance_s * _SECOND)
-        color_ns = found.topics[camera.color_topic].stamps_ns
         pairing_ns = round(self._options.pairing_tolerance_s * _SECOND)
         masks = mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
-        planned = []
-        for color_index, depth_index in pairs:
-            stamp_ns = color_ns[color_index]
-            T = camera.pose_at(found.tf, stamp_ns, tolerance_ns)
-            if T is not None:
-                planned.append(
-                    _Planned(
-                        stamp_ns=stamp_ns,
-                        camera=camera,
-                        color_index=color_index,
-                        depth_index=depth_index,
-                        human_index=masks.get(color_index),
-                        T_world_camera=T,
-                    )
-                )
-        if not planned:
+        poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
+        num = plan.add(camera, stamp_ns, color, depth, masks, poses)
+        if not num:
             raise InputError(
                 f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
                 f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
                 remedy="check the clocks of the recording, or give --camera-pose",
             )
-        self._loss.without_pose += len(pairs) - len(planned)
-        return planned
+        self._loss.without_pose += len(color) - num
 
     def _shots(self, *, lazily: bool) -> Iterator[Shot]:
-        images = _PlannedImages(self._log, self._plan)
+        images = PlannedImages(self._log, self._plan)
         checked: set[str] = set()
 
         def decodes(camera: Camera) -> bool:
@@ -196,91 +176,12 @@ class RosLogSource:
         return human if camera.undistortion is None else camera.undistortion.labels(human)
 
 
-class _PlannedImages:
-    """The second pass: brings the images of each planned frame together, in the plan's order."""
-
-    def __init__(self, log: RawLog, plan: list[_Planned]) -> None:
-        self._log = log
-        self._plan = plan
-        self._held: dict[tuple[str, int], RawMessage] = {}
-        self._uses: dict[tuple[str, int], int] = {}
-        for planned in plan:
-            for key in _keys(planned):
-                self._uses[key] = self._uses.get(key, 0) + 1
-
-    def of_frames(
-        self, damage: Damage, decodes: Callable[[Camera], bool]
-    ) -> Iterator[tuple[_Planned, list[ImageMessage], tuple[Place, ...]]]:
-        """Yield each planned frame with its colour, depth and mask, and their places; what fails goes to `damage`.
-
-        decodes: whether all of a camera's images are decoded, and not only those that a capture cannot keep.
-        """
-        topics = {key[0] for key in self._uses}
-        numbers = dict.fromkeys(topics, 0)
-        decoder = MessageDecoder()
-        position = 0
-        for message in self._log.messages(Damage(), topics):  # the survey has counted this damage
-            key = (message.topic.name, numbers[message.topic.name])
-            numbers[message.topic.name] += 1
-            if key not in self._uses:
-                continue
-            self._held[key] = message
-            while position < len(self._plan) and all(key in self._held for key in _keys(self._plan[position])):
-                planned = self._plan[position]
-                position += 1
-                taken = [self._take(key) for key in _keys(planned)]
-                kept = (False,) * 3 if decodes(planned.camera) else _kept(planned.camera)
-                try:
-                    images = [
-                        read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
-                        for message, lazily in zip(taken, kept, strict=False)
-                    ]
-                    _check_sizes(planned.camera, *images[:2])
-                except UndecodableMessageError as error:
-                    damage.add(f"camera {planned.camera.name} at {planned.stamp_ns} ns: {error}")
-                    continue
-                yield planned, images, tuple(_place(message) for message in taken)
-
-    def _take(self, key: tuple[str, int]) -> RawMessage:
-        self._uses[key] -= 1
-        return self._held[key] if self._uses[key] else self._held.pop(key)
-
-
-def _place(message: RawMessage) -> Place:
-    return Place(file=message.file, offset=message.offset, log_time_ns=message.log_time_ns)
-
-
-def _keys(planned: _Planned) -> list[tuple[str, int]]:
-    camera = planned.camera
-    keys = [(camera.color_topic, planned.color_index), (camera.depth_topic, planned.depth_index)]
-    return keys if planned.human_index is None else [*keys, (camera.human_topic, planned.human_index)]
-
-
-def _kept(camera: Camera) -> tuple[bool, bool, bool]:
-    """Whether image files of colour, depth and masks go into a capture as they are."""
-    is_plain = camera.undistortion is None
-    return is_plain, is_plain and camera.depth_to_color is None, False
-
-
-def _check_sizes(camera: Camera, color: ImageMessage, depth: ImageMessage) -> None:
-    """Raise UndecodableMessageError for images of another size than the camera's."""
-    registration = camera.depth_to_color
-    for image, lens in (
-        (color, camera.intrinsics),
-        (depth, camera.intrinsics if registration is None else registration.depth_intrinsics),
-    ):
-        if (image.width, image.height) != (lens.width, lens.height):
-            raise UndecodableMessageError(
-                f"expected an image of {lens.width}x{lens.height}, got {image.width}x{image.height}"
-            )
-
-
 def _shot(
-    planned: _Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, places: tuple[Place, ...]
+    planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, places: tuple[Place, ...]
 ) -> Shot:
     camera = planned.camera
     is_counts = depth.is_counts and camera.depth_to_color is None
-    keeps_color, keeps_depth, _ = _kept(camera)
+    keeps_color, keeps_depth, _ = keeps_files(camera)
     return Shot(
         stamp_ns=planned.stamp_ns,
         camera=camera.name,

@@ -170,7 +170,7 @@ def test_drops_are_not_guessed_where_there_is_no_rate() -> None:
     assert dropped(jitter).num_images == 0
     assert dropped([*jitter[:50], *jitter[53:]]).num_images == 3
     assert dropped(jitter[:3]).num_images == 0
-    assert first_of_each([5, 7, 5, 5, 9, 7]) == [0, 1, 4]
+    assert first_of_each(np.array([5, 7, 5, 5, 9, 7])).tolist() == [0, 1, 4]
 
 
 def test_several_publishers_of_static_transforms_are_joined(tmp_path: Path) -> None:
