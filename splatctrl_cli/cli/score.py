@@ -129,6 +129,7 @@ def score_scene(
     lpips = None if args.lpips is None else Lpips(args.lpips)
     scene = open_scene(args.scene)
     reference = open_reference(args, console)
+    cloud = None if cloud is None else cloud.of_scan(reference.scan)
     cameras = cameras_to_score(args, reference, scene.cameras)
     check_training(args, reference, scene)
     digests = reference.source.digests()

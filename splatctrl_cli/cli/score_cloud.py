@@ -10,6 +10,7 @@ from splatctrl_cli.cli.score_views import rendered
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from splatctrl_cli.io.dtu_observed import ObservedSpace
     from splatctrl_cli.io.scene_folder import SceneFolder
     from splatctrl_cli.records import Float64, GaussianSet, RgbdFrame, SplatSet
 
@@ -22,12 +23,26 @@ class CloudSettings:
     unit: float
     max_distance: float
     spacing: float
+    masks: Path | None = None
+    space: "ObservedSpace | None" = None
+
+    def of_scan(self, scan: str | None) -> "CloudSettings":
+        """The same with the files of one scan, where folders of several were given.
+
+        Raises InputError naming the files looked for.
+        """
+        from splatctrl_cli.io.dtu_observed import cloud_of_scan, read_observed
+
+        path = cloud_of_scan(self.path, scan or "") if self.path.is_dir() else self.path
+        return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))
 
     def words(self) -> str:
         """How the figures come about."""
+        both = "points" if self.masks is None else "the surface's points"
+        within = "" if self.masks is None else f"; within the masks and above the planes of {self.masks}"
         return (
-            f"{self.path}, 1 unit = {self.unit:g} m; points thinned to {1e3 * self.spacing:g} mm; means below"
-            f" {1e3 * self.max_distance:g} mm"
+            f"{self.path}, 1 unit = {self.unit:g} m; {both} thinned to {1e3 * self.spacing:g} mm; means below"
+            f" {1e3 * self.max_distance:g} mm{within}"
         )
 
 
@@ -35,7 +50,17 @@ def add_cloud(parser: argparse.ArgumentParser) -> None:
     """``--cloud`` and what goes with it."""
     group = parser.add_argument_group("surface")
     group.add_argument(
-        "--cloud", type=Path, metavar="FILE", help="reference points (.ply) or mesh: accuracy, completeness, Chamfer"
+        "--cloud",
+        type=Path,
+        metavar="FILE",
+        help="reference points (.ply) or mesh: accuracy, completeness, Chamfer; or a folder of stl024_total.ply or"
+        " scan24.ply",
+    )
+    group.add_argument(
+        "--cloud-masks",
+        type=Path,
+        metavar="DIR",
+        help="DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where its own evaluation does",
     )
     group.add_argument(
         "--cloud-unit", type=float, metavar="M", help="metres per unit (default: 0.001 with --dtu, else 1)"
@@ -55,14 +80,20 @@ def add_cloud(parser: argparse.ArgumentParser) -> None:
 def cloud_settings(args: argparse.Namespace) -> CloudSettings | None:
     """None where no cloud is given. Raises UsageError for a length that is not above 0."""
     if args.cloud is None:
-        if args.cloud_unit is not None:
-            raise UsageError("--cloud-unit: only with --cloud", remedy="leave it out")
+        for name in ("unit", "masks"):
+            if getattr(args, f"cloud_{name}") is not None:
+                raise UsageError(f"--cloud-{name}: only with --cloud", remedy="leave it out")
         return None
+    if args.dtu is None and (args.cloud_masks is not None or args.cloud.is_dir()):
+        what = "--cloud-masks" if args.cloud_masks is not None else f"--cloud {args.cloud}"
+        raise UsageError(f"{what}: a folder of scans, only with --dtu", remedy="give the file of this recording")
     unit = args.cloud_unit if args.cloud_unit is not None else (0.001 if args.dtu is not None else 1.0)
     for name, value in (("unit", unit), ("max", args.cloud_max), ("spacing", args.cloud_spacing)):
         if not 0 < value < float("inf"):
             raise UsageError(f"--cloud-{name}: expected a length above 0, got {value:g}")
-    return CloudSettings(path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing)
+    return CloudSettings(
+        path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing, masks=args.cloud_masks
+    )
 
 
 def cloud_figures(
@@ -72,9 +103,21 @@ def cloud_figures(
     from splatctrl_cli.evaluate.cloud import cloud_score, thinned
     from splatctrl_cli.evaluate.visibility import seen_by
 
-    reference = thinned(_reference(settings), settings.spacing)
-    points = thinned(_surface(scene, frames, threads), settings.spacing)
-    score = cloud_score(points, reference, seen_by(reference, frames), max_distance=settings.max_distance)
+    reference, space, counts = _reference(settings), settings.space, None
+    points = _surface(scene, frames, threads, settings.spacing)
+    if space is None:
+        reference = thinned(reference, settings.spacing)
+    else:
+        reference, points = reference[space.above(reference)], points[space.near(points)]
+        counts = space.observed(points)
+    score = cloud_score(
+        points,
+        reference,
+        seen_by(reference, frames),
+        max_distance=settings.max_distance,
+        counts=counts,
+        unit=settings.unit,
+    )
     return score.figures()
 
 
@@ -89,18 +132,20 @@ def _reference(settings: CloudSettings) -> "Float64":
     return points_on(replace(mesh, vertices=settings.unit * mesh.vertices), settings.spacing)
 
 
-def _surface(scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int) -> "Float64":
-    """World points (P, 3) [m] of the final splats' rendered depth at the poses of `frames`, the robot left out."""
+def _surface(scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int, spacing: float) -> "Float64":
+    """World points (P, 3) [m] of the final splats' rendered depth at the poses of `frames`, the robot left out,
+    thinned to `spacing` [m]."""
     import numpy as np
 
+    from splatctrl_cli.evaluate.cloud import thinned
     from splatctrl_cli.evaluate.visibility import surface_points
 
     splats = _without_robot(scene)
     parts = []
     for frame in frames:
         depth = rendered(splats, frame.intrinsics, frame.T_world_camera, threads).normalised_depth()
-        parts.append(surface_points(replace(frame, depth=depth))[0])
-    return np.concatenate(parts) if parts else np.empty((0, 3))
+        parts.append(thinned(surface_points(replace(frame, depth=depth))[0], spacing))
+    return thinned(np.concatenate(parts), spacing) if parts else np.empty((0, 3))
 
 
 def _without_robot(scene: "SceneFolder") -> "SplatSet | GaussianSet":

@@ -19,13 +19,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """source: the recording with all its cameras. protocol and split where one was named; training_stamps_ns: of the
-    views that it trains on. mask: of a frame, the pixels that the mask rule selects; mask_rule says it in words.
-    Without depth, nothing says what a training camera saw. doubts: what speaks against the scores, in words.
+    """source: the recording with all its cameras. scan: its name in a data set of several. protocol and split where
+    one was named; training_stamps_ns: of the views that it trains on. mask: of a frame, the pixels that the mask rule
+    selects; mask_rule says it in words. Without depth, nothing says what a training camera saw. doubts: what speaks
+    against the scores, in words.
     """
 
     source: "RecordSource"
     layout: str
+    scan: str | None = None
     protocol: "ScoreProtocol | None" = None
     split: "Split | None" = None
     training_stamps_ns: frozenset[int] = frozenset()
@@ -137,6 +139,7 @@ def _dtu_reference(args: argparse.Namespace, console: Console) -> Reference:
     return Reference(
         source=source,
         layout=f"{source.layout}'s",
+        scan=source.scan,
         protocol=protocol,
         split=split,
         training_stamps_ns=frozenset(split.training) if protocol else frozenset(),

@@ -15,6 +15,8 @@ from splatctrl_cli.records import Bool, Float64
 MAX_DISTANCE = 0.020  # [m] of DTU's evaluation: what is farther off counts in a share, not in a mean
 SPACING = 0.0002  # [m] of DTU's evaluation
 MAX_POINTS = 2_000_000  # on a mesh
+OTHER_UNITS = (1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
+NO_OVERLAP, GOOD_OVERLAP = 0.001, 0.05  # shares of two boxes' volume
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,18 +41,30 @@ class CloudScore:
         return {name: float(value) for name, value in vars(self).items()}
 
 
-def cloud_score(points: Float64, reference: Float64, seen: Bool, *, max_distance: float = MAX_DISTANCE) -> CloudScore:
+def cloud_score(
+    points: Float64,
+    reference: Float64,
+    seen: Bool,
+    *,
+    max_distance: float = MAX_DISTANCE,
+    counts: Bool | None = None,
+    unit: float = 1.0,
+) -> CloudScore:
     """Distances between the surface's points (P, 3) and the reference's (R, 3) [m], world; seen (R,).
 
-    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py, have it: means over distances below `max_distance`; but
-    without their hand-made observation masks and ground planes, instead of which `seen` says what could be
-    reconstructed. Raises NotEvaluableError where nothing lies that near.
+    As DTU's evaluation and jzhangbs/DTUeval-python, eval.py, have it: means over distances below `max_distance`.
+    counts (P,): points that enter the accuracy, all where None; the completeness is over the whole reference.
+    unit: metres per unit of the reference's file, for the words of a refusal. Raises NotEvaluableError where nothing
+    lies that near, or the reference would fit in another unit.
     """
     if not max_distance > 0:
         raise UsageError(f"--cloud-max: expected a distance above 0 m, got {max_distance:g}")
-    if not len(points):
-        raise NotEvaluableError("the scene's surface: expected points to compare with the cloud, got none")
-    to_reference = np.asarray(cKDTree(reference).query(points)[0])
+    counted = points if counts is None else points[counts]
+    for name, some in (("scene's surface", counted), ("reference cloud", reference)):
+        if not len(some):
+            raise NotEvaluableError(f"the {name}: expected points to compare, got none")
+    _check_unit(points, reference, max_distance, unit)
+    to_reference = np.asarray(cKDTree(reference).query(counted)[0])
     to_surface = np.asarray(cKDTree(points).query(reference)[0])
     if to_reference.min() >= max_distance:
         raise NotEvaluableError(
@@ -69,9 +83,30 @@ def cloud_score(points: Float64, reference: Float64, seen: Bool, *, max_distance
         accuracy_beyond=accuracy_beyond,
         completeness_beyond=completeness_beyond,
         completeness_seen_beyond=completeness_seen_beyond,
-        num_points=len(points),
+        num_points=len(counted),
         num_reference=len(reference),
     )
+
+
+def _check_unit(points: Float64, reference: Float64, margin: float, unit: float) -> None:
+    fits = {factor: _overlap(points, factor * reference, margin) for factor in (1.0, *OTHER_UNITS)}
+    best = max(fits, key=lambda factor: fits[factor])
+    if fits[1.0] < NO_OVERLAP and fits[best] > GOOD_OVERLAP:
+        raise NotEvaluableError(
+            f"the reference cloud: expected the size of the scene's surface, which spans {_box(points)} m, got"
+            f" {_box(reference)} m; {best:g} times as large it overlaps by {100 * fits[best]:.0f}%",
+            remedy=f"give the cloud's unit as --cloud-unit {unit * best:g}",
+        )
+
+
+def _overlap(points: Float64, others: Float64, margin: float) -> float:
+    """Volume that the boxes of both, without one percent at either end, and `margin` [m] wider, share of what they
+    fill together."""
+    (low, high), (low_other, high_other) = (np.percentile(p, (1, 99), axis=0) for p in (points, others))
+    sides = np.minimum(high, high_other) - np.maximum(low, low_other) + 2 * margin
+    shared = float(np.prod(np.maximum(sides, 0.0)))
+    each = [float(np.prod(sides + 2 * margin)) for sides in (high - low, high_other - low_other)]
+    return shared / (sum(each) - shared)
 
 
 def cloud_names() -> tuple[str, ...]:
@@ -80,7 +115,8 @@ def cloud_names() -> tuple[str, ...]:
 
 
 def thinned(points: Float64, spacing: float) -> Float64:
-    """One of the points (P, 3) for each cube of edge `spacing` [m] that holds any: the first.
+    """One of the points (P, 3) for each cube of edge `spacing` [m] that holds any: the first. Thinning parts of a
+    cloud, then what is left of them together, leaves the same.
 
     DTU's evaluation keeps random points that are `spacing` apart; this is as dense, and takes seconds for millions.
     """
@@ -88,7 +124,8 @@ def thinned(points: Float64, spacing: float) -> Float64:
         raise UsageError(f"--cloud-spacing: expected a distance above 0 m, got {spacing:g}")
     if not len(points):
         return points
-    cells = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
+    cells = np.floor(points / spacing).astype(np.int64)
+    cells -= cells.min(axis=0)
     counts = cells.max(axis=0) + 1
     keys = (cells[:, 0] * counts[1] + cells[:, 1]) * counts[2] + cells[:, 2]
     first = np.sort(np.unique(keys, return_index=True)[1])

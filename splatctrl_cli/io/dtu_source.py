@@ -80,6 +80,11 @@ class DtuSource:
         return f"{self._root.name}/{self._name}"
 
     @property
+    def scan(self) -> str:
+        """The scan's name in its data set."""
+        return self._name
+
+    @property
     def layout(self) -> str:
         """``MVSNet`` or ``IDR``."""
         return self._layout

@@ -13,6 +13,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.records import Float64
 from tests.io.make_idr import half_size, write_idr
+from tests.io.make_observed import write_observed
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
 HOLDOUT = "holdout:every4"
@@ -193,6 +194,25 @@ def test_the_surface_is_compared_with_a_cloud_in_millimetres(
     moved = scored(capsys, place, "mvsnet", *given[:4], "--cloud-max", "0.004")["metrics"]
     assert moved["accuracy"] < metrics["accuracy"]
     assert moved["accuracy_beyond"] > metrics["accuracy_beyond"]
+
+
+def test_the_surface_is_compared_where_dtus_own_evaluation_looks(
+    place: Path, views: list[DtuView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = surface(views[:3])
+    write_cloud(tmp_path / "stl001_total.ply", 1000 * points)
+    middle = 1000 * np.median(points, axis=0)
+    middle[2] = 30.0  # above the table
+    write_observed(tmp_path, 1, middle - 100, middle + 100)
+    given = ("--cloud", tmp_path, "--cloud-spacing", "0.004")
+    whole = scored(capsys, place, "mvsnet", *given)["metrics"]
+    result = scored(capsys, place, "mvsnet", *given, "--cloud-masks", tmp_path)
+    assert 100 < result["metrics"]["num_points"] < 0.5 * whole["num_points"]
+    assert result["metrics"]["num_reference"] == np.count_nonzero(points[:, 2] > 0.03)
+    assert "within the masks and above the planes of" in result["protocol"]["definitions"]["cloud"]
+    assert run(place, "mvsnet", "--protocol", HOLDOUT, "--cloud", tmp_path / "masks.ply") == 4
+    assert run(place, "mvsnet", "--protocol", HOLDOUT, *given, "--cloud-masks", place) == 4
+    assert "ObsMask1_10.mat: no such file; give the folder ObsMask" in capsys.readouterr().err
 
 
 def test_the_surface_is_compared_with_a_mesh(

@@ -51,6 +51,32 @@ def test_another_unit_or_frame_is_told_from_a_bad_surface() -> None:
         cloud_score(plane(0.0), plane(0.0), np.ones(400, np.bool_), max_distance=0.0)
 
 
+@pytest.mark.parametrize("factor", [1000.0, 0.001, 100.0])
+def test_a_cloud_that_would_fit_in_another_unit_is_refused_with_that_unit(factor: float) -> None:
+    surface = np.vstack([plane(0.0, 0.8, 0.05), plane(0.4, 0.8, 0.05)])
+    with pytest.raises(
+        NotEvaluableError, match=f"times as large it overlaps by 100%; .* --cloud-unit {0.02 * factor:g}$"
+    ):
+        cloud_score(surface, surface / factor, np.ones(len(surface), np.bool_), unit=0.02)
+
+
+def test_points_that_do_not_count_enter_no_accuracy_but_complete_the_surface() -> None:
+    points = np.vstack([plane(0.003), plane(0.0)])
+    counts = np.repeat([True, False], 400)
+    score = cloud_score(points, plane(0.0), np.ones(400, np.bool_), counts=counts)
+    assert score.accuracy == pytest.approx(0.003)
+    assert score.completeness == 0.0
+    assert score.num_points == 400
+    with pytest.raises(NotEvaluableError, match="the scene's surface: expected points to compare, got none"):
+        cloud_score(points, plane(0.0), np.ones(400, np.bool_), counts=counts & False)
+
+
+def test_thinning_in_parts_leaves_what_thinning_at_once_does() -> None:
+    points = np.random.default_rng(2).uniform(-0.01, 0.01, (2000, 3))
+    parts = np.vstack([thinned(points[:900], 0.003), thinned(points[900:], 0.003)])
+    assert np.array_equal(thinned(parts, 0.003), thinned(points, 0.003))
+
+
 def test_rigid_motion_changes_no_figure() -> None:
     rng = np.random.default_rng(1)
     points, reference = rng.uniform(0, 0.03, (200, 3)), rng.uniform(0, 0.03, (300, 3))
