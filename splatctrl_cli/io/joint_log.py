@@ -63,9 +63,10 @@ class JointStream:
         return Rows(self._files[name]) if name in self._files else None
 
     def add(self, state: RawJoints) -> None:
-        """The next state."""
-        self._stamps.append(state.stamp_ns)
-        self._log_times.append(state.log_time_ns)
+        """The next state. Raises OverflowError for a time beyond 64 bits."""
+        times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
+        self._stamps.append(times[0])
+        self._log_times.append(times[1])
         self._waiting.append(state)
         if len(self._waiting) == BLOCK:
             self._flush()
@@ -116,11 +117,13 @@ class JointLog:
         return list(self._streams.values())
 
     def extend(self, states: Iterable[RawJoints]) -> None:
-        """The next states."""
+        """The next states. Raises OverflowError for a time beyond 64 bits."""
         for state in states:
+            if state.names:
+                key = frozenset(state.names)
+                stream = self._streams[key] if key in self._streams else JointStream(state.names)
+                stream.add(state)
+                self._streams[key] = stream
             if self.first_names is None:
                 self.first_names = state.names
             self._num += 1
-            if state.names:
-                key = frozenset(state.names)
-                self._streams.setdefault(key, JointStream(state.names)).add(state)

@@ -1,5 +1,6 @@
 """A first pass over a log: topics, stamps, frames, calibrations, joints; of images the first of each topic."""
 
+from array import array
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -48,7 +49,7 @@ class TopicSurvey:
     count: int = 0
     first_log_ns: int = 0
     last_log_ns: int = 0
-    stamps_ns: list[int] = field(default_factory=list)
+    stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
     first_image: ImageMessage | None = None
     calibration: Calibration | None = None
     joints: JointLog = field(default_factory=JointLog)
@@ -103,6 +104,8 @@ def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) ->
             _take(result, entry, decoder, message)
         except (UndecodableMessageError, ValueError) as error:
             result.damage.add(str(error))
+        except OverflowError:
+            result.damage.add(f"{message.topic.name}: a time beyond 2^63 ns")
         except AttributeError as error:  # a definition of a known name with other fields
             result.damage.add(f"{message.topic.name}: a {message.topic.type_name} of another definition: {error}")
 

@@ -1,10 +1,12 @@
-"""The tree of coordinate frames that /tf and /tf_static recorded, asked at any time."""
+"""The tree of coordinate frames that /tf and /tf_static recorded, asked at any time; 16 bytes of memory a sample."""
 
+from array import array
 from bisect import bisect_left
 
 import numpy as np
 
 from splatctrl_cli.geometry import interpolate_transform, invert_transform, transform_from
+from splatctrl_cli.io.rows import BLOCK, RowFile
 from splatctrl_cli.records import Float64
 
 MAX_GAP_NS = 1_000_000_000  # samples farther apart than this bracket no pose, unless nothing moved between them
@@ -12,47 +14,72 @@ STILL_POSITION = 1e-3  # [m]
 STILL_ROTATION = 2e-3  # largest change of a rotation entry
 
 
-class _Edge:
-    """T_parent_child over time."""
+class _Transforms:
+    """Transforms by number, most of them in a file without a name."""
 
-    def __init__(self, parent: str) -> None:
+    def __init__(self) -> None:
+        self._file = RowFile((3, 4))
+        self._waiting: list[Float64] = []
+
+    def add(self, T: Float64) -> int:
+        """Keep one; its number."""
+        self._waiting.append(T[:3])
+        if len(self._waiting) == BLOCK:
+            self._file.append(np.array(self._waiting))
+            self._waiting = []
+        return len(self._file) + len(self._waiting) - 1
+
+    def __getitem__(self, number: int) -> Float64:
+        waiting = number - len(self._file)
+        T = np.eye(4)
+        T[:3] = self._waiting[waiting] if waiting >= 0 else self._file.read(number, number + 1)[0]
+        return T
+
+
+class _Edge:
+    """T_parent_child over time, in `transforms` by number."""
+
+    def __init__(self, parent: str, transforms: _Transforms) -> None:
         self.parent = parent
-        self.stamps: list[int] = []
-        self.transforms: list[Float64] = []
+        self.stamps, self.numbers = array("q"), array("q")
         self.static: Float64 | None = None
         self.holds = False
-        self.is_sorted = True
+        self._transforms = transforms
+        self._is_sorted = True
 
     def add(self, stamp_ns: int, T: Float64) -> None:
-        self.is_sorted = self.is_sorted and (not self.stamps or stamp_ns >= self.stamps[-1])
+        self._is_sorted = self._is_sorted and (not self.stamps or stamp_ns >= self.stamps[-1])
         self.stamps.append(stamp_ns)
-        self.transforms.append(T)
+        self.numbers.append(self._transforms.add(T))
 
     def at(self, stamp_ns: int, tolerance_ns: int) -> Float64 | None:
         if self.static is not None:
             return self.static
         if self.holds and len(self.stamps) == 1:
-            return self.transforms[0]
+            return self._at(0)
         self._sort()
         after = bisect_left(self.stamps, stamp_ns)
         if after == len(self.stamps):
-            return self.transforms[-1] if stamp_ns - self.stamps[-1] <= tolerance_ns else None
+            return self._at(-1) if stamp_ns - self.stamps[-1] <= tolerance_ns else None
         if self.stamps[after] == stamp_ns:
-            return self.transforms[after]
+            return self._at(after)
         if after == 0:
-            return self.transforms[0] if self.stamps[0] - stamp_ns <= tolerance_ns else None
+            return self._at(0) if self.stamps[0] - stamp_ns <= tolerance_ns else None
         gap = self.stamps[after] - self.stamps[after - 1]
-        T_before, T_after = self.transforms[after - 1], self.transforms[after]
+        T_before, T_after = self._at(after - 1), self._at(after)
         if gap > MAX_GAP_NS and not _is_still(T_before, T_after):
             return None
         return interpolate_transform(T_before, T_after, (stamp_ns - self.stamps[after - 1]) / gap)
 
+    def _at(self, sample: int) -> Float64:
+        return self._transforms[self.numbers[sample]]
+
     def _sort(self) -> None:
-        if not self.is_sorted:
-            order = sorted(range(len(self.stamps)), key=lambda i: self.stamps[i])
-            self.stamps = [self.stamps[i] for i in order]
-            self.transforms = [self.transforms[i] for i in order]
-            self.is_sorted = True
+        if not self._is_sorted:
+            order = np.argsort(np.frombuffer(self.stamps, dtype=np.int64), kind="stable")
+            self.stamps = array("q", np.frombuffer(self.stamps, dtype=np.int64)[order].tobytes())
+            self.numbers = array("q", np.frombuffer(self.numbers, dtype=np.int64)[order].tobytes())
+            self._is_sorted = True
 
 
 def _is_still(T_a: Float64, T_b: Float64) -> bool:
@@ -65,6 +92,7 @@ class TfTree:
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
+        self._transforms = _Transforms()
         self.notes: list[str] = []
 
     def add(
@@ -87,9 +115,9 @@ class TfTree:
         norm = float(np.linalg.norm(quat_xyzw))
         if not (np.isfinite(position).all() and 0.5 < norm < 2.0):
             raise ValueError(f"transform {parent} -> {child} is not a rigid transform")
-        edge = self._edges.setdefault(child, _Edge(parent))
+        edge = self._edges.setdefault(child, _Edge(parent, self._transforms))
         if edge.parent != parent:
-            self._note(f"tf: frame {child} has parents {edge.parent} and {parent}; {edge.parent} is kept")
+            self.note(f"tf: frame {child} has parents {edge.parent} and {parent}; {edge.parent} is kept")
             return
         T = transform_from(position, quat_xyzw)
         edge.holds = edge.holds or holds
@@ -97,12 +125,13 @@ class TfTree:
             edge.add(stamp_ns, T)
         else:
             if edge.static is not None and not _is_still(edge.static, T):
-                self._note(f"tf: {parent} -> {child} is static and changes; the last one holds")
+                self.note(f"tf: {parent} -> {child} is static and changes; the last one holds")
             edge.static = T
         if edge.static is not None and edge.stamps:
-            self._note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
+            self.note(f"tf: {parent} -> {child} is both static and moving; the static one holds")
 
-    def _note(self, note: str) -> None:
+    def note(self, note: str) -> None:
+        """Keep a remark on the tree, once."""
         if note not in self.notes:
             self.notes.append(note)
 
