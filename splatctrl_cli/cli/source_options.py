@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.io.options import CameraTopics, SourceOptions
+    from splatctrl_cli.io.options import CameraTopics, PoseTopic, SourceOptions
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +27,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=X,Y,Z,QX,QY,QZ,QW",
-        help="pose of a fixed camera in the world, instead of the recorded one, or NAME=identity (repeatable)",
+        help="pose of a fixed camera in the world, instead of the recorded one, or NAME=identity; or"
+        " NAME=TOPIC[@FRAME], a topic of poses (Odometry, PoseStamped, ...) of FRAME where tf has none (repeatable)",
     )
     group.add_argument(
         "--intrinsics",
@@ -76,7 +77,8 @@ def source_options(args: argparse.Namespace) -> "SourceOptions":
         world_frame=args.world_frame,
         cameras=_names(args.cameras),
         camera_topics=tuple(_topics(text) for text in args.camera),
-        camera_poses=dict(_pose(text) for text in args.camera_pose),
+        camera_poses=dict(_pose(text) for text in args.camera_pose if not _is_topic(text)),
+        camera_pose_topics=dict(_pose_topic(text) for text in args.camera_pose if _is_topic(text)),
         human_topics=dict(_human_topic(text) for text in args.human_topic),
         intrinsics=dict(_lens(text) for text in args.intrinsics),
         depth_scale=args.depth_scale,
@@ -135,6 +137,20 @@ def _pose(text: str) -> tuple[str, tuple[float, ...]]:
             f"--camera-pose {text}: expected NAME=X,Y,Z,QX,QY,QZ,QW with a unit quaternion, or NAME=identity"
         )
     return name, values
+
+
+def _is_topic(text: str) -> bool:
+    return text.partition("=")[2].startswith("/")
+
+
+def _pose_topic(text: str) -> tuple[str, "PoseTopic"]:
+    from splatctrl_cli.io.options import PoseTopic
+
+    name, _, rest = text.partition("=")
+    topic, at, frame = rest.partition("@")
+    if not name or not topic or bool(at) != bool(frame):
+        raise UsageError(f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME")
+    return name, PoseTopic(topic=topic, frame=frame.strip("/"))
 
 
 def _lens(text: str) -> tuple[str, tuple[float, ...]]:

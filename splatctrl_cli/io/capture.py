@@ -45,7 +45,7 @@ __all__ = ["CaptureSource", "is_capture", "read_capture_header", "write_capture"
 INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
 _NOT_FOR_CAPTURES = (
     *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
-    *("depth_scale", "root", "holdout", "stamps"),
+    *("camera_pose_topics", "depth_scale", "root", "holdout", "stamps"),
 )
 _FURTHER = (*((mask,) for mask in MASKS), MASKS)  # columns of frames.csv
 _AGAIN = "run `splatctrl ingest` again"

@@ -25,7 +25,10 @@ from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
 
-_NOT_FOR_FOLDERS = ("world_frame", "camera_topics", "human_topics", "joint_topic", "stamps")
+_NOT_FOR_FOLDERS = (
+    *("world_frame", "camera_topics", "camera_pose_topics", "human_topics"),
+    *("joint_topic", "stamps"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)

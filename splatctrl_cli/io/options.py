@@ -19,12 +19,21 @@ class CameraTopics:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PoseTopic:
+    """A topic of poses; frame: what it poses, "" for the frame that its messages name, else the camera's own."""
+
+    topic: str
+    frame: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SourceOptions:
     """What a person may say about an input; every field has a default that fits a well-formed log.
 
     world_frame: frame of poses (default: the root of the tf tree). cameras: only these (default: all).
     camera_topics: topics by camera name, instead of those found. camera_poses: T_world_camera of fixed cameras as
-    x, y, z, qx, qy, qz, qw, instead of those recorded. human_topics: image topics by camera name, not 0 where a
+    x, y, z, qx, qy, qz, qw, instead of those recorded. camera_pose_topics: topics of poses by camera name, where tf
+    has none. human_topics: image topics by camera name, not 0 where a
     pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, instead of those recorded. depth_scale:
     [m per count] of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an
     image folder that become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging.
@@ -34,6 +43,7 @@ class SourceOptions:
     cameras: tuple[str, ...] | None = None
     camera_topics: tuple[CameraTopics, ...] = ()
     camera_poses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    camera_pose_topics: Mapping[str, PoseTopic] = field(default_factory=dict)
     human_topics: Mapping[str, str] = field(default_factory=dict)
     intrinsics: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     depth_scale: float | None = None
@@ -46,7 +56,8 @@ class SourceOptions:
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
         """Raise InputError where a person gave an option that means nothing for this kind of input."""
-        flags = {"camera_topics": "camera", "camera_poses": "camera-pose", "human_topics": "human-topic"}
+        flags = {"camera_topics": "camera", "human_topics": "human-topic"}
+        flags |= dict.fromkeys(["camera_poses", "camera_pose_topics"], "camera-pose")
         default = SourceOptions()
         for name in names:
             if getattr(self, name) != getattr(default, name):

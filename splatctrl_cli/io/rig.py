@@ -11,6 +11,7 @@ from splatctrl_cli.io.cameras import find_cameras, find_info, image_topics, is_r
 from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, is_ros
 from splatctrl_cli.io.masks import check_mask_topics
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
+from splatctrl_cli.io.pose_topics import join_pose_topics, pose_topics
 from splatctrl_cli.io.raw_log import RawLog, Topic
 from splatctrl_cli.io.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
 from splatctrl_cli.io.survey import Calibration, Survey
@@ -50,9 +51,10 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
         raise _no_camera(log, survey)
     known = {camera.name: camera for camera in found}
     names = tuple(known) if options.cameras is None else options.cameras
-    for name in (*names, *options.camera_poses, *options.intrinsics):
+    for name in (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics):
         if name not in known:
             raise InputError(f"{log.path}: no camera {name!r}", remedy=f"use one of: {', '.join(known)}")
+    join_pose_topics(log, survey, options, [known[name] for name in names])
     check_mask_topics(log.path, survey, options.human_topics, tuple(known))
     try:
         cameras = tuple(_Builder(log, survey, options, known[name]).build() for name in names)
@@ -84,7 +86,13 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
             lacks.append("no CameraInfo topic; record the colour camera's camera_info")
         return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static); record it, or give --camera-pose"]
     lacks = []
+    try:
+        join_pose_topics(log, survey, options, found, only_first=True)
+    except InputError as error:
+        lacks.append(str(error).removeprefix(f"{log.path}: "))
     for topics in found:
+        if options.cameras is not None and topics.name not in options.cameras:
+            continue
         lacks.extend(_Builder(log, survey, options, topics).problems())
         stamps = [survey.topics[name].stamps_ns for name in (topics.color, topics.depth)]
         gap = nearest_gap_ns(*stamps) * 1e-9
@@ -250,9 +258,15 @@ class _Builder:
             raise InputError(
                 f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
                 f" frames tf knows: {_listed(tf.frames)}",
-                remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw",
+                remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw"
+                f"{self._instead()}",
             )
         return world
+
+    def _instead(self) -> str:
+        """What else could place the camera, in words; empty where nothing."""
+        topics = pose_topics(self._survey)
+        return f", or NAME=TOPIC[@FRAME] of a pose topic ({_listed(topics)})" if topics else ""
 
     def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
         if not np.any(np.abs(calibration.distortion) > 1e-9):

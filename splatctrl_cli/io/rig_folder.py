@@ -25,7 +25,7 @@ class RigFolderSource:
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
-        options.refuse(("holdout", "intrinsics"), "a description with several cameras", path)
+        options.refuse(("holdout", "intrinsics", "camera_pose_topics"), "a description with several cameras", path)
         self.name = path.name
         by_name = {}
         for description in read_rig(path, options.root):

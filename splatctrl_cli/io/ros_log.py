@@ -43,8 +43,8 @@ class RosLogSource:
         self._options = options
         found = survey(log, by_log_time=options.stamps == "log")
         _check_not_empty(log, found)
-        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
         self._rig = build_cameras(log, found, options)
+        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
         self.cameras = tuple(camera.name for camera in self._rig)
         self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
         self.world_frame = self._rig[0].world_frame

@@ -22,7 +22,10 @@ from splatctrl_cli.io.state_track import RawTrack, cleaned
 from splatctrl_cli.io.survey import survey
 from splatctrl_cli.records import LossReport, Record, RecordSource
 
-_FOR_CAMERAS = ("cameras", "camera_topics", "camera_poses", "human_topics", "depth_scale", "world_frame")
+_FOR_CAMERAS = (
+    *("cameras", "camera_topics", "camera_poses", "camera_pose_topics"),
+    *("human_topics", "depth_scale", "world_frame"),
+)
 _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
 
