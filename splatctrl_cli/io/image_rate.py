@@ -1,4 +1,4 @@
-"""Images of one topic that came twice, or did not come, by their stamps."""
+"""Images of one topic that came twice, or did not come, and clocks that went back, by their stamps."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,38 @@ Stamps = NDArray[np.int64]
 
 STEADY = 0.25  # largest departure from the period, in periods, of an interval that counts as steady
 GAP = 1.5  # [periods] from which on an interval is a gap
+BACK_NS = 1_000_000_000  # behind an earlier stamp, that is no mere disorder
+FEWEST_BACK = 3
 FEWEST = 5  # intervals that a rate is judged by
+
+
+@dataclass(kw_only=True)
+class StampClock:
+    """Whether the clock of a topic's headers went back while the recording went on: a bag in a loop, a reset.
+
+    num_back: stamps more than a second behind one that was logged before them; back_ns: the first one's distance, seen
+    at log time back_log_ns.
+    """
+
+    num_back: int = 0
+    back_ns: int = 0
+    back_log_ns: int = 0
+    _latest_ns: int | None = None
+    _latest_log_ns: int = 0
+
+    def see(self, stamp_ns: int, log_time_ns: int) -> None:
+        """The next message in the order of the file."""
+        if self._latest_ns is None or stamp_ns > self._latest_ns:
+            self._latest_ns, self._latest_log_ns = stamp_ns, log_time_ns
+        elif self._latest_ns - stamp_ns > BACK_NS and log_time_ns > self._latest_log_ns:
+            if not self.num_back:
+                self.back_ns, self.back_log_ns = self._latest_ns - stamp_ns, log_time_ns
+            self.num_back += 1
+
+    @property
+    def went_back(self) -> bool:
+        """Whether it did: a stamp or two may be wrong by themselves."""
+        return self.num_back >= FEWEST_BACK
 
 
 @dataclass(frozen=True, kw_only=True)

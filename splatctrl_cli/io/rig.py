@@ -149,6 +149,7 @@ class _Builder:
     def build(self) -> Camera:
         """The camera. Raises InputError for the first thing it lacks."""
         topics = self._topics
+        self._check_clock()
         calibration = self._calibration(topics.info, topics.color)
         intrinsics = intrinsics_of(calibration)
         undistortion = self._undistortion(calibration, topics.info)
@@ -173,6 +174,7 @@ class _Builder:
         found = []
         intrinsics = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
         steps: list[Callable[[], object]] = [
+            self._check_clock,
             lambda: self._calibration(self._topics.info, self._topics.color),
             self._check_world,
             lambda: None if self._is_registered else self._registration(intrinsics),
@@ -242,6 +244,18 @@ class _Builder:
             distortion=np.zeros(0),
             frame_id=image.frame_id,
         )
+
+    def _check_clock(self) -> None:
+        """Raise InputError where a clock went back: one stamp stands for two times then, of images and of tf."""
+        for name in (self._topics.color, self._topics.depth):
+            clock = self._survey.topics[name].clock
+            if clock.went_back:
+                raise InputError(
+                    f"{self._where}: topic {name}: the clock of its headers goes back by {clock.back_ns / 1e9:.3f} s at"
+                    f" {clock.back_log_ns / 1e9:.3f} s of the log (a bag in a loop, a simulation that was reset),"
+                    f" {clock.num_back} images in all",
+                    remedy="give --stamps log to take the times of logging, or cut the log there",
+                )
 
     def _check_world(self) -> str:
         """The world frame, after checking that tf joins the camera to it."""

@@ -17,6 +17,7 @@ from splatctrl_cli.io.decoder import (
     is_ros,
     stamp_ns,
 )
+from splatctrl_cli.io.image_rate import StampClock
 from splatctrl_cli.io.joint_log import JointLog
 from splatctrl_cli.io.messages import ImageMessage, read_image
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
@@ -43,13 +44,14 @@ class Calibration:
 
 @dataclass(kw_only=True)
 class TopicSurvey:
-    """What a log holds of one topic; stamps_ns (image topics only) are header stamps in file order."""
+    """What a log holds of one topic; stamps_ns and clock (image topics only) are of the headers in file order."""
 
     topic: Topic
     count: int = 0
     first_log_ns: int = 0
     last_log_ns: int = 0
     stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    clock: StampClock = field(default_factory=StampClock)
     first_image: ImageMessage | None = None
     calibration: Calibration | None = None
     joints: JointLog = field(default_factory=JointLog)
@@ -115,6 +117,7 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
     if kind in {IMAGE, COMPRESSED_IMAGE}:
         entry.stamps_ns.append(-1)  # every image has its place, also one that does not decode
         entry.stamps_ns[-1] = message.log_time_ns if result.by_log_time else header_stamp_ns(message)
+        entry.clock.see(entry.stamps_ns[-1], message.log_time_ns)
         if entry.first_image is None:
             entry.first_image = read_image(decoder.decode(message), kind)
     elif kind == CAMERA_INFO and entry.calibration is None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.image_rate import dropped, first_of_each
+from splatctrl_cli.io.describe import describe
+from splatctrl_cli.io.image_rate import StampClock, dropped, first_of_each
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.io.session_log import SessionLog
@@ -141,6 +142,37 @@ def test_headers_without_stamps_ask_for_the_times_of_logging(tmp_path: Path) -> 
     with pytest.raises(InputError, match=r"expected stamps, got 0 in all 5 headers; give --stamps log"):
         open_source(log)
     assert len(frames_of(list(open_source(log, SourceOptions(stamps="log")).records()))) == 5
+
+
+def looped(message: Message) -> list[Message]:
+    """From the sixth frame on, the headers begin again, half a period later."""
+    index = (message[0] - START_NS) // FRAME_NS
+    return [restamped(message, -5 * FRAME_NS * 3 + FRAME_NS // 2) if index >= 5 * 3 else message]
+
+
+def test_a_clock_that_goes_back_is_refused_and_the_times_of_logging_taken_on_request(tmp_path: Path) -> None:
+    recipe = LogRecipe(num_frames=20)
+    log = make_part(tmp_path / "log.mcap", recipe, looped)
+    with pytest.raises(InputError) as caught:
+        open_source(log)
+    assert (
+        "topic /cam0/color/image_raw: the clock of its headers goes back by 1.350 s at 1700000001.500 s of the"
+        in (str(caught.value))
+    )
+    assert "5 images in all; give --stamps log" in str(caught.value)
+    assert any("goes back by 1.350 s" in lack for lack in describe(log).missing)
+    frames = frames_of(list(open_source(log, SourceOptions(stamps="log")).records()))
+    assert [f.stamp_ns for f in frames] == [START_NS + i * FRAME_NS for i in range(20)]
+    assert [f.T_world_camera[0, 3] for f in frames] == pytest.approx([camera_x(i) for i in range(20)])
+
+
+def test_a_log_that_was_written_out_of_order_has_no_clock_that_goes_back() -> None:
+    clock, late = StampClock(), StampClock()
+    for stamp in (5, 6, 7, 1, 2, 3, 4):  # as in a file that was merged
+        clock.see(stamp * 10**9, stamp * 10**9 + 1)
+    for time, stamp in enumerate((5, 6, 0, 7, 0, 8)):  # two headers that were not filled
+        late.see(stamp * 10**9, time * 10**9)
+    assert not clock.num_back and late.num_back == 2 and not late.went_back
 
 
 def test_images_that_came_twice_are_taken_once_and_counted(tmp_path: Path) -> None:
