@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output
-from splatctrl_cli.cli.export_check import check, compare, difference_table
+from splatctrl_cli.cli.export_check import check, check_colors, compare, difference_table
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     if os.path.realpath(out) == os.path.realpath(source):
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
     splats, comments = read_splats(source)
+    check_colors(source, splats)
     selected = _select(splats, args.labels)
     if not len(selected):
         raise NotEvaluableError(f"{source}: no splat to write among {len(splats)}", remedy="give other --labels")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measured: 107 and more, or the same
 MAX_PIXEL_DIFFERENCE = 3 / 255  # there; the last bit can take a splat across the renderer's cut-off of 1/255
+MAX_COLOR = 1e4  # of a sensor's 0 to 1, or of a harmonic; from 1e6 on an isotropic PLY looks otherwise
 NUM_VIEWS = 4  # around the scene
 IMAGE_SIZE = (320, 240)
 SHOWN = {  # of Differences: what the table calls it, and the unit it is shown in
@@ -69,6 +70,18 @@ def check(
         "psnr": comparison.psnr,
         "covered_share": comparison.covered,
     }
+
+
+def check_colors(source: "Path", splats: "SplatSet | GaussianSet") -> None:
+    """Raise InputError naming the first splat whose colour no picture has: beside it float32 loses the others."""
+    import numpy as np
+
+    from splatctrl_cli.io.splat_values import refuse
+    from splatctrl_cli.records import SplatSet
+
+    colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
+    largest = np.abs(colors).max(axis=1, initial=0.0)
+    refuse(str(source), "colour", largest, largest > MAX_COLOR, f"at most {MAX_COLOR:g}")
 
 
 def _gaussians(splats: "SplatSet | GaussianSet") -> "GaussianSet":

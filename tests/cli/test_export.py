@@ -84,6 +84,25 @@ def test_labels_choose_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -
     assert "267 splats, 133 left out by label" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("value", [-1e37, -1e6, 2e4, 1e37])
+@pytest.mark.parametrize("is_round", [True, False])
+def test_a_colour_that_no_picture_has_is_the_fault_of_the_input(
+    scene: Path, capsys: pytest.CaptureFixture[str], value: float, is_round: bool
+) -> None:
+    file, splats = scene / "splats.ply", ball(20)
+    splats.colors[3, 1] = value
+    if is_round:
+        write_ply(file, splats, {})
+    else:
+        gaussians = as_gaussians(ball(20))
+        gaussians.scales[:, 0] *= 2
+        gaussians.harmonics[3, 0, 1] = value
+        write_gaussian_ply(file, gaussians, {})
+    assert run(scene, "-o", scene.parent / "out.ply", "--isotropic") == 4
+    assert "splat 3: colour: expected at most 10000" in capsys.readouterr().err
+    assert not (scene.parent / "out.ply").exists()
+
+
 def test_the_same_scene_gives_the_same_bytes(scene: Path) -> None:
     for name in ("a.ply", "b.ply"):
         assert run(scene, "-o", scene.parent / name) == 0
