@@ -18,8 +18,8 @@ FEWEST = 5  # intervals that a rate is judged by
 class StampClock:
     """Whether the clock of a topic's headers went back while the recording went on: a bag in a loop, a reset.
 
-    num_back: stamps more than a second behind one that was logged before them; back_ns: the first one's distance, seen
-    at log time back_log_ns.
+    num_back: stamps more than a second behind one that was logged before them; back_ns: the first one's distance,
+    seen at log time back_log_ns.
     """
 
     num_back: int = 0

@@ -251,8 +251,8 @@ class _Builder:
             clock = self._survey.topics[name].clock
             if clock.went_back:
                 raise InputError(
-                    f"{self._where}: topic {name}: the clock of its headers goes back by {clock.back_ns / 1e9:.3f} s at"
-                    f" {clock.back_log_ns / 1e9:.3f} s of the log (a bag in a loop, a simulation that was reset),"
+                    f"{self._where}: topic {name}: the clock of its headers goes back by {clock.back_ns / 1e9:.3f} s"
+                    f" at {clock.back_log_ns / 1e9:.3f} s of the log (a bag in a loop, a simulation that was reset),"
                     f" {clock.num_back} images in all",
                     remedy="give --stamps log to take the times of logging, or cut the log there",
                 )

@@ -155,11 +155,9 @@ def test_a_clock_that_goes_back_is_refused_and_the_times_of_logging_taken_on_req
     log = make_part(tmp_path / "log.mcap", recipe, looped)
     with pytest.raises(InputError) as caught:
         open_source(log)
-    assert (
-        "topic /cam0/color/image_raw: the clock of its headers goes back by 1.350 s at 1700000001.500 s of the"
-        in (str(caught.value))
-    )
-    assert "5 images in all; give --stamps log" in str(caught.value)
+    message = str(caught.value)
+    assert "image_raw/compressed: the clock of its headers goes back by 1.350 s at 1700000001.500 s" in message
+    assert "4 images in all; give --stamps log" in message  # the fifth is less than a second behind
     assert any("goes back by 1.350 s" in lack for lack in describe(log).missing)
     frames = frames_of(list(open_source(log, SourceOptions(stamps="log")).records()))
     assert [f.stamp_ns for f in frames] == [START_NS + i * FRAME_NS for i in range(20)]
