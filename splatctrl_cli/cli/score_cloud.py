@@ -38,10 +38,9 @@ class CloudSettings:
 
     def words(self) -> str:
         """How the figures come about."""
-        both = "points" if self.masks is None else "the surface's points"
         within = "" if self.masks is None else f"; within the masks and above the planes of {self.masks}"
         return (
-            f"{self.path}, 1 unit = {self.unit:g} m; {both} thinned to {1e3 * self.spacing:g} mm; means below"
+            f"{self.path}, 1 unit = {self.unit:g} m; points {1e3 * self.spacing:g} mm apart; means below"
             f" {1e3 * self.max_distance:g} mm{within}"
         )
 
@@ -73,7 +72,7 @@ def add_cloud(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0002,
         metavar="M",
-        help="both sides are thinned to it (default: 0.0002)",
+        help="both sides are thinned to points this far apart (default: 0.0002)",
     )
 
 
@@ -100,14 +99,12 @@ def cloud_figures(
     settings: CloudSettings, scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int
 ) -> dict[str, Any]:
     """The figures by flat name. `frames`: the training views that the surface is looked at from."""
-    from splatctrl_cli.evaluate.cloud import cloud_score, thinned
+    from splatctrl_cli.evaluate.cloud import cloud_score, spaced
     from splatctrl_cli.evaluate.visibility import seen_by
 
-    reference, space, counts = _reference(settings), settings.space, None
+    reference, space, counts = spaced(_reference(settings), settings.spacing), settings.space, None
     points = _surface(scene, frames, threads, settings.spacing)
-    if space is None:
-        reference = thinned(reference, settings.spacing)
-    else:
+    if space is not None:
         reference, points = reference[space.above(reference)], points[space.near(points)]
         counts = space.observed(points)
     score = cloud_score(
@@ -117,6 +114,7 @@ def cloud_figures(
         max_distance=settings.max_distance,
         counts=counts,
         unit=settings.unit,
+        threads=threads or -1,
     )
     return score.figures()
 
@@ -134,18 +132,18 @@ def _reference(settings: CloudSettings) -> "Float64":
 
 def _surface(scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int, spacing: float) -> "Float64":
     """World points (P, 3) [m] of the final splats' rendered depth at the poses of `frames`, the robot left out,
-    thinned to `spacing` [m]."""
+    `spacing` [m] apart."""
     import numpy as np
 
-    from splatctrl_cli.evaluate.cloud import thinned
+    from splatctrl_cli.evaluate.cloud import spaced, thinned
     from splatctrl_cli.evaluate.visibility import surface_points
 
     splats = _without_robot(scene)
     parts = []
     for frame in frames:
         depth = rendered(splats, frame.intrinsics, frame.T_world_camera, threads).normalised_depth()
-        parts.append(thinned(surface_points(replace(frame, depth=depth))[0], spacing))
-    return thinned(np.concatenate(parts), spacing) if parts else np.empty((0, 3))
+        parts.append(thinned(surface_points(replace(frame, depth=depth))[0], spacing / 2))
+    return spaced(np.concatenate(parts), spacing) if parts else np.empty((0, 3))
 
 
 def _without_robot(scene: "SceneFolder") -> "SplatSet | GaussianSet":

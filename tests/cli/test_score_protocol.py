@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.evaluate.cloud import spaced
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.records import Float64
 from tests.io.make_idr import half_size, write_idr
@@ -188,7 +189,7 @@ def test_the_surface_is_compared_with_a_cloud_in_millimetres(
     assert run(place, "mvsnet", "--protocol", HOLDOUT, "--cloud", cloud, "--cloud-spacing", "0.004") == 0
     out = capsys.readouterr().out
     assert "surface: accuracy " in out
-    assert "1 unit = 0.001 m; points thinned to 4 mm; means below 20 mm" in out
+    assert "1 unit = 0.001 m; points 4 mm apart; means below 20 mm" in out
     blind = scored(capsys, place, "blind", *given)["metrics"]
     assert blind["accuracy"] == pytest.approx(metrics["accuracy"], rel=1e-3), "the surface is rendered, not recorded"
     moved = scored(capsys, place, "mvsnet", *given[:4], "--cloud-max", "0.004")["metrics"]
@@ -208,7 +209,8 @@ def test_the_surface_is_compared_where_dtus_own_evaluation_looks(
     whole = scored(capsys, place, "mvsnet", *given)["metrics"]
     result = scored(capsys, place, "mvsnet", *given, "--cloud-masks", tmp_path)
     assert 100 < result["metrics"]["num_points"] < 0.5 * whole["num_points"]
-    assert result["metrics"]["num_reference"] == np.count_nonzero(points[:, 2] > 0.03)
+    above = spaced(points, 0.004)[:, 2] > 0.03
+    assert result["metrics"]["num_reference"] == pytest.approx(np.count_nonzero(above), rel=0.05)
     assert "within the masks and above the planes of" in result["protocol"]["definitions"]["cloud"]
     assert run(place, "mvsnet", "--protocol", HOLDOUT, "--cloud", tmp_path / "masks.ply") == 4
     assert run(place, "mvsnet", "--protocol", HOLDOUT, *given, "--cloud-masks", place) == 4
@@ -224,7 +226,7 @@ def test_the_surface_is_compared_with_a_mesh(
     mesh.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\nf 1 3 4\n", encoding="ascii")
     given = ("--cloud", mesh, "--cloud-unit", "1", "--cloud-spacing", "0.005", "--cloud-max", "0.1")
     metrics = scored(capsys, place, "mvsnet", *given)["metrics"]
-    assert metrics["num_reference"] == pytest.approx(0.04 / 0.005**2, rel=0.1), "one point to a square of the spacing"
+    assert metrics["num_reference"] == pytest.approx(0.55 * 0.04 / 0.005**2, rel=0.1), "a spacing apart"
     assert 0 < metrics["completeness"] < 0.1
 
 

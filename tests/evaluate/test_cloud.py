@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.cloud import cloud_score, points_on, thinned
+from splatctrl_cli.evaluate.cloud import cloud_score, points_on, spaced, thinned
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Float64
 
@@ -75,6 +75,21 @@ def test_thinning_in_parts_leaves_what_thinning_at_once_does() -> None:
     points = np.random.default_rng(2).uniform(-0.01, 0.01, (2000, 3))
     parts = np.vstack([thinned(points[:900], 0.003), thinned(points[900:], 0.003)])
     assert np.array_equal(thinned(parts, 0.003), thinned(points, 0.003))
+
+
+def test_spaced_points_are_what_taking_them_in_turn_leaves() -> None:
+    points = np.random.default_rng(3).uniform(0, 0.01, (800, 3))
+    spacing = 0.002
+    kept: list[Float64] = []
+    some = thinned(points, spacing / 2)
+    for point in some[np.random.default_rng(0).permutation(len(some))]:
+        if all(np.linalg.norm(point - other) > spacing for other in kept):
+            kept.append(point)
+    assert 50 < len(kept) < 0.6 * len(some)
+    assert np.array_equal(spaced(points, spacing), kept)
+    again = spaced(np.array(kept), spacing)
+    assert sorted(again.tolist()) == sorted(np.array(kept).tolist()), "what is spaced stays as it is"
+    assert len(spaced(np.empty((0, 3)), spacing)) == 0
 
 
 def test_rigid_motion_changes_no_figure() -> None:
