@@ -108,13 +108,17 @@ class TfTree:
     ) -> None:
         """Add T_parent_child at a time; a static one holds always, one that `holds` as long as it is the only one.
 
-        The first parent of a frame stays its parent, the last of different static transforms holds; both are noted.
+        The first parent of a frame stays its parent, what would close a loop is left out, the last of different
+        static transforms holds; all of this is noted.
         Raises ValueError for a rotation or position that is none (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
         norm = float(np.linalg.norm(quat_xyzw))
         if not (np.isfinite(position).all() and 0.5 < norm < 2.0):
             raise ValueError(f"transform {parent} -> {child} is not a rigid transform")
+        if child not in self._edges and child in self._ancestors(parent):
+            self.note(f"tf: {parent} -> {child} would close a loop, as {child} is above {parent}; it is left out")
+            return
         edge = self._edges.setdefault(child, _Edge(parent, self._transforms))
         if edge.parent != parent:
             self.note(f"tf: frame {child} has parents {edge.parent} and {parent}; {edge.parent} is kept")

@@ -85,6 +85,17 @@ def test_a_second_parent_is_noted_and_the_first_kept() -> None:
     assert "camera has parents base and elsewhere" in tree.notes[0]
 
 
+@pytest.mark.parametrize("bottom", ["world", "base", "camera"])
+def test_a_transform_that_would_close_a_loop_is_left_out_and_noted(bottom: str) -> None:
+    tree = moving_tree()
+    tree.add(bottom, "world", 0, np.array([9.0, 9, 9]), IDENTITY, static=True)
+    T = tree.lookup("world", "camera", 0)
+    assert T is not None
+    assert T[:3, 3] == pytest.approx([0, 0, 0.5])
+    assert tree.roots == ("world",) and tree.connects("world", "camera")
+    assert f"tf: {bottom} -> world would close a loop" in tree.notes[0]
+
+
 def test_a_zero_quaternion_is_refused() -> None:
     with pytest.raises(ValueError, match="not a rigid transform"):
         TfTree().add("a", "b", 0, np.zeros(3), np.zeros(4), static=True)
