@@ -135,6 +135,10 @@ def drawn_figure(height: float) -> Iterator["Figure"]:
 
 def save_figure(figure: "Figure", path: Path) -> None:
     """Write the figure without the clock in it."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)  # else savefig lays out once more, and draws everything for it
     figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": "splatctrl"})
 
 
