@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from splatctrl_cli.cli import replay_draw
 from splatctrl_cli.io import state_source
@@ -38,6 +40,14 @@ def coverage_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of other files of the output."""
     monkeypatch.setattr(replay_draw, "draw_replay", lambda *_: None)
+
+
+@pytest.fixture
+def unpainted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made in full, but neither laid out nor painted, which takes longer than a replay; `painted` are."""
+    if request.node.get_closest_marker("painted") is None:
+        monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda *_: None)
+        monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).touch())
 
 
 @pytest.fixture

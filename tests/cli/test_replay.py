@@ -26,7 +26,10 @@ from tests.cli.replay_desk import (
     write_scene,
 )
 
+pytestmark = pytest.mark.usefixtures("unpainted")
 
+
+@pytest.mark.painted
 def test_an_audit_measures_every_logged_state(desk: Desk, arm: RobotModel) -> None:
     desk.source.states = logged(START + 0.3)
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
@@ -97,6 +100,7 @@ def test_unknown_space_is_said_after_the_outputs_are_written(desk: Desk, capsys:
     assert desk.replay("--scene", str(scene), "-q", "--max-unknown", "1", out="again") == 0
 
 
+@pytest.mark.painted
 def test_a_closed_loop_reaches_the_logged_end_and_gates_on_it(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     end = START + np.array([0.5, 0.1, 0, 0, 0, 0, 0])
     desk.source.states = logged(end)
@@ -120,6 +124,7 @@ def test_a_posture_can_be_the_goal(desk: Desk) -> None:
     assert desk.metrics()["goal_reached"] == 1
 
 
+@pytest.mark.painted
 def test_the_truth_is_reported_beside_the_scene(
     desk: Desk, sample_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,6 +17,8 @@ from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, grid_seen, splats_of, write_scene
 from tests.cli.test_replay_modes import MOVE, ball_ahead, moving, with_person
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 CLOSED = ("-q", "--mode", "closed-loop", "--set", "control.max_time=4")
 
 
@@ -24,6 +26,7 @@ def scene_of(desk: Desk, *balls: tuple[tuple[float, float, float], float]) -> tu
     return "--scene", str(write_scene(desk.folder / "scene", (0, splats_of(*balls))))
 
 
+@pytest.mark.painted
 def test_every_method_has_every_figure_and_gates_can_name_them(
     desk: Desk, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -78,6 +81,7 @@ def test_a_ball_that_comes_later_is_not_planned_for_but_is_measured(desk: Desk, 
     assert metrics["birrt_min_clearance"] < 0 < metrics["birrt_planned_margin"]
 
 
+@pytest.mark.painted
 def test_a_goal_that_is_in_collision_leaves_a_row_without_a_motion(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:

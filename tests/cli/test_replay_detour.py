@@ -7,6 +7,8 @@ import pytest
 
 from tests.cli.replay_desk import Desk, logged, splats_of, write_scene
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 GOAL = np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 1.6])
 WALL = tuple(((x, 0.0, z), 0.04) for x in np.arange(0.3, 0.85, 0.05) for z in np.arange(0.05, 0.5, 0.05))
 

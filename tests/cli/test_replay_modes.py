@@ -13,6 +13,8 @@ from splatctrl_cli.records import JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, splats_of, write_scene
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 MOVE = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -40,6 +42,7 @@ def events(desk: Desk, out: str = "out") -> list[dict[str, object]]:
     return document
 
 
+@pytest.mark.painted
 def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) -> None:
     moving(desk)
     scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05))))
@@ -51,6 +54,7 @@ def test_open_loop_commands_what_was_logged_where_nothing_is_near(desk: Desk) ->
     assert (desk.folder / "out" / "open_loop.png").is_file()
 
 
+@pytest.mark.painted
 def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -84,6 +88,7 @@ def test_open_loop_may_ask_for_a_goal_instead_of_the_log(desk: Desk) -> None:
     assert float(desk.rows()[-1]["v_joint1"]) < 0 and desk.metrics()["max_velocity_difference"] > 0.5
 
 
+@pytest.mark.painted
 def test_a_clearance_below_the_margin_is_one_interval_with_its_obstacle(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -186,6 +191,7 @@ def test_a_gate_that_fails_names_the_first_time_that_breaks_it(
     assert message.rstrip().endswith("required >= 2")
 
 
+@pytest.mark.painted
 def test_a_driven_arm_follows_the_log_and_its_divergence_is_measured(desk: Desk) -> None:
     moving(desk)
     scene = write_scene(desk.folder / "scene", (0, splats_of(((-1.0, 0.0, 1.5), 0.05))))
@@ -272,6 +278,7 @@ def with_person(arm: RobotModel, *, is_there: bool = True) -> tuple[SplatSet, Sp
     return alone, replace(beside, labels=np.array([0, Label.HUMAN if is_there else 0], np.uint8))
 
 
+@pytest.mark.painted
 def test_the_standstill_waits_where_the_controller_goes_on(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:

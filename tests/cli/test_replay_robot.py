@@ -19,6 +19,8 @@ from splatctrl_cli.robot.sphere_files import spheres_yaml
 from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_scene
 from tests.control.fakes import Balls
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SHORT = 0.012  # [m] taken off every radius
 
 
@@ -131,6 +133,7 @@ def test_pairs_that_an_srdf_disables_have_no_row(desk: Desk, arm: RobotModel) ->
     assert srdf.name in json.loads((desk.folder / "out" / "run.json").read_text())["inputs"]
 
 
+@pytest.mark.painted
 def test_an_fr3_is_reminded_of_its_limits_by_position(sample_data: Path, tmp_path: Path) -> None:
     tabletop, urdf = sample_data / "tabletop", tmp_path / "fr3.urdf"
     urdf.write_text((tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint'))

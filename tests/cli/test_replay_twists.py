@@ -12,6 +12,8 @@ from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_scene
 from tests.io.make_states import START_NS, states_of, write_mcap
 from tests.io.test_twists import stamped
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 NUM = 41  # states, every 10 ms
 TWIST = [0.0, -0.1, 0.05, 0.0, 0.0, 0.0]
 
@@ -42,6 +44,7 @@ def test_a_driven_arm_does_what_the_log_asked_for(desk: Desk, arm: RobotModel) -
     assert about["outcome"] == "log-ended"
 
 
+@pytest.mark.painted
 def test_open_loop_says_how_the_command_misses_a_twist(desk: Desk) -> None:
     assert replayed(desk, "--twist-topic", "/cmd", "--mode", "open-loop", "--require", "twist_share>=0.7") == 0
     assert desk.metrics()["mean_velocity_difference"] > 0.05 > desk.metrics()["mean_twist_error_linear"]
