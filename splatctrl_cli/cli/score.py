@@ -25,6 +25,7 @@ from splatctrl_cli.cli.score_reference import (
     recording_check,
 )
 from splatctrl_cli.cli.score_report import lines_of, result_of, write_scores
+from splatctrl_cli.cli.score_scans import lines_of_scans, scenes_of_scans, score_scans
 from splatctrl_cli.cli.source_options import add_source
 from splatctrl_cli.errors import UsageError
 
@@ -43,7 +44,13 @@ def register(subparsers: Subparsers) -> None:
         summary="compare renders of a scene with recorded views (by default of the cameras that did not train it): "
         "PSNR, SSIM, depth error, by a named protocol; or fit scans first (--fit)",
     )
-    parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help="a folder that reconstruct wrote")
+    parser.add_argument(
+        "scene",
+        type=Path,
+        nargs="?",
+        metavar="SCENE",
+        help="a folder that reconstruct wrote, or one of such folders, named like the scans of --dtu",
+    )
     reference = parser.add_mutually_exclusive_group(required=True)
     reference.add_argument(
         "--reference", type=Path, metavar="PATH", help="a log, a capture, or an image folder's TOML"
@@ -100,19 +107,24 @@ def run(args: argparse.Namespace) -> int:
     console = Console(args)
     from splatctrl_cli.io.output import output_path
 
+    scenes = scenes_of_scans(args)
     output = output_path(args.out, force=args.force, is_folder=True) if args.out else nullcontext()
     with output as folder:
-        result, source = score_scene(args, console, folder)
-    console.result(result, lines_of(result))
+        if scenes:
+            result, is_damaged = score_scans(args, console, scenes, score_scene, folder)
+        else:
+            result, source = score_scene(args, console, folder)
+            is_damaged = bool(source.loss.damaged)
+    console.result(result, lines_of_scans(result) if scenes else lines_of(result))
     check_gates(args.require, dict.fromkeys(names, None) | result["metrics"])
-    return DAMAGED if source.loss.damaged else 0
+    return DAMAGED if is_damaged else 0
 
 
 def _gated() -> tuple[str, ...]:
     from splatctrl_cli.evaluate.cloud import cloud_names
     from splatctrl_cli.evaluate.score import metric_names
 
-    return (*metric_names(), *cloud_names(), "free_mass", "num_skipped", "num_warnings")
+    return (*metric_names(), *cloud_names(), "free_mass", "num_skipped", "num_warnings", "num_scans")
 
 
 def score_scene(

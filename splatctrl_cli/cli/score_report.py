@@ -68,6 +68,7 @@ def _protocol(reference: Reference, scene: "SceneFolder", scores: Scores, lpips:
         "mask_rule": reference.mask_rule,
         "resolution": [f"{width}x{height}" for width, height in sizes],
         "published_resolution": None if named is None or named.size is None else "{}x{}".format(*named.size),
+        "published_scans": None if named is None or not named.scans else list(named.scans),
         "background": [round(value, 4) for value in scene.background],
         "averaging": "mean over the views",
         "lpips": None if lpips is None else lpips.name,
@@ -129,19 +130,21 @@ COLUMNS = {
     "ssim_all": "SSIM all",
     "ssim_published": "SSIM publ.",
     "lpips": "LPIPS",
+    "lpips_published": "LPIPS publ.",
     "depth_median_seen": "depth mm seen",
     "depth_median_all": "depth mm all",
     "in_front_seen": "in front",
     "seen_share": "seen",
     "mask_share": "mask",
     "valid_share": "valid",
+    "chamfer": "Chamfer mm",
 }
 SHARES = ("seen_share", "in_front_seen", "mask_share", "valid_share")
 
 
 def lines_of(result: dict[str, Any]) -> list[str]:
     """The table, and what belongs to its figures."""
-    metrics, columns = result["metrics"], [name for name in COLUMNS if name in result["metrics"]]
+    metrics, columns = result["metrics"], [name for name in COLUMNS if name in result["views"][0]]
     stamps = [f"{view['stamp_ns'] / 1e9:.3f}" if result["has_clock"] else "-" for view in result["views"]]
     views = [
         [view["view"], stamp, *(cell(n, view[n]) for n in columns)]
@@ -156,7 +159,7 @@ def lines_of(result: dict[str, Any]) -> list[str]:
         f"depth: median of the absolute error; seen: by {', '.join(result['training_cameras'])} within 2 cm"
     )
     if "chamfer" in metrics:
-        lines += _cloud_lines(metrics, result["protocol"]["definitions"]["cloud"])
+        lines += cloud_lines(metrics, result["protocol"]["definitions"]["cloud"])
     lines += [f"warning: {line}" for line in result["warnings"]]
     lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
     if metrics["free_mass"] is not None:
@@ -170,15 +173,19 @@ def protocol_lines(protocol: dict[str, Any]) -> list[str]:
     published = protocol["published_resolution"]
     resolution = ", ".join(protocol["resolution"])
     differs = "" if published in (None, resolution) else f" (published figures: {published})"
+    scans = protocol["published_scans"]
     return [
         f"protocol: {protocol['name']}" + ("" if protocol["name"] == "none" else f" ({protocol['source']})"),
         f"split: {protocol['split']}",
+        *([f"published figures: means over scans {', '.join(map(str, scans))}"] if scans else []),
         f"mask rule: {protocol['mask_rule']}; averaging: {protocol['averaging']}; resolution: {resolution}{differs};"
         f" background: ({color})",
     ]
 
 
-def _cloud_lines(metrics: dict[str, Any], words: str) -> list[str]:
+def cloud_lines(metrics: dict[str, Any], words: str) -> list[str]:
+    """Accuracy, completeness and Chamfer, and by what they came about, for people."""
+
     def share(name: str) -> str:
         return "-" if metrics[name] is None else f"{100 * metrics[name]:.1f}% farther"
 
@@ -202,6 +209,8 @@ def cell(name: str, value: float | None) -> str:
         return "-"
     if name.startswith("depth"):
         return f"{1000 * value:.1f}"
+    if name == "chamfer":
+        return f"{1000 * value:.2f}"
     if name in SHARES:
         return f"{100 * value:.1f}%"
     return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"

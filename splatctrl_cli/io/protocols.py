@@ -19,6 +19,7 @@ REGNERF_SCANS = (8, 21, 30, 31, 34, 38, 40, 41, 45, 55, 63, 82, 103, 110, 114)
 MVSNERF_TRAINING = (25, 21, 33, 22, 14, 15, 26, 30, 31, 35, 34, 43, 46, 29, 16, 36)
 MVSNERF_SCORED = (32, 24, 23, 44)
 MVSNERF_SCANS = (1, 8, 21, 103, 114)
+SURFACE_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)  # those IDR has masks for
 DTU_VIEWS = 49
 NAMES = ("dtu-train", "dtu-holdout8", "regnerf-3", "regnerf-6", "regnerf-9", "mvsnerf", "holdout:RULE")
 RULES = "expected holdout:everyN, holdout:everyN+FIRST or holdout:2,5"
@@ -97,17 +98,18 @@ def score_protocol(name: str) -> ScoreProtocol:
     """The protocol of that name. Raises UsageError with the choices.
 
     dtu-train: every view trains and is scored, as surface methods print it (2D Gaussian splatting, repository
-    hbb1/2d-gaussian-splatting, thread 13: DTU has no test views). dtu-holdout8: every 8th view from the first on is
-    scored (graphdeco-inria/gaussian-splatting, scene/dataset_readers.py, ``llffhold = 8``). regnerf-N: the first N of
-    nine input views, 25 scored, 15 left out (google-research/google-research, regnerf/internal/datasets.py, class
-    DTU, split 'pixelnerf'; figures over the object, regnerf/eval.py, 400x300 by ``factor = 4`` of regnerf/configs).
-    mvsnerf: 16 views train, four are scored, pixels without reference depth left out (apchenstu/mvsnerf,
-    data/dtu_ft.py and renderer.ipynb; the numbers of its configs/pairs.th as autonomousvision/murf,
-    datasets/dtu.py, writes them out).
+    hbb1/2d-gaussian-splatting, thread 13: DTU has no test views; its scans by scripts/dtu_eval.py). dtu-holdout8:
+    every 8th view from the first on is scored (graphdeco-inria/gaussian-splatting, scene/dataset_readers.py,
+    ``llffhold = 8``). regnerf-N: the first N of nine input views, 25 scored, 15 left out (google-research/
+    google-research, regnerf/internal/datasets.py, class DTU, split 'pixelnerf'; figures over the object,
+    regnerf/eval.py, 400x300 by ``factor = 4`` of regnerf/configs). mvsnerf: 16 views train, four are scored, pixels
+    without reference depth left out (apchenstu/mvsnerf, data/dtu_ft.py and renderer.ipynb; the numbers of its
+    configs/pairs.th as autonomousvision/murf, datasets/dtu.py, writes them out).
     """
     if name == "dtu-train":
         return ScoreProtocol(
             name=name,
+            scans=SURFACE_SCANS,
             source="every view trains and is scored: DTU has no test views (hbb1/2d-gaussian-splatting, thread 13)",
         )
     if name == "dtu-holdout8":

@@ -54,7 +54,7 @@ def test_the_mean_is_over_the_scans(
     def score(args: Any, console: Any, folder: Path | None) -> Any:
         metrics = dict.fromkeys(score_fit.EACH, 1.0) | {"psnr_all": psnr.get((args.scan, args.scene.parent.name))}
         protocol = {"name": "x", "source": "y", "split": "z", "mask_rule": "none", "background": [0.0],
-                    "published_resolution": None, "resolution": ["1x1"]}  # fmt: skip
+                    "published_resolution": None, "published_scans": None, "resolution": ["1x1"]}  # fmt: skip
         return {"metrics": metrics, "protocol": protocol}, None
 
     monkeypatch.setattr(score_fit, "_reconstruct", reconstruct)

@@ -38,6 +38,13 @@ def test_every_eighth_view_is_scored_and_all_of_dtu_train() -> None:
     assert split.training == split.scored == tuple(DTU)
 
 
+def test_published_means_are_over_so_many_scans() -> None:
+    names = ("regnerf-3", "mvsnerf", "dtu-train", "dtu-holdout8")
+    assert [len(score_protocol(name).scans) for name in names] == [15, 5, 15, 0]
+    assert score_protocol("regnerf-9").scans == (8, 21, 30, 31, 34, 38, 40, 41, 45, 55, 63, 82, 103, 110, 114)
+    assert score_protocol("dtu-train").scans[:6] == (24, 37, 40, 55, 63, 65)
+
+
 def test_every_eighth_counts_the_views_that_are_there() -> None:
     assert score_protocol("dtu-holdout8").split([1, 3, *range(5, 15)], "scan").scored == (1, 11)
 
