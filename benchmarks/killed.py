@@ -3,13 +3,16 @@
 Each command first runs to its end. Then it is killed (SIGKILL) N times, after a random part of that time, every
 other time with --force over an output that is there. After each kill the output is not there, or holds the same
 bytes as the whole one (but for times and paths in run.json), and what is left under NAME.partial is refused by the
-tool's own readers or is whole, too. Commands run in forked children that have their imports behind them, so that the
+tool's own readers or is whole, too. Commands that can go on are killed anew N times, every third time once more while
+they go on, and then end with --resume: every byte has to be that of the whole run, but for the times in run.json.
+Commands run in forked children that have their imports behind them, so that the
 moments fall where files are written.
 """
 
 import argparse
 import contextlib
 import hashlib
+import json
 import os
 import random
 import shutil
@@ -31,6 +34,7 @@ from splatctrl_cli.io.splat_formats import FORMATS
 from tests.io.test_gaussian_ply import gaussian_set
 
 SAMPLE = Path(__file__).parent.parent / "sample_data" / "tabletop"
+_OWN = ("seconds", "arguments")  # of run.json
 _TIMED = ("run.json", "SHA256SUMS")  # SHA256SUMS holds the sum of run.json where it lists it
 
 
@@ -41,6 +45,7 @@ class Task:
     name: str
     arguments: tuple[str, ...]
     out: str
+    resumes: bool = False
 
 
 def tasks(folder: Path) -> list[Task]:
@@ -48,10 +53,12 @@ def tasks(folder: Path) -> list[Task]:
     robot = ("--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml"))
     audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *robot, "--max-unknown", "1")
     bake = ("sdf-bake", str(folder / "splats.ply"), "--voxel", "0.1", "--no-report")
+    fine = ("sdf-bake", str(folder / "splats.ply"), "--voxel", "0.04", "--no-report", "--threads", "1")
     found = [
-        Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture"),
+        Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture", resumes=True),
         Task(name="export", arguments=("export", str(folder / "a.ply"), "--isotropic"), out="splats.ply"),
         Task(name="sdf-bake", arguments=bake, out="field"),
+        Task(name="sdf-bake, fine", arguments=fine, out="fine", resumes=True),
         Task(name="replay", arguments=audit, out="replay"),
     ]
     if "capture" in COMMANDS:
@@ -67,7 +74,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--only", nargs="+", help="names of commands")
     args = parser.parse_args(argv)
-    rows, faults = [], []
+    rows, resumed, faults = [], [], []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         FORMATS[".ply"].write(folder / "a.ply", gaussian_set(2000), {})
@@ -77,7 +84,13 @@ def run(argv: Sequence[str] | None = None) -> int:
                 rows.append([task.name, *row])
                 print("\t".join(map(str, rows[-1])), flush=True)
             faults += found
+            if task.resumes and (args.only is None or task.name in args.only):
+                row, found = kill_and_resume(task, folder, args.kills, random.Random(args.seed + 1))
+                resumed.append([task.name, *row])
+                print("\t".join(map(str, resumed[-1])), flush=True)
+                faults += found
     print("\n".join(table(["command", "seconds", "killed", "ended first", "left partial", "faults"], rows)))
+    print("\n".join(table(["command", "seconds", "kills", "went on", "of these twice", "differ"], resumed)))
     print("\n".join(faults))
     return 1 if faults else 0
 
@@ -111,6 +124,46 @@ def kill(
         if fault:
             faults.append(f"{task.name}, killed after {moment:.3f} s: {fault}")
     return [f"{seconds:.2f}", num - ended, ended, partial, len(faults)], faults
+
+
+def kill_and_resume(task: Task, folder: Path, num: int, moments: random.Random) -> tuple[list[object], list[str]]:
+    """Kill a task `num` times, each time anew, and go on; its row of the table and what was wrong."""
+    out, box = folder / task.out, folder / "box"
+    start = time.monotonic()
+    _wait(_start([*task.arguments, "-o", str(out), "--force"]), None)
+    seconds = time.monotonic() - start
+    whole = exact(out)
+    kills, went_on, twice, faults = 0, 0, 0, []
+    while kills < num:
+        shutil.rmtree(box, ignore_errors=True)
+        box.mkdir()
+        target = box / task.out
+        arguments = [*task.arguments, "-o", str(target)]
+        moment = moments.uniform(0.0, seconds)
+        if _wait(_start(arguments), moment):
+            continue
+        kills += 1
+        went_on += partial_path(target).exists()
+        if kills % 3 == 0 and not _wait(_start([*arguments, "--resume"]), moments.uniform(0.0, seconds)):
+            kills, twice = kills + 1, twice + 1
+        _wait(_start([*arguments, "--resume", "--force"]), None)
+        if exact(target) != whole or partial_path(target).exists():
+            faults.append(f"{task.name}, killed after {moment:.3f} s: goes on to other bytes")
+    return [f"{seconds:.2f}", kills, went_on, twice, len(faults)], faults
+
+
+def exact(path: Path) -> dict[str, object]:
+    """sha256 of each file of a folder, by name; of run.json what it says but for times and paths."""
+    found: dict[str, object] = {}
+    for file in sorted(p for p in path.rglob("*") if p.is_file()):
+        data, name = file.read_bytes(), str(file.relative_to(path))
+        if file.name == "run.json":
+            found[name] = {key: value for key, value in json.loads(data).items() if key not in _OWN}
+        elif file.name == "SHA256SUMS":
+            found[name] = [line for line in data.decode().splitlines() if not line.endswith("run.json")]
+        else:
+            found[name] = hashlib.sha256(data).hexdigest()
+    return found
 
 
 def judge(target: Path, whole: dict[str, str]) -> str:
