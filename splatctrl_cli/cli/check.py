@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
 from splatctrl_cli.cli.robot_options import add_lock, locked_joints
 from splatctrl_cli.cli.source_options import add_source, source_options
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.io.check_report import CheckReport
@@ -26,7 +26,13 @@ RANGE = (0.2, 6.0)  # [m] of depth that is compared between views
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
     parser = add_command(subparsers, "check", run, summary="say what is wrong with a log, capture or image folder")
-    parser.add_argument("source", type=Path, help="log, ROS 2 bag folder, capture, or .toml of an image folder")
+    parser.add_argument(
+        "source",
+        type=Path,
+        nargs="+",
+        help=".mcap, .bag, .db3, ROS 2 bag folder, capture, folder of a dataset, or .toml of an image folder;"
+        " several logs of one session are read as one",
+    )
     parser.add_argument(
         "--fail-on",
         choices=["error", "warning", "never"],
@@ -52,19 +58,18 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
     from splatctrl_cli.io.check_log import check_log
     from splatctrl_cli.io.check_source import check_source
+    from splatctrl_cli.io.source import open_logs
 
     if args.quick is not None and args.quick < 1:
         raise UsageError(f"--quick {args.quick}: expected 1 or more")
-    options, model, path = source_options(args), _robot(args), args.source
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder", remedy="check the path")
-    if path.suffix == ".toml" or (path.is_dir() and not is_bag_folder(path)):
-        report = check_source(path, options, model=model, num_images=args.quick)
+    options, model = source_options(args), _robot(args)
+    log = open_logs(args.source)
+    if log is None:
+        report = check_source(args.source[0], options, model=model, num_images=args.quick)
     else:
-        report = check_log(open_raw_log(path), options, model=model, num_images=args.quick)
+        report = check_log(log, options, model=model, num_images=args.quick)
     report = replace(report, findings=[*report.findings, *_agreement(report)])
     Console(args).result(report.as_dict(), list(_lines(report)))
     return _exit_code(report, args.fail_on)
@@ -128,7 +133,8 @@ def _agreement(report: "CheckReport") -> list["Finding"]:
 def _lines(report: "CheckReport") -> Iterator[str]:
     counts = report.counts
     span = f", {report.duration_s:.2f} s" if report.duration_s else ""
-    yield f"{report.path}: {report.kind}{span}, {report.num_messages} {report.unit}"
+    num = f", {report.num_messages} {report.unit}" if report.num_messages else ""
+    yield f"{report.path}: {report.kind}{span}{num}"
     yield ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in counts.items())
     for finding in report.sorted_findings:
         yield ""
@@ -143,22 +149,27 @@ def _lines(report: "CheckReport") -> Iterator[str]:
         yield ""
         yield from table(["topic", "messages", "hz", "longest gap s", "delay s"], [*map(_rate_row, rates)])
     if len(rates) < len(report.rates):
-        yield f"{len(report.rates) - len(rates)} topics that no command reads"
+        others = len(report.rates) - len(rates)
+        yield f"{others} topic{'' if others == 1 else 's'} that no command reads"
     yield ""
     yield from _needs(report)
 
 
 def _needs(report: "CheckReport") -> Iterator[str]:
-    """Commands that can start, then each thing that is lacking with the commands that lack it."""
+    """Commands that can start, those that errors keep from it, then what each lacks beside."""
     ready = [need.command for need in report.needs if not report.lacks(need)]
     if ready:
         yield f"can start: {', '.join(ready)}"
-    lacking: dict[str, list[str]] = {}
+    kept: dict[str, list[str]] = {}
     for need in report.needs:
-        for lack in report.lacks(need):
-            lacking.setdefault(lack, []).append(need.command)
-    for lack, commands in lacking.items():
-        yield from textwrap.wrap(f"missing for {', '.join(commands)}: {lack}", WIDTH, subsequent_indent="  ")
+        codes = dict.fromkeys(finding.code for finding in report.refusing(need))
+        if codes:
+            kept.setdefault(", ".join(f"[{code}]" for code in codes), []).append(need.command)
+    for why, commands in kept.items():
+        yield f"cannot start, or would be wrong: {', '.join(commands)}; see {why}"
+    for need in report.needs:
+        for lack in need.lacks:
+            yield from textwrap.wrap(f"missing for {need.command}: {lack}", WIDTH, subsequent_indent="  ")
 
 
 def _rate_row(rate: "Rate") -> list[object]:

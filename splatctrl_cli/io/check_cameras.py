@@ -9,11 +9,12 @@ import numpy as np
 from splatctrl_cli.io.decoder import CAMERA_INFO
 from splatctrl_cli.io.finding import Finding, error, note, warning
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
-from splatctrl_cli.io.registration import DISTORTION_MODELS
+from splatctrl_cli.io.registration import DISTORTION_MODELS, SAME_MODELS
 from splatctrl_cli.io.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.io.tf_tree import MAX_GAP_NS
 from splatctrl_cli.records import Float64, Intrinsics
 
+SAME_FACTOR = 0.1  # by which both factors of another size may differ
 CENTRE = 0.15  # of the image's size that a principal point may be off its middle
 RATIO = 0.05  # by which fx / fy may differ from 1
 FIELD_OF_VIEW = (20.0, 140.0)  # [deg], horizontal
@@ -23,23 +24,35 @@ JUMP_RATIO = 10.0  # times the median step
 NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
 
-def lens_findings(where: str, lens: Intrinsics) -> list[Finding]:
-    """Focal lengths and principal point against the image's size."""
+def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Finding]:
+    """Focal lengths and principal point against the image's size; source: what says them."""
     found: list[Finding] = []
+    says = f"{source}: " if source else ""
     remedy = "calibrate again, or give the CameraInfo of this very stream (a crop or another size has its own)"
-    for name, value, size in (("cx", lens.cx, lens.width), ("cy", lens.cy, lens.height)):
-        off = (value + 0.5) / size - 0.5
-        if abs(off) > CENTRE:
-            text = f"{name} = {value:.1f} px of {size}: {100 * abs(off):.0f} % off the middle of the image"
-            found.append(warning("principal-point", where, text, remedy, value=value, unit="px"))
+    off = [(c + 0.5) / size - 0.5 for c, size in ((lens.cx, lens.width), (lens.cy, lens.height))]
+    if max(map(abs, off)) > CENTRE:
+        worst = max(off, key=abs)
+        text = f"{says}cx, cy = {lens.cx:.1f}, {lens.cy:.1f} px of {lens.width}x{lens.height}"
+        text, make = f"{text}: {100 * abs(worst):.0f} % off the middle of the image", warning
+        times = [2 * (share + 0.5) for share in off]
+        if abs(times[0] / times[1] - 1) < SAME_FACTOR:
+            factor = float(np.mean(times))
+            size = f"{factor * lens.width:.0f}x{factor * lens.height:.0f}"
+            text, remedy = f"{text}, as if calibrated at about {size}", f"scale K by {1 / factor:.3g}, or {remedy}"
+            make = error
+        found.append(make("principal-point", where, text, remedy, value=round(100 * worst, 1), unit="%"))
     ratio = lens.fx / lens.fy
     if abs(ratio - 1) > RATIO:
-        text = f"fx / fy = {ratio:.3f} ({lens.fx:.1f}, {lens.fy:.1f} px): pixels are square in every RGB-D camera"
+        text = (
+            f"{says}fx / fy = {ratio:.3f} ({lens.fx:.1f}, {lens.fy:.1f} px): pixels are square in every RGB-D camera"
+        )
         found.append(warning("focal-ratio", where, text, remedy, value=ratio))
     angle = math.degrees(2 * math.atan(0.5 * lens.width / lens.fx))
     low, high = FIELD_OF_VIEW
     if not low <= angle <= high:
-        text = f"field of view {angle:.0f} deg (fx {lens.fx:.1f} of {lens.width} px): expected {low:g} to {high:g}"
+        text = (
+            f"{says}field of view {angle:.0f} deg (fx {lens.fx:.1f} of {lens.width} px): expected {low:g} to {high:g}"
+        )
         found.append(warning("field-of-view", where, text, remedy, value=angle, unit="deg"))
     return found
 
@@ -53,7 +66,8 @@ def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed
         if calibration is None:
             text = "K is zero: the camera was never calibrated"
             remedy = "calibrate it, or record the driver's factory values"
-            findings.append(warning("uncalibrated", name, text, remedy))
+            make = note if cameras and all(camera.info for camera in cameras) else warning
+            findings.append(make("uncalibrated", name, text, remedy))
             continue
         if name in changed:
             text = "the CameraInfo changes within the log; the first is used for all frames"
@@ -68,7 +82,7 @@ def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed
 
 
 def _distortion(name: str, calibration: Calibration) -> list[Finding]:
-    d, model = calibration.distortion, calibration.distortion_model
+    d, model = calibration.distortion, SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
     if not np.any(np.abs(d) > 1e-9):
         return []
     if model not in DISTORTION_MODELS:

@@ -17,11 +17,12 @@ class Need:
 
 
 _LATER = ("reconstruct", "score", "replay")
-BLOCKED = {  # commands that refuse a recording with an error of this code
-    "agreement": _LATER,
-    "pose-jump": _LATER,
-    **dict.fromkeys(["depth-scale", "camera-info-size", "refused"], ("ingest", *_LATER)),
-    "joints-degrees": ("replay",),
+_ALL = ("ingest", *_LATER)
+BLOCKED = {  # commands that refuse a recording with an error of this code, or whose result would be wrong
+    **dict.fromkeys(["agreement", "pose-jump", "views-scale", "depth-empty", "alignment", "principal-point"], _LATER),
+    **dict.fromkeys(["missing", "refused", "pairing", "pose-missing", "undecodable"], _ALL),
+    **dict.fromkeys(["depth-scale", "camera-info-size", "distortion", "stamp-zero", "tf-roots"], _ALL),
+    **dict.fromkeys(["joints", "joints-degrees", "end-effector"], ("replay",)),
 }
 
 
@@ -53,12 +54,12 @@ class CheckReport:
 
     def lacks(self, need: Need) -> tuple[str, ...]:
         """What keeps a command from this recording, the errors among the findings included."""
-        refused = [
-            f"{f.where}: {f.code}; {f.remedy}"
-            for f in self.findings
-            if f.severity is Severity.ERROR and need.command in BLOCKED.get(f.code, ())
-        ]
-        return tuple(dict.fromkeys([*need.lacks, *refused]))
+        return (*need.lacks, *(f"{f.where}: {f.what} [{f.code}]" for f in self.refusing(need)))
+
+    def refusing(self, need: Need) -> list[Finding]:
+        """The errors among the findings that keep a command from this recording."""
+        errors = [f for f in self.sorted_findings if f.severity is Severity.ERROR]
+        return [f for f in errors if need.command in BLOCKED.get(f.code, ())]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -98,17 +99,20 @@ class CheckReport:
         }
 
 
-def needs(
-    *, lacks: Sequence[str], num_cameras: int, num_frames: int, has_joints: bool, states_lack: str
-) -> list[Need]:
-    """One line for each later command. lacks: what a reconstruction would; states_lack: why there are no states."""
-    scoring = list(lacks)
-    if not scoring and num_cameras < 2 and num_frames < 3:
-        scoring = ["one camera and less than three frames: nothing can be held out; record more views"]
-    driving = [] if has_joints else [states_lack]
+def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
+    """One for each later command, errors among the findings apart. states_lack: why there are no joint states."""
+    scoring: tuple[str, ...] = ()
+    if num_cameras == 1 and 0 < num_frames < 3:
+        scoring = ("one camera and less than three frames: nothing can be held out; record more views",)
     return [
-        Need(command="ingest", lacks=tuple(lacks)),
-        Need(command="reconstruct", lacks=tuple(lacks)),
-        Need(command="score", lacks=tuple(scoring)),
-        Need(command="replay", lacks=tuple([*lacks, *driving] if lacks else driving)),
+        Need(command="ingest", lacks=()),
+        Need(command="reconstruct", lacks=()),
+        Need(command="score", lacks=scoring),
+        Need(command="replay", lacks=(states_lack,) if states_lack else ()),
     ]
+
+
+def usable_frames(frames: Sequence[RgbdFrame], findings: Sequence[Finding]) -> list[RgbdFrame]:
+    """The frames of cameras whose own lens and depth are right: of others a comparison would blame the pose."""
+    wrong = {f.where for f in findings if f.severity is Severity.ERROR and f.code in {"alignment", "principal-point"}}
+    return [frame for frame in frames if f"camera {frame.camera}" not in wrong]

@@ -1,24 +1,26 @@
 """Everything that is wrong with a capture or an image folder, from one pass over its frames."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.capture import is_capture
-from splatctrl_cli.io.check_arm import arm_agreement, arm_findings
+from splatctrl_cli.io.check_alignment import alignment_findings
 from splatctrl_cli.io.check_cameras import lens_findings, pose_findings
-from splatctrl_cli.io.check_images import ImageWatch, KeptDepth, depth_findings, strided_lens
-from splatctrl_cli.io.check_report import CheckReport, needs
+from splatctrl_cli.io.check_images import ImageWatch, depth_findings, sample_findings, strided_lens
+from splatctrl_cli.io.check_report import CheckReport, needs, usable_frames
+from splatctrl_cli.io.check_robot import motion_findings
 from splatctrl_cli.io.check_states import robot_findings
 from splatctrl_cli.io.check_times import TimesWatch, time_findings
+from splatctrl_cli.io.check_views import check_views
 from splatctrl_cli.io.finding import Finding, error, note, warning
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.shot import Shot, ShotSource
 from splatctrl_cli.io.source import open_source
+from splatctrl_cli.io.state_columns import StateCollector, StateColumns
 from splatctrl_cli.io.state_motion import ImageMotion
-from splatctrl_cli.io.state_offset import RobotPoints, estimate_clock_offset
 from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 
@@ -33,23 +35,42 @@ _LOST = {
 class _CameraWatch:
     """What is kept of one camera's frames."""
 
-    def __init__(self, lens: Intrinsics, where: str, scale: float | None) -> None:
-        self.lens, self.images, self.times = lens, ImageWatch(where, scale), TimesWatch(where, has_stamps=False)
+    def __init__(self, lens: Intrinsics, where: str, unit: float | None) -> None:
+        self.lens, self.unit = lens, unit
+        self.images, self.colors = ImageWatch(where, unit), ImageWatch(where)
+        self.times = TimesWatch(where, has_stamps=False)
         self.stamps: list[int] = []
         self.poses: list[Float64] = []
 
-    def add(self, frame: RgbdFrame, unit: float | None) -> None:
-        self.times.add(frame.stamp_ns, frame.stamp_ns)
-        self.stamps.append(frame.stamp_ns)
-        self.poses.append(frame.T_world_camera)
-        encoding = "32FC1" if unit is None else "16UC1"
-        self.images.scale = unit if unit is not None else self.images.scale
-        self.images.add_depth(frame.stamp_ns, frame.depth, encoding)
+    def add(self, shot: Shot, motion: ImageMotion) -> None:
+        """Take a frame; its images are decoded where they are wanted."""
+        self.times.add(shot.stamp_ns, shot.stamp_ns)
+        self.stamps.append(shot.stamp_ns)
+        self.poses.append(shot.T_world_camera)
+        encoding = "32FC1" if shot.depth_unit is None else "16UC1"
+        if self.images.is_wanted():
+            self.images.add_depth(shot.stamp_ns, shot.depth, encoding)
+            self.colors.add_color(shot.stamp_ns, shot.color, "rgb8")
+            motion.add(shot.frame)
+        else:
+            self.images.add_undecoded(encoding, self.lens.width, self.lens.height)
 
-    def posed(self) -> list[tuple[KeptDepth, Float64]]:
-        """The kept depth images with their poses."""
-        by_stamp = dict(zip(self.stamps, self.poses, strict=True))
-        return [(kept, by_stamp[kept.stamp_ns]) for kept in self.images.kept]
+    def frames(self, camera: str) -> list[RgbdFrame]:
+        """The kept images with their poses; by number, for views of a folder may have no clock."""
+        poses = dict(zip(self.stamps, self.poses, strict=True))
+        pairs = [(d, c) for d, c in zip(self.images.kept, self.colors.kept, strict=True)]
+        return [
+            RgbdFrame(
+                stamp_ns=depth.stamp_ns,
+                camera=camera,
+                color=color.color if color.color is not None else np.zeros((*depth.depth.shape, 3), np.uint8),
+                depth=depth.depth,
+                intrinsics=strided_lens(self.lens, depth.stride),
+                T_world_camera=poses[depth.stamp_ns],
+            )
+            for depth, color in pairs
+            if depth.depth is not None
+        ]
 
 
 def check_source(
@@ -60,16 +81,16 @@ def check_source(
     try:
         source = open_source(path, options)
     except InputError as wrong:
-        return _refused(path, kind, wrong)
+        return _refused(path, kind if path.is_file() or is_capture(path) else "folder", wrong)
     cameras: dict[str, _CameraWatch] = {}
-    states: list[JointState] = []
+    states = StateCollector(len(source.joint_names))
     motion = ImageMotion()
     findings: list[Finding] = []
     is_whole = True
     try:
         for item in source.shots():
             if isinstance(item, JointState):
-                states.append(item)
+                states.add(item)
                 continue
             is_whole = _take(item, cameras, motion, num_images)
             if not is_whole:
@@ -79,19 +100,29 @@ def check_source(
     findings += _losses(source, path.name)
     for name, camera in sorted(cameras.items()):
         findings += _camera_findings(f"camera {name}", camera, has_clock=source.has_clock)
-    findings += _robot(source, cameras, states, motion, model)
+    findings += sample_findings([camera.images for _, camera in sorted(cameras.items())])
+    frames = [frame for name, camera in sorted(cameras.items()) for frame in camera.frames(name)]
+    findings += alignment_findings(frames)
+    frames = usable_frames(frames, findings)
+    views = check_views(frames, {name: camera.unit for name, camera in sorted(cameras.items())})
+    findings += views.findings
+    columns = states.columns()
+    states_lack = "" if len(columns) else "no joint states; give them apart (docs/replay.md, Logs)"
+    if len(columns) and source.has_clock:
+        states_lack, of_robot = _robot(source, views.corrected, columns, motion, model)
+        findings += of_robot
+    if not cameras and not any(finding.code == "refused" for finding in findings):
+        findings.append(error("missing", path.name, "no frame could be read", "copy or record it again"))
     if not is_whole:
         findings.append(note("quick", path.name, f"only the first {num_images} frames of a camera were read"))
-    return _report(path, kind, source, cameras, states, findings)
+    return _report(path, kind, source, cameras, len(columns), views.scaled, findings, states_lack)
 
 
 def _take(shot: Shot, cameras: dict[str, _CameraWatch], motion: ImageMotion, num_images: int | None) -> bool:
     """Watch a frame; False where it was the last that is wanted."""
-    frame = shot.frame
-    where = f"camera {frame.camera}"
-    camera = cameras.setdefault(frame.camera, _CameraWatch(frame.intrinsics, where, shot.depth_unit))
-    camera.add(frame, shot.depth_unit)
-    motion.add(frame)
+    where = f"camera {shot.camera}"
+    camera = cameras.setdefault(shot.camera, _CameraWatch(shot.intrinsics, where, shot.depth_unit))
+    camera.add(shot, motion)
     return len(camera.stamps) != num_images
 
 
@@ -102,8 +133,8 @@ def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
         duration_s=0.0,
         num_messages=0,
         start_ns=None,
-        findings=[error("refused", path.name, wrong.message, wrong.remedy)],
-        needs=needs(lacks=[str(wrong)], num_cameras=0, num_frames=0, has_joints=False, states_lack="no joint states"),
+        findings=[error("refused", path.name, wrong.message.removeprefix(f"{path}: "), wrong.remedy)],
+        needs=needs(num_cameras=0, num_frames=0, states_lack=""),
     )
 
 
@@ -133,28 +164,22 @@ def _camera_findings(where: str, camera: _CameraWatch, *, has_clock: bool) -> li
 
 def _robot(
     source: ShotSource,
-    cameras: dict[str, _CameraWatch],
-    states: list[JointState],
+    frames: Sequence[RgbdFrame],
+    states: StateColumns,
     motion: ImageMotion,
     model: RobotModel | None,
-) -> list[Finding]:
-    if not states or not source.has_clock:
-        return []
-    robot, findings = None, []
-    if model is not None and set(model.joint_names) <= set(source.joint_names):
-        order = model.joint_order(source.joint_names)
-        states = [replace(s, position=s.position[order], velocity=s.velocity[order]) for s in states]
-        findings = robot_findings(model, states, "joint states")
-        centers = np.array([model.sphere_centers(state.position) for state in states])
-        robot = RobotPoints(centers=centers, radii=model.sphere_set.radii)
-        stamps = np.array([state.stamp_ns for state in states], dtype=np.int64)
-        for name, camera in sorted(cameras.items()):
-            agreement = arm_agreement(model, camera.lens, camera.posed(), states, stamps)
-            findings += [] if agreement is None else arm_findings(f"camera {name}", agreement)
-    if motion.cameras:
-        offset = estimate_clock_offset(states, motion, robot)
-        findings.append(note("robot-clock", "joint states", offset.sentence))
-    return findings
+) -> tuple[str, list[Finding]]:
+    """What `replay` lacks, and what is wrong with the joint states."""
+    if model is None:
+        return "", motion_findings(frames, motion, states, None)
+    absent = [name for name in model.joint_names if name not in source.joint_names]
+    if absent:
+        text = f"the robot's joints {', '.join(absent)} are in no joint state"
+        remedy = "give this robot's URDF, or hold them still with --lock"
+        return f"{text}; {remedy}", [error("joints", "joint states", text, remedy)]
+    states = states.of_joints(np.asarray(model.joint_order(source.joint_names), dtype=np.int64))
+    found = robot_findings(model, states, "joint states")
+    return "", [*found, *motion_findings(frames, motion, states, model)]
 
 
 def _report(
@@ -162,36 +187,24 @@ def _report(
     kind: str,
     source: ShotSource,
     cameras: dict[str, _CameraWatch],
-    states: list[JointState],
+    num_states: int,
+    frames: Sequence[RgbdFrame],
     findings: list[Finding],
+    states_lack: str,
 ) -> CheckReport:
     stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
-    frames = [
-        RgbdFrame(
-            stamp_ns=kept.stamp_ns,
-            camera=name,
-            color=np.zeros((*kept.depth.shape, 3), np.uint8),
-            depth=kept.depth,
-            intrinsics=strided_lens(camera.lens, kept),
-            T_world_camera=T,
-        )
-        for name, camera in sorted(cameras.items())
-        for kept, T in camera.posed()
-    ]
     return CheckReport(
         path=str(path),
         kind=kind,
         duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
-        num_messages=len(stamps) + len(states),
+        num_messages=len(stamps) + num_states,
         start_ns=min(stamps, default=None) if source.has_clock else None,
         findings=findings,
         rates=[camera.times.rate(is_read=True) for _, camera in sorted(cameras.items())] if source.has_clock else [],
         needs=needs(
-            lacks=[] if stamps else ["no frame could be read; see the findings"],
             num_cameras=len(cameras),
             num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
-            has_joints=bool(states),
-            states_lack="no joint states; give them apart (docs/replay.md, Logs)",
+            states_lack=states_lack,
         ),
         frames=frames,
     )

@@ -7,15 +7,52 @@ import numpy as np
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.finding import Finding, error, note, warning
 from splatctrl_cli.io.joint_log import JointStream
+from splatctrl_cli.io.joints import joint_records
+from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.rows import blocks_of
 from splatctrl_cli.io.state_check import PoseVerdict, check_angles, pose_agreement
-from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.io.state_columns import StateColumns
+from splatctrl_cli.io.state_messages import STATE_TYPES
+from splatctrl_cli.io.survey import Survey
+from splatctrl_cli.records import Float64, JointState, LossReport
 from splatctrl_cli.robot.model import RobotModel
 
 TURN = 2 * np.pi
 DEGREES = 3.0 * TURN  # that no joint of an arm turns to, in radians
 MOVING = 1e-3  # [rad or m] of all motion under which nothing moves
 LIMIT_SLACK = 0.01  # [rad or m]
+
+
+def log_states(
+    found: Survey, options: SourceOptions, model: RobotModel | None
+) -> tuple[StateColumns | None, str, list[Finding]]:
+    """The joint states (in the model's order where there is one), why there are none, and what is wrong with them."""
+    findings: list[Finding] = []
+    for topic in found.of_type(*STATE_TYPES):
+        if options.joint_topic in (None, topic.topic.name):
+            for stream in topic.joints.streams:
+                findings += stream_findings(topic.topic.name, stream)
+    loss = LossReport()
+    wanted = None if model is None else model.joint_names
+    try:
+        names, states = joint_records(found, options, loss, wanted)
+    except InputError as wrong:
+        return None, str(wrong), [*findings, error("joints", "joint states", wrong.message, wrong.remedy)]
+    findings += [note("joints", "joint states", text) for text in loss.notes]
+    if not len(states):
+        lack = "no joint states; record /joint_states, or give the states apart (docs/replay.md, Logs)"
+        return None, lack, findings
+    if model is None:
+        return states, "", findings
+    absent = [name for name in model.joint_names if name not in names]
+    if absent:
+        text = f"the robot's joints {', '.join(absent)} are in no joint state"
+        remedy = "give this robot's URDF, or hold them still with --lock"
+        return None, f"{text}; {remedy}", [*findings, error("joints", "joint states", text, remedy)]
+    states = states.of_joints(np.asarray(model.joint_order(names), dtype=np.int64))
+    is_said = any(f.code == "joints-degrees" for f in findings)
+    of_robot = robot_findings(model, states, "joint states")
+    return states, "", [*findings, *(f for f in of_robot if not (is_said and f.code == "joints-degrees"))]
 
 
 def stream_findings(where: str, stream: JointStream) -> list[Finding]:

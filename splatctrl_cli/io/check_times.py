@@ -1,7 +1,9 @@
 """When the messages of a topic came: rate, gaps, stamps that repeat or go back, header stamps against log times."""
 
 import heapq
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,7 +18,12 @@ REGULAR = 2.0  # times the median that nine of ten intervals must stay under for
 AHEAD = 0.020  # [s] that a stamp may be after its log time
 DELAYED = 1.0  # [s] from stamp to log that no driver takes
 APART = 0.2  # [s] between the delays of two topics
+PEERS = 0.060  # [s] between the delays of one kind of images of several cameras
 DRIFT = 0.020  # [s] over the log
+TOGETHER = 0.8  # of the shorter of two pauses that both share
+ENDS = 1.0  # [s] before the last image; or after the first of all topics, before the last
+MUCH = 0.1  # of the log
+FILES_APART = 60.0  # [s]
 _NS = 1e-9
 
 
@@ -126,15 +133,18 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
     found: list[Finding] = []
     where = times.topic
     if times.num_zero:
-        share = f"{times.num_zero} of {times.count}"
-        remedy = "let the driver stamp them; without stamps nothing can be paired or placed"
-        found.append(error("stamp-zero", where, f"{share} header stamps are 0", remedy, value=times.num_zero))
-        return found
+        text = f"{times.num_zero} of {times.count} header stamps are 0"
+        remedy = "give --stamps log to take the times of logging, and let the driver stamp the next recording"
+        make = error if times.num_zero == times.count and what != "states" else warning
+        if what == "states":
+            text = f"{text}; the times of logging are taken where all are"
+        return [make("stamp-zero", where, text, remedy, value=times.num_zero)]
     gaps = times.gaps()
     if gaps and times.median_interval is not None:
         longest, at = max(gaps)
         lost = sum(round(interval / times.median_interval) - 1 for interval, _ in gaps)
-        text = f"{len(gaps)} gaps, the longest {longest:.3g} s; about {lost} {what} are missing"
+        gaps_of = f"a gap of {longest:.3g} s" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest {longest:.3g} s"
+        text = f"{gaps_of}; about {lost} {what} are missing"
         remedy = "record fewer topics or to a faster disk; what moved meanwhile is unknown"
         found.append(warning("gap", where, text, remedy, value=longest, unit="s", stamp_ns=at))
     if times.num_duplicates:
@@ -148,6 +158,98 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
         first = times.first_back_ns
         figure = {"value": times.furthest_back, "unit": "s", "stamp_ns": first}
         found.append(warning("stamp-back", where, text, remedy, **figure))
+    return found
+
+
+def joined_gaps(findings: list[Finding]) -> list[Finding]:
+    """With one finding for all topics and transforms that pause together."""
+    kept = [f for f in findings if f.code not in {"gap", "tf-gap"}]
+    groups: list[list[Finding]] = []
+    for finding in (f for f in findings if f.code in {"gap", "tf-gap"}):
+        group = next((g for g in groups if _overlap(g[0], finding)), None)
+        if group is None:
+            groups.append([finding])
+        else:
+            group.append(finding)
+    return [*(group[0] if len(group) == 1 else _joined(group) for group in groups), *kept]
+
+
+def _overlap(a: Finding, b: Finding) -> bool:
+    """Whether the longest pauses of two topics are the same."""
+    (a0, a1), (b0, b1) = (((f.stamp_ns or 0) * _NS, (f.stamp_ns or 0) * _NS + (f.value or 0.0)) for f in (a, b))
+    return min(a1, b1) - max(a0, b0) > TOGETHER * min(a1 - a0, b1 - b0)
+
+
+def _joined(group: list[Finding]) -> Finding:
+    worst = max(group, key=lambda f: f.value or 0.0)
+    names = [f.where for f in group]
+    where = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return replace(worst, where=where, what=f"{len(names)} pause together; of {worst.where}: {worst.what}")
+
+
+def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
+    """Files of one recording that were logged far apart; spans: first and last log time [ns] by file."""
+    ordered = sorted((span, name) for name, span in spans.items() if name)
+    found = []
+    for (before, name), (after, other) in pairwise(ordered):
+        pause = (after[0] - before[1]) * _NS
+        if pause > FILES_APART:
+            text = f"between {name} and {other} nothing was logged for {pause:.4g} s"
+            remedy = "are they one recording? if not, give each alone"
+            found.append(warning("files-apart", "files", text, remedy, value=pause, unit="s", stamp_ns=before[1]))
+    return found
+
+
+def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
+    """Moving transforms that end long before the last image."""
+    ended = [
+        e for e in edges if e.count > 2 and (last_ns - e.last_ns) * _NS > max(ENDS, 3 * (e.median_interval or 0))
+    ]
+    if not ended:
+        return []
+    first = min(ended, key=lambda edge: edge.last_ns)
+    early = (last_ns - first.last_ns) * _NS
+    more = f" and {len(ended) - 1} more" if len(ended) > 1 else ""
+    text = f"ends {early:.3g} s before the last image: what hangs below has no pose from then on"
+    remedy = "record /tf to the end; if it stands still, publish it on /tf_static or give --camera-pose"
+    return [warning("tf-ends", f"{first.topic}{more}", text, remedy, value=early, unit="s", stamp_ns=first.last_ns)]
+
+
+def part_findings(topics: list[TimesWatch]) -> list[Finding]:
+    """Topics that begin long after the others, or end long before them."""
+    several = [t for t in topics if t.count > 2 and t.median_interval is not None]
+    found = []
+    first, last = (min((t.first_ns for t in several), default=0), max((t.last_ns for t in several), default=0))
+    for times in several:
+        least = max(ENDS, 3 * (times.median_interval or 0.0))
+        begins, ends = (times.first_ns - first) * _NS, (last - times.last_ns) * _NS
+        for seconds, words, at in ((begins, "begins", times.first_ns), (ends, "ends", times.last_ns)):
+            if seconds > least:
+                side = "after the first" if words == "begins" else "before the last"
+                text = f"{words} {seconds:.3g} s {side} of the other topics"
+                make = warning if seconds > MUCH * (last - first) * _NS else note
+                remedy = "start and stop all drivers with the recorder, or cut the log there"
+                found.append(make("part", times.topic, text, remedy, value=seconds, unit="s", stamp_ns=at))
+    return found
+
+
+def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
+    """Topics of one kind of different cameras: one whose stamps are otherwise against the log than all others'."""
+    stamped = [t for t in topics if t.delay is not None and t.count > 1]
+    if len(stamped) < 3:
+        return []
+    found = []
+    for times in stamped:
+        own = times.delays[:, 1]
+        others = np.array([t.delay for t in stamped if t is not times], dtype=np.float64)
+        apart = float(np.median(own) - np.median(others))
+        spread = float(np.median(np.abs(own - np.median(own))))
+        if abs(apart) > max(PEERS, 5 * spread, 3 * float(np.ptp(others))) and abs(apart) <= APART:
+            text = f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
+            text = f"{text} cameras' images, as logged"
+            remedy = "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves"
+            figure = {"value": round(1e3 * apart, 1), "unit": "ms", "stamp_ns": times.first_ns}
+            found.append(warning("clock-offset", times.topic, text, remedy, **figure))
     return found
 
 

@@ -17,6 +17,7 @@ from splatctrl_cli.io.decoder import (
     stamp_ns,
 )
 from splatctrl_cli.io.messages import color_of, depth_of, num_invalid, read_image
+from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
 
 _HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu")
@@ -24,18 +25,20 @@ _FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
 
 
 class LogWatch:
-    """A log whose messages are looked at while somebody else reads them; images are decoded here, once each.
+    """A log whose messages are looked at while somebody else reads them; images are decoded here, as far as needed.
 
-    num_images: reading ends once a topic has had as many images.
+    num_images: reading ends once a topic has had as many images. files: first and last log time by file.
     """
 
-    def __init__(self, log: RawLog, scale: float | None, num_images: int | None = None) -> None:
-        self._log, self._scale, self._num_images = log, scale, num_images
+    def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:
+        self._log, self._scale, self._num_images = log, options.depth_scale, num_images
+        self._by_log_time = options.stamps == "log"
         self.path, self.files, self.container = log.path, log.files, log.container
         self.times: dict[str, TimesWatch] = {}
         self.transforms: dict[str, TimesWatch] = {}
         self.images: dict[str, ImageWatch] = {}
         self.changed_infos: dict[str, int] = {}
+        self.spans: dict[str, tuple[int, int]] = {}
         self.is_whole = True
         self._infos: dict[str, tuple[object, ...]] = {}
         self._decoder = MessageDecoder()
@@ -61,9 +64,10 @@ class LogWatch:
                 return
 
     def _take(self, message: RawMessage) -> None:
-        topic, name = message.topic, message.topic.name
-        has_stamps = self._is_headed(topic)
-        stamp = message.log_time_ns
+        topic, name, stamp = message.topic, message.topic.name, message.log_time_ns
+        first, last = self.spans.get(message.file, (stamp, stamp))
+        self.spans[message.file] = min(first, stamp), max(last, stamp)
+        has_stamps = not self._by_log_time and self._is_headed(topic)
         if has_stamps:
             try:
                 stamp = header_stamp_ns(message)
@@ -97,18 +101,17 @@ class LogWatch:
     def _image(self, message: RawMessage, stamp: int) -> None:
         name = message.topic.name
         images = self.images.setdefault(name, ImageWatch(name, self._scale))
+        is_wanted = images.is_wanted()
         try:
-            image = read_image(self._decoder.decode(message), message.topic.type_name)
+            image = read_image(self._decoder.decode(message), message.topic.type_name, lazily=True)
+            if is_wanted and image.kind == "depth":
+                images.add_depth(stamp, depth_of(image, self._scale), image.encoding, num_invalid(image.pixels))
+            elif is_wanted and image.kind == "color":
+                images.add_color(stamp, color_of(image), image.encoding)
+            else:
+                images.add_undecoded(image.encoding, image.width, image.height)
         except (UndecodableMessageError, ValueError) as reason:
             images.add_bad(stamp, str(reason))
-            return
-        if image.kind == "depth":
-            depth = depth_of(image, self._scale)
-            images.add_depth(stamp, depth, image.encoding, num_invalid(image.pixels))
-        elif image.kind == "color":
-            images.add_color(stamp, color_of(image), image.encoding)
-        else:
-            images.add_other(image.encoding, image.width, image.height)
 
     def _info(self, message: RawMessage, stamp: int) -> None:
         info = self._decoder.decode(message)
@@ -123,4 +126,5 @@ class LogWatch:
             edge = f"tf {item.header.frame_id.strip('/')} -> {child}"
             if child not in self.transforms:
                 self.transforms[child] = TimesWatch(edge, has_stamps=True)
-            self.transforms[child].add(stamp_ns(item.header), message.log_time_ns)
+            stamp = message.log_time_ns if self._by_log_time else stamp_ns(item.header)
+            self.transforms[child].add(stamp, message.log_time_ns)

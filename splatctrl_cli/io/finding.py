@@ -1,6 +1,6 @@
 """What `check` says about a recording, one finding at a time, and what it keeps of a long one."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Generic, TypeVar
@@ -67,7 +67,7 @@ def _finding(
         where=where,
         what=what,
         remedy=remedy,
-        value=None if value is None else float(str(value)),
+        value=None if value is None else round(float(str(value)), 6),
         unit=str(unit),
         stamp_ns=None if stamp_ns is None else int(str(stamp_ns)),
     )
@@ -97,6 +97,10 @@ class Thinned(Generic[T]):
         if len(self._kept) > self._limit:
             self._kept = self._kept[::2]
             self._step *= 2
+
+    def change(self, by: Callable[[T], T]) -> None:
+        """Put something else in the place of each value."""
+        self._kept = [by(value) for value in self._kept]
 
     def __iter__(self) -> Iterator[T]:
         return iter(self._kept)

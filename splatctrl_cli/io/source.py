@@ -8,12 +8,13 @@ from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.io.capture import CaptureSource, is_capture
 from splatctrl_cli.io.layouts import open_layout
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
+from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig_folder import open_image_folder
 from splatctrl_cli.io.ros_log import RosLogSource
 from splatctrl_cli.io.session_log import SessionLog
 from splatctrl_cli.io.shot import ShotSource
 
-__all__ = ["CameraTopics", "SourceOptions", "open_session", "open_source"]
+__all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
 
 
 def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
@@ -39,11 +40,21 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
 
     Raises InputError as `open_source`, and where one of several is no log.
     """
-    if len(paths) == 1:
-        return open_source(paths[0], options)
+    log = open_logs(paths)
+    return open_source(paths[0], options) if log is None else RosLogSource(log, options or SourceOptions())
+
+
+def open_logs(paths: Sequence[Path]) -> RawLog | None:
+    """A log, or several of one session as one; None where there is one path, and it is no log.
+
+    Raises InputError where there is nothing, and where one of several is no log.
+    """
     for path in paths:
         if not path.exists():
             raise InputError(f"{path}: no such file or folder", remedy="check the path")
         if path.suffix == ".toml" or is_capture(path) or (path.is_dir() and not is_bag_folder(path)):
+            if len(paths) == 1:
+                return None
             raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")
-    return RosLogSource(SessionLog(tuple(open_raw_log(path) for path in paths)), options or SourceOptions())
+    logs = tuple(open_raw_log(path) for path in paths)
+    return logs[0] if len(logs) == 1 else SessionLog(logs)
