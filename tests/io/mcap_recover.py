@@ -4,8 +4,8 @@
 go/cli/mcap/utils/rebuild_info.go, as published (commit 6dfb6290 and later). It walks over the records and stops at
 the first that cannot be where it stands. By default chunks are copied as they are: their messages are counted by the
 message indexes behind them, and a chunk is unpacked only where a channel is new or it is the last. With
---always-decode-chunk each chunk is unpacked and its checksum compared; one that differs is left out, one that does not
-unpack ends the run.
+--always-decode-chunk each chunk is unpacked and its checksum compared; one that differs is left out, one that does
+not unpack ends the run.
 """
 
 import struct
