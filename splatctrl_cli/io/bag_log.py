@@ -92,6 +92,17 @@ def _open_folder(path: Path) -> RawLog:
     return UnpackedMessagesLog(log) if is_by_message else log
 
 
+def told_formats(path: Path) -> set[str]:
+    """The serialization formats that a bag folder's metadata.yaml names; none for anything else."""
+    if not path.is_dir():
+        return set()
+    try:
+        topics = _metadata(path)[0].get("topics_with_message_count") or ()
+        return {str(topic["topic_metadata"]["serialization_format"]) for topic in topics}
+    except (KeyError, TypeError):
+        return set()
+
+
 def _begins_compressed(parts: tuple[RawLog, ...]) -> bool:
     """Whether the first message is a zstd frame: CDR begins with its own four bytes, of which the first is 0."""
     first = next((message for part in parts for message in part.messages(Damage())), None)

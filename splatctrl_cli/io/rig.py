@@ -7,12 +7,13 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.io.cameras import find_cameras, find_info, image_topics, is_registered
-from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, is_ros
+from splatctrl_cli.io.cameras import find_cameras, find_info, is_registered
+from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from splatctrl_cli.io.lacking import listed, no_camera
 from splatctrl_cli.io.masks import check_mask_topics
 from splatctrl_cli.io.options import CameraTopics, SourceOptions
 from splatctrl_cli.io.pose_topics import join_pose_topics, pose_topics
-from splatctrl_cli.io.raw_log import RawLog, Topic
+from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
 from splatctrl_cli.io.survey import Calibration, Survey
 from splatctrl_cli.io.tf_tree import TfTree
@@ -48,7 +49,7 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
     """Every camera to be read, complete. Raises InputError naming the camera, the topic and what it lacks."""
     found = camera_topics(log, survey, options)
     if not found:
-        raise _no_camera(log, survey)
+        raise no_camera(log, survey)
     known = {camera.name: camera for camera in found}
     names = tuple(known) if options.cameras is None else options.cameras
     for name in (*names, *options.camera_poses, *options.camera_pose_topics, *options.intrinsics):
@@ -81,7 +82,7 @@ def missing(log: RawLog, survey: Survey, options: SourceOptions) -> list[str]:
     """What a reconstruction from this log would lack, in words; empty where nothing."""
     found = camera_topics(log, survey, options)
     if not found:
-        lacks = [str(_no_camera(log, survey)).removeprefix(f"{log.path}: ")]
+        lacks = [str(no_camera(log, survey)).removeprefix(f"{log.path}: ")]
         if not survey.of_type(CAMERA_INFO):
             lacks.append("no CameraInfo topic; record the colour camera's camera_info")
         return lacks if survey.tf.frames else [*lacks, "no tf (/tf, /tf_static); record it, or give --camera-pose"]
@@ -213,7 +214,7 @@ class _Builder:
             there = [t.topic.name for t in self._survey.of_type(CAMERA_INFO)]
             raise InputError(
                 f"{self._where}: topic {image_topic} has no usable CameraInfo",
-                remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {_listed(there)};"
+                remedy=f"record its camera_info, name it with --camera; CameraInfo topics there: {listed(there)};"
                 f" or give --intrinsics {self._topics.name}=FX,FY,CX,CY",
             )
         image = self._survey.topics[image_topic].first_image
@@ -265,13 +266,13 @@ class _Builder:
         world = self._options.world_frame or tf.root_of(frame_id)
         if world not in tf.frames and tf.frames and self._options.world_frame:
             raise InputError(
-                f"{self._where}: tf has no frame {world!r}", remedy=f"--world-frame: use one of {_listed(tf.frames)}"
+                f"{self._where}: tf has no frame {world!r}", remedy=f"--world-frame: use one of {listed(tf.frames)}"
             )
         if frame_id not in tf.frames or not tf.connects(world, frame_id):
             target = f" in {world!r}" if world != frame_id else ""
             raise InputError(
                 f"{self._where}: no tf for frame {frame_id!r} of topic {self._topics.color}{target};"
-                f" frames tf knows: {_listed(tf.frames)}",
+                f" frames tf knows: {listed(tf.frames)}",
                 remedy=f"record /tf and /tf_static, or give --camera-pose {self._topics.name}=x,y,z,qx,qy,qz,qw"
                 f"{self._instead()}",
             )
@@ -280,7 +281,7 @@ class _Builder:
     def _instead(self) -> str:
         """What else could place the camera, in words; empty where nothing."""
         topics = pose_topics(self._survey)
-        return f", or NAME=TOPIC[@FRAME] of a pose topic ({_listed(topics)})" if topics else ""
+        return f", or NAME=TOPIC[@FRAME] of a pose topic ({listed(topics)})" if topics else ""
 
     def _undistortion(self, calibration: Calibration, info: str) -> Undistortion | None:
         if not np.any(np.abs(calibration.distortion) > 1e-9):
@@ -320,7 +321,7 @@ class _Builder:
         if T_color_depth is None:
             raise InputError(
                 f"{what}, and tf does not join their frames {frame!r} and {color_frame!r};"
-                f" frames tf knows: {_listed(tf.frames)}",
+                f" frames tf knows: {listed(tf.frames)}",
                 remedy=f"record /tf_static, or {remedy}",
             )
         return DepthToColor(
@@ -340,7 +341,7 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
             if topic not in images:
                 raise InputError(
                     f"{log.path}: --camera {given.name}: no {kind} images on topic {topic}",
-                    remedy=f"image topics there: {_listed(images)}",
+                    remedy=f"image topics there: {listed(images)}",
                 )
         if given.info and given.info not in [t.topic.name for t in survey.of_type(CAMERA_INFO)]:
             raise InputError(
@@ -358,34 +359,3 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
             )
         )
     return tuple(cameras)
-
-
-def _no_camera(log: RawLog, survey: Survey) -> InputError:
-    colors = [t.topic.name for t in image_topics(survey, "color")]
-    depths = [t.topic.name for t in image_topics(survey, "depth")]
-    if colors and not depths:
-        return InputError(
-            f"{log.path}: no depth topic; colour topics there: {_listed(colors)}",
-            remedy="record 16UC1, mono16 or 32FC1 depth images",
-        )
-    if depths and not colors:
-        return InputError(
-            f"{log.path}: no colour topic; depth topics there: {_listed(depths)}", remedy="record the colour images"
-        )
-    kinds = sorted({_kind(t.topic) for t in survey.topics.values() if t.count})
-    return InputError(
-        f"{log.path}: no image topics; message types there: {_listed(kinds)}",
-        remedy="expected sensor_msgs Image or CompressedImage",
-    )
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Up to eight names, then how many more."""
-    shown = ", ".join(names[:8]) or "none"
-    return f"{shown} and {len(names) - 8} more" if len(names) > 8 else shown
-
-
-def _kind(topic: Topic) -> str:
-    """The type of a topic's messages, and their encoding where it is none of ROS."""
-    name = topic.schema or topic.type_name
-    return name if is_ros(topic) and name else f"{name} ({topic.encoding})".strip()

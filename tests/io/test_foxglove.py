@@ -18,6 +18,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import open_raw_log
 from splatctrl_cli.io.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
 from splatctrl_cli.io.describe import describe
@@ -175,9 +176,14 @@ def as_json(_schema: str, message: Any) -> bytes:
 
 
 def convert(
-    log: Path, path: Path, encoding: str, spoil: Callable[[str, bytes], bytes] = lambda name, data: data
+    log: Path,
+    path: Path,
+    encoding: str,
+    spoil: Callable[[str, bytes], bytes] = lambda name, data: data,
+    *,
+    as_video: bool = False,
 ) -> Path:
-    """The images, calibrations and transforms of a ROS 2 log in Foxglove's schemas."""
+    """The images, calibrations and transforms of a ROS 2 log in Foxglove's schemas; as_video: colour by that name."""
     write: Callable[[str, Any], bytes] = encoded if encoding == "protobuf" else as_json
     schema_encoding, schema_data = ("protobuf", descriptor_set()) if encoding == "protobuf" else ("jsonschema", b"{}")
     decoder = MessageDecoder()
@@ -189,7 +195,8 @@ def convert(
             name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
             topic = message.topic.name
             if topic not in channels:
-                schema = writer.register_schema(name=name, encoding=schema_encoding, data=schema_data)
+                told = name.replace("CompressedImage", "CompressedVideo") if as_video else name
+                schema = writer.register_schema(name=told, encoding=schema_encoding, data=schema_data)
                 channels[topic] = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=schema)
             time = message.log_time_ns
             writer.add_message(
@@ -281,6 +288,15 @@ def test_foxglove_msgs_in_a_bag_give_the_records_of_the_same_ros_log(
     assert source.loss.damaged == 0
     rows = {str(row[0]): row[1] for row in describe(bag).grids[0].rows}
     assert rows["/cam0/depth/image_raw"] == "foxglove_msgs/msg/RawImage"
+
+
+def test_video_is_named_with_what_to_do(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_joints=False))
+    path = convert(log, tmp_path / "video.mcap", "protobuf", as_video=True)
+    with pytest.raises(
+        InputError, match=r"colour is video \(/cam0/.*\), which is not read; decode it to images first"
+    ):
+        open_source(path)
 
 
 def test_a_transform_that_comes_once_holds_always(tmp_path: Path) -> None:
