@@ -1,8 +1,6 @@
 """``splatctrl export`` as a process and as a function."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +19,7 @@ from splatctrl_cli.io.splat_formats import FORMATS
 from splatctrl_cli.io.splats import read_ply, write_ply
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
+from tests.cli import here
 
 
 def ball(num: int = 400) -> SplatSet:
@@ -267,9 +266,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     if "-o" not in arguments:
         arguments = [*arguments, "-o", "out.ply"]
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    done = subprocess.run(
-        [sys.executable, "-m", "splatctrl_cli", "export", *arguments], capture_output=True, text=True, check=False
-    )
+    done = here.splatctrl("export", *arguments)
     assert done.returncode == code
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

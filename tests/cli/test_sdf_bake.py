@@ -19,7 +19,10 @@ from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.simulate.truth import load_truth
+from tests.cli import here
 from tests.field.scenes import cloud, splat_set
+
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 def sdf_bake(*arguments: object) -> "subprocess.CompletedProcess[str]":
@@ -59,14 +62,18 @@ def test_bakes_both_formats_a_header_and_a_run(tmp_path: Path, splats: Path) -> 
 
 def test_box_voxel_and_formats_are_as_asked(tmp_path: Path, splats: Path) -> None:
     out = tmp_path / "field"
-    result = sdf_bake(splats, "-o", out, "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, "--formats", "npz")
+    result = here.splatctrl(
+        "sdf-bake", splats, "-o", out, "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, "--formats", "npz"
+    )
     assert result.returncode == 0
     assert read_npz(out / "field.npz").channels["sdf"].shape == (3, 3, 5)
     assert not (out / "field.vti").exists()
 
 
 def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
-    result = sdf_bake(splats, "-o", tmp_path / "field", "--voxel", 0.1, "--require", "num_splats>1000000")
+    result = here.splatctrl(
+        "sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, "--require", "num_splats>1000000"
+    )
     assert result.returncode == 1
     assert "num_splats is 600, required > 1e+06" in result.stderr
     assert (tmp_path / "field" / "field.npz").exists()
@@ -125,11 +132,12 @@ def test_bad_arguments_are_one_line_and_leave_nothing(
 
 
 def test_a_missing_scene_is_named(tmp_path: Path) -> None:
-    result = sdf_bake(tmp_path / "none", "-o", tmp_path / "field")
+    result = here.splatctrl("sdf-bake", tmp_path / "none", "-o", tmp_path / "field")
     assert result.returncode == 4
     assert "none: no such file or folder; give what reconstruct wrote" in result.stderr
 
 
+@pytest.mark.painted
 def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path: Path, sample_data: Path) -> None:
     folder = sample_data / "tabletop"
     truth = load_truth(folder / "truth.json")
@@ -139,7 +147,8 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     surface = surface[np.abs(distance) < 0.1]
     write_ply(tmp_path / "true.ply", splat_set(surface, np.full(len(surface), 0.002)), {})
     corners = ",".join(f"{value}" for value in box.ravel())
-    result = sdf_bake(
+    result = here.splatctrl(
+        "sdf-bake",
         tmp_path / "true.ply",
         *("-o", tmp_path / "field", f"--box={corners}", "--voxel", 0.03, "--formats", "npz"),
         *("--truth", folder / "truth.json", "--seen-by", folder / "log.mcap"),
@@ -185,7 +194,9 @@ def test_a_scene_is_baked_as_it_was_known_then(
     tmp_path: Path, scene: Path, at: float | None, height: float, observed: int
 ) -> None:
     times = [] if at is None else ["--at", at]
-    result = sdf_bake(scene, "-o", tmp_path / "field", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, *times)
+    result = here.splatctrl(
+        "sdf-bake", scene, "-o", tmp_path / "field", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1, *times
+    )
     assert result.returncode == 0, result.stderr
     grid = read_npz(tmp_path / "field" / "field.npz")
     assert exact_channel(grid)[1, 1, 4] == pytest.approx(0.3 - height - 0.01, abs=1e-6)
@@ -196,17 +207,22 @@ def test_a_scene_is_baked_as_it_was_known_then(
     assert list(digests)[-1] == names[at]
 
 
+@pytest.mark.painted
 def test_a_box_that_no_camera_saw_is_warned_about(tmp_path: Path, scene: Path) -> None:
-    result = sdf_bake(scene, "-o", tmp_path / "field", "--box=7,7,7,8,8,8", "--voxel", 0.5, "--json")
+    result = here.splatctrl(
+        "sdf-bake", scene, "-o", tmp_path / "field", "--box=7,7,7,8,8,8", "--voxel", 0.5, "--json"
+    )
     assert result.returncode == 0, result.stderr
     assert "warning: no cell of the grid was ever seen by a camera; check --box" in result.stderr
     assert json.loads(result.stdout)["num_warnings"] == result.stderr.count("warning: ")
-    inside = sdf_bake(scene, "-o", tmp_path / "seen", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1)
+    inside = here.splatctrl(
+        "sdf-bake", scene, "-o", tmp_path / "seen", "--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", 0.1
+    )
     assert "was ever seen" not in inside.stderr
 
 
 def test_a_time_before_the_scene_was_known_is_refused(tmp_path: Path, scene: Path) -> None:
-    result = sdf_bake(scene, "-o", tmp_path / "field", "--at", -1)
+    result = here.splatctrl("sdf-bake", scene, "-o", tmp_path / "field", "--at", -1)
     assert result.returncode == 5
     assert "no snapshot at or before" in result.stderr
 

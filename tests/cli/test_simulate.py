@@ -1,4 +1,4 @@
-"""``splatctrl simulate`` as a process: the files it writes, the same bytes twice, and how it fails."""
+"""``splatctrl simulate``: the files it writes, the same bytes twice, and how it fails."""
 
 import json
 import subprocess
@@ -13,6 +13,7 @@ from rosbags.highlevel import AnyReader
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
+from tests.cli import here
 
 TINY = ("--duration", "0.6", "--fps", "5", "--width", "64", "--height", "48")
 
@@ -42,7 +43,7 @@ def test_it_writes_log_truth_robot_run_and_scan(recorded: Path) -> None:
 
 
 def test_the_same_command_writes_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
-    result = splatctrl("simulate", "-o", tmp_path / "again", *TINY, "--dtu", "-q")
+    result = here.splatctrl("simulate", "-o", tmp_path / "again", *TINY, "--dtu", "-q")
     assert result.returncode == 0
     files = [path.relative_to(recorded) for path in recorded.rglob("*") if path.is_file() and path.name != "run.json"]
     assert len(files) > 30
@@ -120,14 +121,14 @@ def test_depth_is_in_millimetres_and_camera_info_is_that_of_the_truth(recorded: 
 
 def test_an_existing_output_is_kept_without_force(recorded: Path) -> None:
     before = (recorded / "log.mcap").read_bytes()
-    result = splatctrl("simulate", "-o", recorded, *TINY)
+    result = here.splatctrl("simulate", "-o", recorded, *TINY)
     assert result.returncode == 2
     assert "already exists; give --force" in result.stderr
     assert (recorded / "log.mcap").read_bytes() == before
 
 
 def test_a_bad_option_leaves_nothing_behind(tmp_path: Path) -> None:
-    result = splatctrl("simulate", "-o", tmp_path / "out", "--duration", "0.1")
+    result = here.splatctrl("simulate", "-o", tmp_path / "out", "--duration", "0.1")
     assert result.returncode == 2
     assert result.stderr == "splatctrl: --duration: expected 0.5 to 600 s, got 0.1\n"
     assert list(tmp_path.iterdir()) == []
@@ -135,14 +136,14 @@ def test_a_bad_option_leaves_nothing_behind(tmp_path: Path) -> None:
 
 def test_an_output_that_cannot_be_written_is_a_usage_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    result = splatctrl("simulate", "-o", tmp_path / "file" / "out", *TINY)
+    result = here.splatctrl("simulate", "-o", tmp_path / "file" / "out", *TINY)
     assert result.returncode == 2
     assert "cannot be written" in result.stderr
 
 
 def test_a_persons_arm_is_in_the_log_and_moves_in_the_truth(tmp_path: Path) -> None:
     out = tmp_path / "shared"
-    result = splatctrl("simulate", "-o", out, *TINY[2:], "--duration", "3", "--human-arm", "near-pickup", "-q")
+    result = here.splatctrl("simulate", "-o", out, *TINY[2:], "--duration", "3", "--human-arm", "near-pickup", "-q")
     assert (result.returncode, result.stderr) == (0, "")
     truth = load_truth(out / "truth.json")
     hand = next(p for p in truth.primitives if p.name == "human.hand")
