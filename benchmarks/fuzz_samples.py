@@ -47,10 +47,10 @@ def make_samples(folder: Path, commands: tuple[str, ...]) -> list[Sample]:
     as_log = tuple(of_log)
     made = [
         _file("mcap", log, as_log),
-        _file("mcap-plain", _plain(log, folder / "plain.mcap"), as_log),
+        _file("mcap-plain", plain_log(log, folder / "plain.mcap"), as_log),
         _file("bag", as_ros1_bag(log, folder / "log.bag"), as_log),
         _folder("db3", as_ros2_folder(log, folder / "bag", StoragePlugin.SQLITE3), as_log),
-        _folder("capture", _capture(log, folder / "c.capture"), (*as_log, ("capture", "pack", "IN", "-o", "OUT"))),
+        _folder("capture", capture_of(log, folder / "c.capture"), (*as_log, ("capture", "pack", "IN", "-o", "OUT"))),
         _images(folder / "images", as_log),
         _table(folder / "table"),
     ]
@@ -84,7 +84,7 @@ def _folder(name: str, path: Path, commands: Commands) -> Sample:
     return Sample(name=name, path=path, files=files, commands=commands)
 
 
-def _plain(log: Path, path: Path) -> Path:
+def plain_log(log: Path, path: Path) -> Path:
     """The log without compression and checksums, so that what is mutated reaches the decoders."""
     with path.open("wb") as stream:
         writer = McapWriter(stream, chunk_size=4096, compression=CompressionType.NONE, enable_crcs=False)
@@ -100,7 +100,7 @@ def _plain(log: Path, path: Path) -> Path:
     return path
 
 
-def _capture(log: Path, path: Path) -> Path:
+def capture_of(log: Path, path: Path) -> Path:
     path.mkdir()
     write_capture(path, open_source(log))
     return path

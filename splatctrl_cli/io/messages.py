@@ -204,7 +204,7 @@ def _compressed_depth(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes 
     if not form.strip().startswith("32FC1"):
         return counts, "16UC1", None if is_rvl or counts.dtype != np.uint16 else file
     _, a, b = struct.unpack_from("<iff", data)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(counts > 0, a / (counts.astype(np.float64) - b), 0.0)
     return depth.astype(np.float32), "32FC1", None
 
