@@ -1,6 +1,5 @@
 """``X.capture/``: a recording as a plain folder of images, poses and joints (docs/capture.md)."""
 
-import csv
 import dataclasses
 import hashlib
 import json
@@ -15,8 +14,9 @@ import numpy as np
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.io.arrays import DAMAGE, npy_of
+from splatctrl_cli.io.capture_index import FileSums, FrameRows
 from splatctrl_cli.io.capture_joints import read_joints
-from splatctrl_cli.io.capture_writer import COLUMNS, FORMAT, MASKS, VERSION, write_capture
+from splatctrl_cli.io.capture_writer import COLUMNS, FORMAT, VERSION, write_capture
 from splatctrl_cli.io.joint_topics import (
     joints_again,
     read_topics,
@@ -47,7 +47,6 @@ _NOT_FOR_CAPTURES = (
     *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
     *("camera_pose_topics", "depth_scale", "root", "holdout", "stamps"),
 )
-_FURTHER = (*((mask,) for mask in MASKS), MASKS)  # columns of frames.csv
 _AGAIN = "run `splatctrl ingest` again"
 
 
@@ -71,8 +70,8 @@ class CaptureSource:
         for name in self.cameras:
             if name not in self._cameras:
                 raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(self._cameras)}")
-        self._sums = _read_sums(path)
-        self._rows = [row for row in _read_frames(path) if row["camera"] in self.cameras]
+        self._sums = FileSums(path)
+        self._rows = FrameRows(path / "frames.csv", self.cameras)
         self._damaged: list[str] = []
         self._loss = LossReport(**header["loss"])
         described = header.get("joint_topics")
@@ -133,7 +132,7 @@ class CaptureSource:
             if shot is not None:
                 yield shot
 
-    def _shot(self, row: dict[str, str]) -> Shot | None:
+    def _shot(self, row: Mapping[str, str]) -> Shot | None:
         """The frame of a row; None, and counted, where an image is not as it was written."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
@@ -144,6 +143,10 @@ class CaptureSource:
         bgr, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
         if bgr is None or depth is None:
             self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
+            return None
+        if not bgr.shape[:2] == depth.shape == (camera["height"], camera["width"]):
+            size = f"{camera['width']}x{camera['height']}"
+            self._damaged.append(f"{row['color']}, {row['depth']}: expected images of {size} as capture.json says")
             return None
         intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
         return Shot.of(
@@ -196,7 +199,7 @@ class CaptureSource:
         return file
 
 
-def _pose(row: dict[str, str]) -> Float64:
+def _pose(row: Mapping[str, str]) -> Float64:
     values = [float(row[key]) for key in COLUMNS[4:11]]
     return transform_from(values[:3], values[3:])
 
@@ -228,7 +231,7 @@ def read_capture_header(path: Path) -> dict[str, Any]:
 
 def _check_index(path: Path) -> None:
     """Raises InputError where an index file is not as it was written: nothing in it can be trusted then."""
-    sums = _read_sums(path)
+    sums = FileSums(path)
     for name in INDEX_FILES:
         if not (path / name).is_file():
             raise InputError(f"{path / name}: missing", remedy="run `splatctrl ingest` again")
@@ -246,34 +249,3 @@ def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | N
             return None
     counts = decode_file(data, color=False)
     return None if counts is None else metres(counts, camera["depth_scale"])
-
-
-def _read_frames(path: Path) -> list[dict[str, str]]:
-    file = path / "frames.csv"
-    try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            reader = csv.DictReader(stream)
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
-    further = tuple(reader.fieldnames or ())[len(COLUMNS) :]
-    if tuple(reader.fieldnames or ())[: len(COLUMNS)] != COLUMNS or further not in ((), *_FURTHER):
-        raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy="run `splatctrl ingest` again")
-    try:
-        for row in rows:
-            int(row["stamp_ns"])
-            [float(row[key]) for key in COLUMNS[4:11]]
-            for name in (row["color"], row["depth"], *(row.get(mask) or "" for mask in MASKS)):
-                if Path(name).is_absolute() or ".." in Path(name).parts:
-                    raise ValueError(f"{name} lies outside the capture")
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{file}: {error}", remedy="run `splatctrl ingest` again") from None
-    return rows
-
-
-def _read_sums(path: Path) -> dict[str, str]:
-    file = path / "SHA256SUMS"
-    if not file.is_file():
-        raise InputError(f"{file}: missing", remedy="the capture was not finished; run `splatctrl ingest` again")
-    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
-    return {line[66:]: line[:64] for line in lines}

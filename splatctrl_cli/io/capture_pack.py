@@ -40,7 +40,6 @@ _IMAGES = ("color", "depth", "human")  # columns of frames.csv
 def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | None = None) -> int:
     """Write `capture` as the MCAP `out`; returns the number of frames. Raises InputError where a file is damaged."""
     source = CaptureSource(capture, SourceOptions())
-    images = {source.row(i)[name] for i in range(len(source)) for name in _IMAGES if source.row(i).get(name)}
     with mcap_log(out) as log:
         log.describe(MARK, {"version": str(VERSION), "name": capture.name})
         states = iter(source.states())
@@ -56,6 +55,7 @@ def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | Non
                 progress(number + 1)
         while state is not None:
             state = _add_state(log, state, source, states)
+        images = {row[name] for row in map(source.row, range(len(source))) for name in _IMAGES if row.get(name)}
         for name in sorted(p.relative_to(capture).as_posix() for p in capture.rglob("*") if p.is_file()):
             if name not in images:
                 _check_inside(capture, name)

@@ -17,6 +17,7 @@ from numpy.lib import format as npy
 from splatctrl_cli.errors import InputError, WriteError
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.io.capture_journal import Entry, Journal, check_same_frame
+from splatctrl_cli.io.checksums import Checksums
 from splatctrl_cli.io.joint_topics import FOLDER, JointTopics, write_topics
 from splatctrl_cli.io.messages import metres
 from splatctrl_cli.io.output import sha256, write_json
@@ -124,10 +125,13 @@ def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics:
         shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
         header = header | {"joint_topics": write_topics(folder, topics, names.append)}
     write_json(folder / "capture.json", header)
-    sums = {pair for entry in journal.entries() for pair in entry.sums}  # frames share the mask of their lens
-    sums |= {(sha256(folder / name), name) for name in [*names, "capture.json"]}
-    with (folder / "SHA256SUMS").open("w", encoding="ascii") as stream:
-        stream.writelines(f"{digest}  {name}\n" for digest, name in sorted(sums, key=lambda pair: pair[1]))
+    sums = Checksums()
+    for entry in journal.entries():
+        for digest, name in entry.sums:  # frames share the mask of their lens
+            sums.add(digest, name)
+    for name in [*names, "capture.json"]:
+        sums.add_other(sha256(folder / name), name)
+    sums.write(folder / "SHA256SUMS")
 
 
 def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
