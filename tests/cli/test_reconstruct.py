@@ -12,7 +12,7 @@ FAST = ["--max-splats", "800", "--set", "scene.first_iterations=30", "--set", "s
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "small"
-    size = ["--duration", "1.4", "--width", "160", "--height", "120"]
+    size = ["--duration", "1.0", "--width", "128", "--height", "96"]
     assert main(["simulate", "-o", str(folder), *size, "--dtu", "-q"]) == 0
     return folder
 
