@@ -151,7 +151,8 @@ def _messages() -> list[Reader]:
 
     types = descriptor_set()
     raws = tuple(  # nv24 has to end where its pixels do
-        np.array([k, 8, 6, 48, 0, 0], "<u2").tobytes() + bytes(144 if name == "nv24" else 600)
+        np.array([k, 8, 6, 24 if name == "nv24" else 48, 0, 0], "<u2").tobytes()
+        + bytes(144 if name == "nv24" else 600)
         for k, name in enumerate(ENCODINGS)
     )
     proto = len(types).to_bytes(2, "little") + types + b"\x15\x08\x00\x00\x00\x1d\x06\x00\x00\x00"
