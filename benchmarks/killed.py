@@ -53,7 +53,7 @@ def tasks(folder: Path) -> list[Task]:
     robot = ("--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml"))
     audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *robot, "--max-unknown", "1")
     bake = ("sdf-bake", str(folder / "splats.ply"), "--voxel", "0.1", "--no-report")
-    fine = ("sdf-bake", str(folder / "splats.ply"), "--voxel", "0.04", "--no-report", "--threads", "1")
+    fine = ("sdf-bake", str(folder / "splats.ply"), "--voxel", "0.06", "--no-report", "--threads", "1")
     found = [
         Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture", resumes=True),
         Task(name="export", arguments=("export", str(folder / "a.ply"), "--isotropic"), out="splats.ply"),
