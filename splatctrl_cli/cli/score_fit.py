@@ -12,8 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, check_gate_names, check_gates, configured, table
+from splatctrl_cli.cli.score_cloud import cloud_settings
+from splatctrl_cli.cli.score_fit_picture import draw_methods
 from splatctrl_cli.cli.score_reference import words
 from splatctrl_cli.cli.score_report import cell, protocol_lines
+from splatctrl_cli.cli.score_scans import masks_of_scan
 from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -27,7 +30,24 @@ PAPER = {"3dgs": ("23.27", "50,000-100,000"), "budget": ("23.33", "10,000")}  # 
 PROTOCOL = "dtu-holdout8"  # the paper names neither scans nor views
 FIRST_ITERATIONS = 300  # of ours: on the first time step, the rest refines
 KEYS = {"3dgs": "3dgs", "budget": "ours"}
-GATED = ("psnr_gain", *(f"{what}_{key}" for key in KEYS.values() for what in ("psnr", "splats", "memory", "seconds")))
+EACH = {
+    "psnr_seen": "dB seen",
+    "psnr_all": "dB all",
+    "psnr_masked": "dB mask",
+    "ssim_seen": "SSIM seen",
+    "ssim_all": "SSIM all",
+    "ssim_published": "SSIM publ.",
+    "lpips": "LPIPS",
+    "lpips_published": "LPIPS publ.",
+    "depth_median_seen": "depth mm seen",
+    "depth_median_all": "depth mm all",
+    "chamfer": "Chamfer mm",
+}
+OWN = ("psnr", "splats", "memory", "seconds")
+GATED = (
+    *("psnr_gain", *(f"{what}_{key}" for key in KEYS.values() for what in (*OWN, *EACH))),
+    *("num_scans", "num_warnings"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +99,7 @@ def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
         from splatctrl_cli.evaluate.perceptual import Lpips
 
         Lpips(args.lpips)  # better refused now than after the fits
+    cloud = cloud_settings(args)
     config = configured(args)
     iterations, splats = args.fit_iterations, NUM_SPLATS if args.fit_splats is None else args.fit_splats
     if iterations is None:
@@ -88,6 +109,9 @@ def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
             raise UsageError(f"--fit-{name}: expected at least 1, got {value}")
     check_gate_names(args.require, GATED)
     console, scans = Console(args), _scans(args)
+    if cloud is not None:
+        for scan in scans:
+            cloud.of_scan(scan)
     if args.dtu is not None:
         args.protocol = args.protocol or PROTOCOL
     fits: list[Fitted] = []
@@ -98,19 +122,20 @@ def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
                 place = folder / scan / method
                 scene, memory = _reconstruct(args, place / "scene", scan, _settings(method, iterations, splats))
                 fits.append(_scored(args, console, place, scan, method, scene, memory, score_scene))
+            if args.out is not None and args.images != "none":
+                scenes = {name: folder / scan / method / "scene" for method, name in METHODS.items()}
+                draw_methods(_scoring(args, scan), console, scenes, folder / scan / "methods.png")
         result = _result(args, fits, iterations, splats)
         if args.out is not None:
             _write(folder, args, result, config.as_dict())
     console.result(result, _lines(result, fits))
-    check_gates(args.require, result["metrics"])
+    check_gates(args.require, dict.fromkeys(GATED, None) | result["metrics"])
     return 0
 
 
 def _refuse(args: argparse.Namespace) -> None:
     if args.scene is not None:
         raise UsageError(f"--fit: makes the scenes itself, got {args.scene}", remedy="leave SCENE or --fit out")
-    if args.cloud is not None:
-        raise UsageError("--fit: compares with no cloud", remedy="score the scenes that --fit -o leaves with --cloud")
     if args.dtu is not None and args.holdout:
         raise UsageError("--fit: goes by a protocol", remedy=f"give --protocol holdout:{args.holdout}")
     if args.reference is not None and args.reference.suffix != ".toml":
@@ -131,8 +156,7 @@ def _scored(
     score_scene: "ScoreScene",
 ) -> Fitted:
     run = json.loads((scene / "run.json").read_text(encoding="utf-8"))
-    dtu_scan = scan if args.dtu is not None else None
-    scoring = argparse.Namespace(**{**vars(args), "scene": scene, "scan": dtu_scan})
+    scoring = argparse.Namespace(**{**vars(_scoring(args, scan)), "scene": scene})
     folder = place / "score" if args.out is not None else None
     if folder is not None:
         folder.mkdir()
@@ -146,6 +170,16 @@ def _scored(
         seconds=float(run["seconds"]["fit"]),
         score=result,
     )
+
+
+def _scoring(args: argparse.Namespace, scan: str) -> argparse.Namespace:
+    """What `score` would be told of one scan."""
+    if args.dtu is None:
+        return argparse.Namespace(**{**vars(args), "scan": None})
+    masks = args.masks
+    if masks is not None and (masks / scan).is_dir():
+        masks = masks_of_scan(masks, scan)
+    return argparse.Namespace(**{**vars(args), "scan": scan, "masks": masks})
 
 
 def _settings(method: str, iterations: int, splats: int) -> list[str]:
@@ -220,10 +254,14 @@ def _result(args: argparse.Namespace, fits: Sequence[Fitted], iterations: int, s
         metrics[f"splats_{key}"] = _mean([fit.splats for fit in rows])
         metrics[f"memory_{key}"] = max(fit.memory for fit in rows)
         metrics[f"seconds_{key}"] = _mean([fit.seconds for fit in rows])
+        each = [fit.score["metrics"] for fit in rows]
+        metrics |= {f"{name}_{key}": _mean([one[name] for one in each]) for name in EACH if name in each[0]}
     ours, theirs = metrics["psnr_ours"], metrics["psnr_3dgs"]
     metrics["psnr_gain"] = None if ours is None or theirs is None else ours - theirs
     first = fits[0].score["protocol"]
     scans = list(dict.fromkeys(fit.scan for fit in fits))
+    warnings = [f"{fit.scan}, {METHODS[fit.method]}: {line}" for fit in fits for line in fit.score["warnings"]]
+    metrics |= {"num_scans": len(scans), "num_warnings": len(warnings)}
     averaging = "mean over the views" + (" of a scan, then over the scans" if len(scans) > 1 else "")
     return {
         "source": str(args.dtu or args.reference),
@@ -238,6 +276,7 @@ def _result(args: argparse.Namespace, fits: Sequence[Fitted], iterations: int, s
         },
         "paper": {METHODS[name]: {"psnr": float(psnr), "splats": number} for name, (psnr, number) in PAPER.items()},
         "metrics": metrics,
+        "warnings": warnings,
         "fits": [fit.as_dict() for fit in fits],
     }
 
@@ -250,46 +289,40 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def _lines(result: dict[str, Any], fits: Sequence[Fitted]) -> list[str]:
     metrics, settings = result["metrics"], result["settings"]
-    rows = []
+    rows, psnr = [], {method: [fit.psnr for fit in fits if fit.method == method] for method in METHODS}
     for method, name in METHODS.items():
-        scans = [cell("psnr", fit.psnr) for fit in fits if fit.method == method]
         rest = [_whole(metrics[f"{what}_{KEYS[method]}"]) for what in ("splats", "memory", "seconds")]
+        scans = [cell("psnr", value) for value in psnr[method]]
         rows.append([name, *PAPER[method], *scans, cell("psnr", metrics[f"psnr_{KEYS[method]}"]), *rest])
-    header = ("method", "paper dB", "paper splats", *(f"{scan} dB" for scan in result["scans"]))
+    gains = [None if None in pair else pair[0] - pair[1] for pair in zip(psnr["budget"], psnr["3dgs"], strict=True)]  # type: ignore[operator]
+    paper = float(PAPER["budget"][0]) - float(PAPER["3dgs"][0])
+    rows.append(["ours - 3D-GS", _gain(paper), "-", *map(_gain, gains), _gain(metrics["psnr_gain"]), "-", "-", "-"])
+    header = ("method", "paper's dB", "paper's splats", *(f"{scan} dB" for scan in result["scans"]))
     return [
         *table((*header, "mean dB", "splats", "memory MiB", "fit s"), rows),
+        "paper's: its section IV-A, on scans, views, sizes and iterations that it does not name; the rest: here",
         "",
         *_each(fits),
         "",
         *protocol_lines(result["protocol"]),
         f"PSNR {result['psnr']}; {settings['splats']:,} splats to begin with, {settings['iterations']} iterations,"
-        f" seed {settings['seed']}, the same losses",
-        "memory: the largest of the scans; the paper names no scans, views, resolution or iterations for its figures",
+        f" seed {settings['seed']}, the same losses; memory: the largest of the scans",
+        *(f"warning: {line}" for line in result["warnings"]),
     ]
 
 
-EACH = ("psnr_seen", "psnr_all", "ssim_seen", "ssim_all", "depth_median_seen", "depth_median_all")
+def _gain(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.2f}"
 
 
 def _each(fits: Sequence[Fitted]) -> list[str]:
     """What else was scored, a row for each fit."""
+    names = [name for name in EACH if name in fits[0].score["metrics"]]
     rows = []
     for fit in fits:
-        metrics = fit.score["metrics"]
-        figures = [cell(name, metrics[name]) for name in EACH]
+        figures = [cell(name, fit.score["metrics"][name]) for name in names]
         rows.append([fit.scan, METHODS[fit.method], fit.splats, *figures, f"{fit.memory:.0f}", f"{fit.seconds:.0f}"])
-    header = (
-        "scan",
-        "method",
-        "splats",
-        "dB seen",
-        "dB all",
-        "SSIM seen",
-        "SSIM all",
-        "depth mm seen",
-        "depth mm all",
-    )
-    return table((*header, "memory MiB", "fit s"), rows)
+    return table(("scan", "method", "splats", *(EACH[name] for name in names), "memory MiB", "fit s"), rows)
 
 
 def _whole(value: float | None) -> str:

@@ -53,7 +53,7 @@ def score_scans(
         place = None if folder is None else folder / scan
         if place is not None:
             place.mkdir()
-        masks = None if args.masks is None else _masks(args.masks, scan)
+        masks = None if args.masks is None else masks_of_scan(args.masks, scan)
         scoring = argparse.Namespace(**{**vars(args), "scene": scene, "scan": scan, "masks": masks})
         results[scan], source = score_scene(scoring, console, place)
         is_damaged |= bool(source.loss.damaged)
@@ -63,7 +63,8 @@ def score_scans(
     return result, is_damaged
 
 
-def _masks(folder: Path, scan: str) -> Path:
+def masks_of_scan(folder: Path, scan: str) -> Path:
+    """DIR/SCAN. Raises InputError where there is none: the masks of one scan fit no other."""
     if not (folder / scan).is_dir():
         raise InputError(f"{folder}: expected a folder {scan} with this scan's masks, got none")
     return folder / scan

@@ -129,6 +129,7 @@ class Scorer:
             render=rendering.color,
             photo_depth=frame.depth,
             render_depth=depth,
+            mask=mask,
         )
         if self.draw is not None:
             self.draw(row)

@@ -47,7 +47,8 @@ STYLE: Any = {  # matplotlib types its keys as one long literal
 class ComparisonRow:
     """One view: photo (H, W, 3) uint8, render (H, W, 3) in [0, 1], depths (H, W) [m], 0 = none.
 
-    `title` names the view, `figures` is a few words on how good the render is.
+    `title` names the view, `figures` is a few words on how good the render is; mask (H, W): what
+    counts, None for all.
     """
 
     title: str
@@ -56,6 +57,7 @@ class ComparisonRow:
     render: Float32
     photo_depth: Float32
     render_depth: Float32
+    mask: NDArray[np.bool_] | None = None
 
 
 def comparison_picture(path: Path, rows: Sequence[ComparisonRow]) -> None:
@@ -150,7 +152,7 @@ def _draw_comparison(figure: "Figure", axes: Sequence[Any], row: ComparisonRow) 
     centimetres = np.where(both, 100.0 * np.abs(row.render_depth - row.photo_depth), np.nan)
     error.set_facecolor("#d9d9d9")
     image = error.imshow(centimetres, cmap="cividis", vmin=0.0, vmax=100.0 * MAX_DEPTH_ERROR, interpolation="nearest")
-    figure.colorbar(image, cax=bar, extend="max")
+    figure.colorbar(image, cax=bar, extend="max", label="cm")
     median = f"median {np.nanmedian(centimetres):.2f} cm" if both.any() else "no pixel has both depths"
     titles = (f"photo   {row.title}", f"render   {row.figures}", f"depth error [cm]   {median}, grey: no depth")
     for panel, text in zip((photo, render, error), titles, strict=True):

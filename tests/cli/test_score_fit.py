@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from splatctrl_cli.cli import score_fit
@@ -21,10 +22,12 @@ def test_both_methods_are_fitted_scored_and_printed_beside_the_paper(
     out = tmp_path / "fit"
     arguments = ["score", "--dtu", str(tmp_path / "dtu"), *QUICK, "--protocol", "holdout:0", "-o", str(out)]
     assert main([*arguments, "--require", "psnr_ours>=5", "--require", "memory_3dgs<=4000"]) == 0
-    header, _, theirs, ours, *rest = capsys.readouterr().out.splitlines()
+    header, _, theirs, ours, gain, *rest = capsys.readouterr().out.splitlines()
     assert header.split("  ")[0] == "method"
     assert theirs.split()[:3] == ["3D-GS", "23.27", "50,000-100,000"]
     assert ours.split()[:3] == ["ours", "23.33", "10,000"]
+    assert gain.split()[:5] == ["ours", "-", "3D-GS", "+0.06", "-"]
+    assert rest[0].startswith("paper's: its section IV-A, on scans, views, sizes and iterations that")
     assert "split: train 1-7; score 0" in rest
     assert any(line.startswith("PSNR over the mask; 400 splats to begin with, 6 iterations") for line in rest)
     result = json.loads((out / "score.json").read_text())
@@ -36,6 +39,9 @@ def test_both_methods_are_fitted_scored_and_printed_beside_the_paper(
     for method in fits:
         assert (out / "scan1" / method / "scene" / "splats.ply").is_file()
         assert (out / "scan1" / method / "score" / "score.json").is_file()
+    picture = cv2.imread(str(out / "scan1" / "methods.png"))
+    assert picture is not None
+    assert picture.shape[1] == 1200
 
 
 def test_the_mean_is_over_the_scans(
@@ -52,10 +58,12 @@ def test_the_mean_is_over_the_scans(
         return scene, 50.0 if scan == "scan1" else 70.0
 
     def score(args: Any, console: Any, folder: Path | None) -> Any:
-        metrics = dict.fromkeys(score_fit.EACH, 1.0) | {"psnr_all": psnr.get((args.scan, args.scene.parent.name))}
+        metrics = dict.fromkeys(("psnr_seen", "ssim_all"), 1.0) | {
+            "psnr_all": psnr.get((args.scan, args.scene.parent.name))
+        }
         protocol = {"name": "x", "source": "y", "split": "z", "mask_rule": "none", "background": [0.0],
                     "published_resolution": None, "published_scans": None, "resolution": ["1x1"]}  # fmt: skip
-        return {"metrics": metrics, "protocol": protocol}, None
+        return {"metrics": metrics, "protocol": protocol, "warnings": ["odd"]}, None
 
     monkeypatch.setattr(score_fit, "_reconstruct", reconstruct)
     monkeypatch.setattr("splatctrl_cli.cli.score.score_scene", score)
@@ -64,6 +72,8 @@ def test_the_mean_is_over_the_scans(
     metrics = result["metrics"]
     assert (metrics["psnr_3dgs"], metrics["psnr_ours"], metrics["psnr_gain"]) == (25.0, 26.75, 1.75)
     assert metrics["memory_ours"] == 70.0
+    assert (metrics["ssim_all_ours"], metrics["num_scans"], metrics["num_warnings"]) == (1.0, 2, 4)
+    assert result["warnings"][1] == "scan1, ours: odd"
     assert result["protocol"]["averaging"] == "mean over the views of a scan, then over the scans"
     assert main(["score", "--fit", "--dtu", str(tmp_path), "-q", "--require", "psnr_gain>=2"]) == 1
     assert "scan1 dB  scan2 dB  mean dB" in capsys.readouterr().out
@@ -79,8 +89,8 @@ def test_the_mean_is_over_the_scans(
         (["--holdout", "2"], 2, "--fit: goes by a protocol; give --protocol holdout:2"),
         (["--fit-splats", "0"], 2, "--fit-splats: expected at least 1, got 0"),
         (["--scan", "scan1,scan9"], 4, "no scan 'scan9'; scans: scan1"),
-        (["--require", "psnr_all>=1"], 2, "unknown metric"),
-        (["--cloud", "x.ply"], 2, "--fit: compares with no cloud"),
+        (["--require", "psnr_best>=1"], 2, "unknown metric"),
+        (["--cloud", "."], 4, "expected the points of scan1, scan1.ply or stl001_total.ply, got neither"),
         (["--lpips", "x.npz"], 4, "x.npz: cannot be read: No such file"),
         (["--set", "scene.nothing=1"], 2, "scene.nothing"),
     ],
