@@ -37,7 +37,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
     assert root is not None
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
     trajectory = Trajectory(_poses(root / TRAJECTORY))
-    views, unpaired = paired_views(colors, depths, trajectory, options)
+    views, unpaired = paired_views(colors, depths, trajectory.at, options)
     lenses = Lenses()
     pincams = {
         stamp: path

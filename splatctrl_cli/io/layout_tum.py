@@ -11,6 +11,7 @@ there, which is left out. ETH3D SLAM (Schöps et al., CVPR 2019): ``calibration.
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -82,7 +83,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
     series = _series(folder)
     file = folder / "groundtruth.txt"
     trajectory = Trajectory(read_tum(file) if file.is_file() else {})
-    views, unpaired = paired_views(colors, depths, trajectory, options)
+    views, unpaired = paired_views(colors, depths, trajectory.at, options)
     if series is _BONN:
         views = [_from_markers(view) for view in views]
     return described(
@@ -99,9 +100,12 @@ def read(folder: Path, options: SourceOptions) -> Description:
 
 
 def paired_views(
-    colors: list[tuple[int, Path]], depths: list[tuple[int, Path]], trajectory: Trajectory, options: SourceOptions
+    colors: list[tuple[int, Path]],
+    depths: list[tuple[int, Path]],
+    pose_at: Callable[[int], Float64 | None],
+    options: SourceOptions,
 ) -> tuple[list[ListedView], tuple[int, int]]:
-    """Views of stamps [ns] and files, posed where the trajectory reaches, and how many files have no partner."""
+    """Views of stamps [ns] and files, posed where a pose is known, and how many files have no partner."""
     tolerance_ns = round(options.pairing_tolerance_s * 1e9)
     pairs = pair_by_stamp([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns)
     views = [
@@ -109,7 +113,7 @@ def paired_views(
             name=f"{colors[i][0] / 1e9:.6f}",
             color=colors[i][1],
             depth=depths[j][1],
-            matrix=trajectory.at(colors[i][0]),
+            matrix=pose_at(colors[i][0]),
             stamp_ns=colors[i][0],
         )
         for i, j in pairs

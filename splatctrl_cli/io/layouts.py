@@ -14,6 +14,7 @@ from splatctrl_cli.io import (
     layout_redwood,
     layout_replica,
     layout_scannet,
+    layout_sun3d,
     layout_tum,
 )
 from splatctrl_cli.io.folder_description import Description
@@ -41,6 +42,7 @@ LAYOUTS = tuple(
         ("ICL-NUIM", layout_icl),
         ("Replica", layout_replica),
         ("ARKitScenes", layout_arkit),
+        ("SUN3D", layout_sun3d),
         ("Open3D scene", layout_redwood),
     )
 )

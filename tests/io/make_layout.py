@@ -179,6 +179,27 @@ def make_replica(folder: Path) -> Path:
     return folder
 
 
+def make_sun3d(folder: Path) -> Path:
+    """Depth 2 ms after colour, its bits rotated; an older trajectory beside the one that counts."""
+    rows = []
+    for index, T in enumerate(POSES):
+        time = 33_000 * index
+        color, depth = (
+            folder / f"image/{index + 1:07d}-{time:012d}.png",
+            folder / f"depth/{index:07d}-{time + 2000:012d}.png",
+        )
+        write_pair(color, depth, index)
+        counts = counts_of(index)
+        cv2.imwrite(str(depth), (counts << 3) | (counts >> 13))
+        rows += [" ".join(repr(float(v)) for v in row) for row in T[:3]]
+    (folder / "extrinsics").mkdir()
+    (folder / "extrinsics/20140101000000.txt").write_text("\n".join(rows[3:] + rows[:3]))
+    (folder / "extrinsics/20150101000000.txt").write_text("\n".join(rows))
+    lens = f"{K[0]} 0 {K[2] + 1}\n0 {K[1]} {K[3] + 1}\n0 0 1\n"
+    (folder / "intrinsics.txt").write_text(lens)
+    return folder
+
+
 def make_arkit(folder: Path) -> Path:
     """Depth of half the size; the lens' file is named a millisecond off, poses lie half a period to either side."""
     root = folder / "41069021_frames"

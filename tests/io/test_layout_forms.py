@@ -33,6 +33,7 @@ from tests.io.make_layout import (
     make_redwood,
     make_replica,
     make_scannet,
+    make_sun3d,
     make_tum,
     matrix_text,
     write_pair,
@@ -127,6 +128,13 @@ def test_replica_of_semantic_nerf_has_a_right_angle_of_view(tmp_path: Path) -> N
     lines = [matrix_text(T).replace("\n", " ") + "\n" for T in POSES]
     (tmp_path / "traj_w_c.txt").write_text("".join(lines))
     check(frames_of(tmp_path), k=(4.0, 4.0, 3.5, 2.5))
+
+
+def test_sun3d_goes_by_time_and_place_with_its_newest_poses(tmp_path: Path) -> None:
+    source = open_source(make_sun3d(tmp_path))
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    check(frames)
+    assert source.has_clock and [frame.stamp_ns for frame in frames] == [0, 33_000_000, 66_000_000]
 
 
 def test_arkit_scenes_turn_world_to_camera_and_fit_depth_to_colour(tmp_path: Path) -> None:

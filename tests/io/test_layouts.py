@@ -29,6 +29,7 @@ from tests.io.make_layout import (
     make_redwood,
     make_replica,
     make_scannet,
+    make_sun3d,
     make_tum,
     matrix_text,
 )
@@ -36,7 +37,7 @@ from tests.io.make_layout import (
 TEXTS = {".txt", ".json", ".log", ".freiburg", ".traj", ".pincam"}
 ALL = [
     *(make_tum, make_bop, make_scannet, make_frames, make_nerfstudio),
-    *(make_icl, make_replica, make_arkit, make_redwood),
+    *(make_icl, make_replica, make_arkit, make_sun3d, make_redwood),
 ]
 INTRINSICS = SourceOptions(intrinsics={"camera": K})
 
