@@ -24,6 +24,8 @@ RAW = (1600, 1200)  # pixels of DTU's cameras; 640x512 is half of that, cropped 
 CROPPED = (640, 512)
 CROP = (80, 44)  # pixels cut off left and top of the half-size image
 VISIBLE_ABOVE = 10  # of depth_visual
+PLAUSIBLE_DEPTH = (0.02, 20.0)  # [m] median of a scan
+LEAST_SPREAD = 0.005  # of the depth, by which the cameras stand apart
 BRIGHT = 128  # from which a mask says yes
 
 
@@ -101,6 +103,7 @@ def read_dtu(
         raise InputError(
             f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
         )
+    check_lengths(f"{root}: scan '{scan}'", views)
     return DtuScan(
         name=scan,
         views=tuple(views),
@@ -108,6 +111,30 @@ def read_dtu(
         files=tuple(files),
         without_depth=tuple(without_depth),
     )
+
+
+def check_lengths(where: str, views: Sequence[DtuView]) -> None:
+    """Raise InputError where depth or the cameras' distances were no millimetres: of a table seen from near, not from
+    a thousandth or a thousand times as far."""
+    known = [view.depth[view.depth > 0] for view in views]
+    medians = [float(np.median(depth)) for depth in known if depth.size]
+    if not medians:
+        return
+    median, (low, high) = float(np.median(medians)), PLAUSIBLE_DEPTH
+    if not low <= median <= high:
+        raise InputError(
+            f"{where}: depth: expected {MILLIMETRES * low:g} to {MILLIMETRES * high:g} mm, got a median of"
+            f" {MILLIMETRES * median:.3g}",
+            remedy="lengths have to be millimetres; metres times 1000 are",
+        )
+    centers = np.array([view.T_world_camera[:3, 3] for view in views])
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    if 0 < spread < LEAST_SPREAD * median:
+        raise InputError(
+            f"{where}: cameras: expected millimetres, as the depth's median of {MILLIMETRES * median:.0f} mm, got"
+            f" cameras within {MILLIMETRES * spread:.3g} mm of their middle",
+            remedy="translations have to be millimetres; metres times 1000 are",
+        )
 
 
 def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:

@@ -15,7 +15,16 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.arrays import read_arrays
-from splatctrl_cli.io.dtu import MILLIMETRES, DtuScan, DtuView, Shrink, read_depth, read_image, read_mask
+from splatctrl_cli.io.dtu import (
+    MILLIMETRES,
+    DtuScan,
+    DtuView,
+    Shrink,
+    check_lengths,
+    read_depth,
+    read_image,
+    read_mask,
+)
 from splatctrl_cli.records import Float64, Intrinsics
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
@@ -85,6 +94,7 @@ def read_idr(
         views.append(shrink(view))
     if depths is not None and len(without_depth) == len(views):
         raise InputError(f"{depths}: expected depth_map_0000.pfm and so on, got none")
+    check_lengths(f"{folder}", views)
     return DtuScan(
         name=scan,
         views=tuple(views),

@@ -89,7 +89,7 @@ def test_training_cameras_are_for_a_quarter_of_the_image(scan: Path) -> None:
 
 def test_full_cameras_and_depth_are_halved_and_cropped(scan: Path) -> None:
     full = np.array([[2892.3, 0, 823.2], [0, 2883.2, 619.1], [0, 0, 1]])
-    depth = np.arange(1600 * 1200, dtype=np.float32).reshape(1200, 1600) + 1
+    depth = (np.arange(1600 * 1200, dtype=np.float32) % 4099).reshape(1200, 1600) + 100
     resized(scan, (640, 512), ("00000000_cam.txt", full), depth)
     found = read_dtu(scan).views[0]
     assert found.intrinsics.fx == pytest.approx(1446.15)
@@ -101,7 +101,7 @@ def test_full_cameras_and_depth_are_halved_and_cropped(scan: Path) -> None:
 def test_cameras_and_depth_of_the_full_size_fit_images_made_smaller(scan: Path) -> None:
     """A patch of 4x4 pixels of the full image is one pixel of the small one; its middle stays where it was."""
     full = np.array([[2892.3, 0, 823.2], [0, 2883.2, 619.1], [0, 0, 1]])
-    depth = np.arange(1600 * 1200, dtype=np.float32).reshape(1200, 1600) + 1
+    depth = (np.arange(1600 * 1200, dtype=np.float32) % 4099).reshape(1200, 1600) + 100
     resized(scan, (400, 300), ("00000000_cam.txt", full), depth)
     found = read_dtu(scan).views[0]
     middle = np.array([[4 * 30 + 1.5, 4 * 20 + 1.5]])
@@ -147,6 +147,25 @@ def test_light_three_is_taken_where_there_are_several(scan: Path) -> None:
     for light in (0, 6):
         cv2.imwrite(str(folder / f"rect_001_{light}_r5000.png"), np.zeros((48, 64, 3), np.uint8))
     assert read_dtu(scan).views[0].name == "rect_001_3_r5000"
+
+
+def test_lengths_that_are_no_millimetres_are_told_by_the_depth_and_the_cameras(tmp_path: Path) -> None:
+    def in_metres(some: DtuView, *, depth: bool = False, cameras: bool = False) -> DtuView:
+        T_world_camera = some.T_world_camera.copy()
+        T_world_camera[:3, 3] /= 1000 if cameras else 1
+        return replace(some, depth=some.depth / np.float32(1000 if depth else 1), T_world_camera=T_world_camera)
+
+    write_dtu(tmp_path / "depth", "scan7", [in_metres(view(n), depth=True) for n in range(3)])
+    with pytest.raises(
+        InputError, match=r"depth: expected 20 to 20000 mm, got a median of 0.99\d; lengths have to be"
+    ):
+        read_dtu(tmp_path / "depth")
+    write_dtu(tmp_path / "both", "scan7", [in_metres(view(n), depth=True, cameras=True) for n in range(3)])
+    with pytest.raises(InputError, match="depth: expected 20 to 20000 mm"):
+        read_dtu(tmp_path / "both")
+    write_dtu(tmp_path / "cameras", "scan7", [in_metres(view(n), cameras=True) for n in range(3)])
+    with pytest.raises(InputError, match=r"cameras: expected millimetres, .* of \d+ mm, got cameras within 0.2 mm"):
+        read_dtu(tmp_path / "cameras")
 
 
 def remove_all(root: Path, pattern: str) -> None:
