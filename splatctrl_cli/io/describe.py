@@ -15,7 +15,7 @@ from splatctrl_cli.io.grid_channels import FORMAT
 from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.known_space import known_space
 from splatctrl_cli.io.large_log import survey_to_describe
-from splatctrl_cli.io.layouts import layout_of, open_layout
+from splatctrl_cli.io.layouts import layout_of, open_layout, readable_in
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig import camera_topics, missing
@@ -125,9 +125,12 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
         name.startswith("Rectified/") for name in names
     )
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
+        inside = readable_in(path)
         raise InputError(
             f"{path}: a folder of no known kind",
-            remedy="expected a capture, ROS 2 bag, MVSNet scan or output of splatctrl; for images give their .toml",
+            remedy=f"give one that is in it: {inside}"
+            if inside
+            else "expected a capture, ROS 2 bag, MVSNet scan or output of splatctrl; for images give their .toml",
         )
     field = _field_facts(path / "field.json") if "field.json" in names else {}
     kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"

@@ -21,6 +21,9 @@ from splatctrl_cli.io.folder_description import Description
 from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.options import SourceOptions
 
+_LOGS = (".mcap", ".bag", ".db3")
+_MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is none itself
+
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
@@ -58,9 +61,29 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
     layout = layout_of(folder)
     if layout is None:
         names = ", ".join(known.name for known in LAYOUTS)
+        inside = readable_in(folder)
         raise InputError(
             f"{folder}: a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
-            remedy="give the capture, the bag, one scene of the dataset, or for other images a .toml (docs/input.md)",
+            remedy=f"give one that is in it: {inside}"
+            if inside
+            else "give the capture, the bag, one scene of the dataset, or for other images a .toml (docs/input.md)",
         )
     options.refuse(("root",), f"a folder laid out as {layout.name}", folder)
     return ImageFolderSource(folder, options, layout.read(folder, options))
+
+
+def readable_in(folder: Path) -> str:
+    """What of a folder can be read by itself, in words; empty where nothing."""
+    found = []
+    for path in sorted(folder.iterdir())[:_MOST_LOOKED_AT]:
+        if path.is_file() and path.suffix in _LOGS:
+            found.append(path.name)
+        elif path.is_dir() and (layout := layout_of(path)) is not None:
+            found.append(f"{path.name} ({layout.name})")
+        elif path.is_dir() and (path / "metadata.yaml").is_file():
+            found.append(f"{path.name} (ROS 2 bag)")
+        elif path.is_dir() and (path / "capture.json").is_file():
+            found.append(f"{path.name} (capture)")
+    return ", ".join(found[:_MOST_NAMED]) + (
+        f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    )

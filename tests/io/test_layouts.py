@@ -178,6 +178,17 @@ def test_each_layout_is_known_by_its_files_and_described(tmp_path: Path) -> None
         assert (summary.kind, summary.grids[0].rows) == (layout.name, [["camera", 3]])
 
 
+def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
+    make_redwood(tmp_path / "kitchen")
+    make_scannet(tmp_path / "scene0000_00")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "run.bag").write_bytes(b"")
+    with pytest.raises(InputError, match=r"give one that is in it: kitchen \(Open3D scene\), run.bag, scene0000_00"):
+        open_source(tmp_path)
+    with pytest.raises(InputError, match=r"of no known kind; give one that is in it: kitchen"):
+        describe(tmp_path)
+
+
 def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
     folder = make_tum(tmp_path / "freiburg3")
     next((folder / "depth").iterdir()).unlink()
