@@ -64,6 +64,21 @@ def test_it_is_what_torch_makes_of_the_same_weights(tmp_path: Path, name: str, n
     assert lpips(a, a) == 0.0
 
 
+@pytest.mark.filterwarnings("ignore")  # torchvision calls its own arguments deprecated
+@pytest.mark.parametrize("name", ["alex", "vgg"])
+def test_it_is_what_the_authors_package_makes_of_its_own_linear_layers(tmp_path: Path, name: str) -> None:
+    """Random convolutions: those that were trained have to be downloaded, the linear layers come with the package."""
+    lpips = pytest.importorskip("lpips", reason="the authors' package lpips is not installed")
+    torch.manual_seed(7)
+    model = lpips.LPIPS(net=name, pnet_rand=True, verbose=False).eval()
+    np.savez(tmp_path / "weights.npz", **{key: value.numpy() for key, value in model.state_dict().items()})
+    a, b = pictures()
+    pair = [(2 * torch.from_numpy(x).float() - 1).permute(2, 0, 1)[None] for x in (a, b)]
+    with torch.no_grad():
+        expected = model(*pair).item()
+    assert Lpips(tmp_path / "weights.npz")(a, b) == pytest.approx(expected, rel=1e-5)
+
+
 def test_what_is_no_file_of_weights_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none.npz: cannot be read: No such file"):
         Lpips(tmp_path / "none.npz")
