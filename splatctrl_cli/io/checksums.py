@@ -47,4 +47,4 @@ class Checksums:
 
 
 def _line(digest: str, name: str) -> bytes:
-    return f"{digest}  {name}\n".encode("utf-8")
+    return f"{digest}  {name}\n".encode()
