@@ -117,6 +117,7 @@ class Scorer:
             seen=seen_pixels(frame, view.training),
             mask=mask,
             fill=0.0 if protocol is None else protocol.fill,
+            is_zero_padded=protocol is not None and protocol.is_zero_padded,
             perceptual=self.perceptual,
         )
         scores.views.append(score)

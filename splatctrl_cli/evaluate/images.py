@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,17 +47,21 @@ def psnr(image: NDArray[np.floating], reference: NDArray[np.floating], mask: Boo
     return math.inf if error == 0 else -10.0 * math.log10(error)
 
 
-def ssim_map(image: NDArray[np.floating], reference: NDArray[np.floating]) -> Float64:
+def ssim_map(
+    image: NDArray[np.floating], reference: NDArray[np.floating], *, is_zero_padded: bool = False
+) -> Float64:
     """Structural similarity (H, W, 3) per pixel and channel of images (H, W, 3) in [0, 1] (Wang et al. 2004).
 
     Gaussian window 11×11, sigma 1.5, C1 = 0.01², C2 = 0.03², population moments; at the border the image is mirrored
-    with its edge pixel repeated.
+    with its edge pixel repeated, or continued with zeros, as 3D Gaussian splatting has it
+    (graphdeco-inria/gaussian-splatting, utils/loss_utils.py), which hides errors there.
     """
     x, y = image.astype(np.float64), np.asarray(reference, dtype=np.float64)
-    mean_x, mean_y = _window_mean(x), _window_mean(y)
-    variance_x = _window_mean(x * x) - mean_x**2
-    variance_y = _window_mean(y * y) - mean_y**2
-    covariance = _window_mean(x * y) - mean_x * mean_y
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
+        _window_mean(picture, "constant" if is_zero_padded else "reflect") for picture in (x, y, x * x, y * y, x * y)
+    )
+    variance_x, variance_y = mean_xx - mean_x**2, mean_yy - mean_y**2
+    covariance = mean_xy - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
     structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
     return np.asarray(luminance * structure)
@@ -124,10 +129,10 @@ def depth_errors(
 _DEPTH_FIGURES = ("median", "mean", "p90", "within_1cm", "within_2cm")
 
 
-def _window_mean(image: Float64) -> Float64:
+def _window_mean(image: Float64, border: Literal["reflect", "constant"]) -> Float64:
     """The Gaussian-weighted mean of each pixel's window, rows then columns."""
     offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
     weights /= weights.sum()
-    rows = correlate1d(image, weights, axis=0, mode="reflect")
-    return np.asarray(correlate1d(rows, weights, axis=1, mode="reflect"))
+    rows = correlate1d(image, weights, axis=0, mode=border)
+    return np.asarray(correlate1d(rows, weights, axis=1, mode=border))

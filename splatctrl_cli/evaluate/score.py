@@ -30,7 +30,8 @@ PROTOCOL = {
     "in_front": "share of those pixels whose normalised depth is nearer than the reference by more than 3 cm",
     "masked": "the pixels that the mask rule selects; its share of the view is mask_share",
     "ssim_published": "of the whole view with render and photo set to one colour outside the mask, as scikit-image's "
-    "default has it: 7x7 box, sample moments, data range 2, border of 3 pixels left out",
+    "default has it: 7x7 box, sample moments, data range 2, border of 3 pixels left out; without a mask as 3D "
+    "Gaussian splatting has it: as ssim, but zeros beyond the border",
     "lpips": "of the whole view, colours scaled to [-1, 1]; lpips_published: with render and photo set to one colour "
     "outside the mask",
     "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
@@ -58,7 +59,8 @@ class ViewScore:
     """One view: `valid_share` of its pixels have a reference depth; `all` and `seen` are its regions.
 
     Where there is a mask: `masked` is its region, ssim_published and lpips_published are those of the view with the
-    rest filled. lpips where weights were given. size: width and height [px].
+    rest filled; without one, ssim_published is there where the protocol has one. lpips where weights were given.
+    size: width and height [px].
     """
 
     view: str
@@ -69,7 +71,7 @@ class ViewScore:
     seen: RegionScore
     all: RegionScore
     masked: RegionScore | None = None
-    ssim_published: float = math.nan
+    ssim_published: float | None = None
     lpips: float | None = None
     lpips_published: float | None = None
 
@@ -78,8 +80,10 @@ class ViewScore:
         figures = {"valid_share": self.valid_share, "seen_share": self.seen.share}
         regions = {"seen": self.seen, "all": self.all}
         if self.masked is not None:
-            figures |= {"mask_share": self.masked.share, "ssim_published": self.ssim_published}
+            figures["mask_share"] = self.masked.share
             regions["masked"] = self.masked
+        if self.ssim_published is not None:
+            figures["ssim_published"] = self.ssim_published
         if self.lpips is not None:
             figures["lpips"] = self.lpips
         if self.lpips_published is not None:
@@ -103,13 +107,15 @@ def score_view(
     seen: Bool,
     mask: Bool | None = None,
     fill: float = 0.0,
+    is_zero_padded: bool = False,
     perceptual: Perceptual | None = None,
 ) -> ViewScore:
     """The scores of a rendering against `frame`.
 
     color (H, W, 3) in [0, 1], depth (H, W) [m] normalised by accumulated opacity, 0 = none; seen (H, W): pixels
     that a training camera saw; mask (H, W): pixels that the mask rule selects, `fill` the grey outside it for
-    the published figures; perceptual: LPIPS. What is not valid in `frame` is in no region. `PROTOCOL` says what each
+    the published figures; is_zero_padded: without a mask, the published SSIM is that of `ssim_map` of that kind;
+    perceptual: LPIPS. What is not valid in `frame` is in no region. `PROTOCOL` says what each
     figure means.
     """
     rendered = np.clip(color.astype(np.float64), 0.0, 1.0)
@@ -143,7 +149,9 @@ def score_view(
         seen=score_region(seen),
         all=score_region(valid),
         masked=None if mask is None else score_region(mask),
-        ssim_published=math.nan if mask is None else published_ssim(rendered, photo, mask, fill),
+        ssim_published=published_ssim(rendered, photo, mask, fill)
+        if mask is not None
+        else (float(ssim_map(rendered, photo, is_zero_padded=True).mean()) if is_zero_padded else None),
         lpips=None if perceptual is None else perceptual(rendered, photo),
         lpips_published=None if perceptual is None or mask is None else of_the_mask(perceptual, mask),
     )

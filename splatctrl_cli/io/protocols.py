@@ -44,7 +44,8 @@ class ScoreProtocol:
     """What a name fixes.
 
     mask: what of a view counts in the published figure: the pixels of a mask where one is given, those of the object
-    (a mask has to be given), or those with a reference depth. fill: colour outside the mask in the published SSIM.
+    (a mask has to be given), or those with a reference depth. fill: colour outside the mask in the published SSIM;
+    is_zero_padded: without a mask that has zeros beyond the image's border.
     size: width and height [px] of the published figures. scans: of DTU, in the published mean. Empty training and
     scored views say that a rule splits the views.
     """
@@ -53,6 +54,7 @@ class ScoreProtocol:
     source: str
     mask: MaskRule = "given"
     fill: float = 0.0
+    is_zero_padded: bool = False
     size: tuple[int, int] | None = None
     scans: tuple[int, ...] = ()
     training: tuple[int, ...] = ()
@@ -110,12 +112,14 @@ def score_protocol(name: str) -> ScoreProtocol:
         return ScoreProtocol(
             name=name,
             scans=SURFACE_SCANS,
+            is_zero_padded=True,
             source="every view trains and is scored: DTU has no test views (hbb1/2d-gaussian-splatting, thread 13)",
         )
     if name == "dtu-holdout8":
         return ScoreProtocol(
             name=name,
             every=EVERY,
+            is_zero_padded=True,
             source="every 8th view from view 0 on (graphdeco-inria/gaussian-splatting, scene/dataset_readers.py)",
         )
     if name == "mvsnerf":

@@ -91,6 +91,17 @@ def test_depth_errors_without_a_common_pixel_are_not_numbers() -> None:
     assert math.isnan(errors.within_1cm)
 
 
+def test_zeros_beyond_the_border_make_it_look_alike() -> None:
+    rng = np.random.default_rng(5)
+    image, reference = rng.random((24, 30, 3)), rng.random((24, 30, 3))
+    padded = [np.pad(x, ((5, 5), (5, 5), (0, 0))) for x in (image, reference)]
+    expected = ssim_map(*padded)[5:-5, 5:-5]
+    found = ssim_map(image, reference, is_zero_padded=True)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(found[5:-5, 5:-5], ssim_map(image, reference)[5:-5, 5:-5], atol=1e-12)
+    assert found[0].mean() > ssim_map(image, reference)[0].mean() + 0.05
+
+
 def test_published_ssim_is_the_box_window_of_scikit_image_on_filled_images() -> None:
     rng = np.random.default_rng(5)
     image, reference = rng.random((14, 17, 3)), rng.random((14, 17, 3))
