@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import told_formats
 from splatctrl_cli.io.cameras import image_topics
-from splatctrl_cli.io.decoder import is_ros
+from splatctrl_cli.io.decoder import COMPRESSED_IMAGE, IMAGE, is_ros
 from splatctrl_cli.io.raw_log import RawLog, Topic
 from splatctrl_cli.io.survey import Survey
 
@@ -26,6 +26,13 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
         return InputError(
             f"{log.path}: colour is video ({', '.join(videos)}), which is not read",
             remedy="decode it to images first: `ros2 run image_transport republish` for ROS topics, else ffmpeg",
+        )
+    broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
+    if broken:
+        why = next((note for note in survey.damage.notes if "image" in note), "see `splatctrl info`")
+        return InputError(
+            f"{log.path}: no image of {listed(broken)} can be decoded ({why})",
+            remedy="record raw images, JPEG or PNG; decode video to images first",
         )
     if depths and not colors:
         return InputError(

@@ -181,6 +181,31 @@ def test_images_that_came_twice_are_taken_once_and_counted(tmp_path: Path) -> No
     assert (source.loss.duplicate_images, source.loss.unpaired_color, source.loss.unpaired_depth) == (10, 0, 0)
 
 
+def test_depth_of_half_the_rate_gives_as_many_frames(tmp_path: Path) -> None:
+    def slow(message: Message) -> list[Message]:
+        index = round((message[0] - START_NS) / FRAME_NS)
+        return [] if "depth" in message[1] and index % 2 else [message]
+
+    source = open_source(make_part(tmp_path / "log.mcap", LogRecipe(num_frames=9), slow))
+    assert [f.stamp_ns for f in frames_of(list(source.records()))] == [
+        START_NS + i * FRAME_NS for i in range(0, 9, 2)
+    ]
+    assert (source.loss.unpaired_color, source.loss.unpaired_depth) == (4, 0)
+
+
+def test_images_that_are_video_do_not_decode_and_are_named(tmp_path: Path) -> None:
+    def as_video(message: Message) -> list[Message]:
+        if message[1].endswith("/compressed"):
+            message[3].format, message[3].data = "h264", np.frombuffer(b"\0\0\0\1\x67 nal", np.uint8)
+        return [message]
+
+    log = make_part(tmp_path / "log.mcap", LogRecipe(), as_video)
+    with pytest.raises(
+        InputError, match=r"no image of /cam0/.*/compressed can be decoded \(compressed image \(h264\)"
+    ):
+        open_source(log)
+
+
 def test_images_that_did_not_come_are_counted(tmp_path: Path) -> None:
     missing = {START_NS + index * FRAME_NS for index in (4, 5, 9)}
 
