@@ -127,8 +127,11 @@ def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics:
     write_json(folder / "capture.json", header)
     sums = Checksums()
     for entry in journal.entries():
-        for digest, name in entry.sums:  # frames share the mask of their lens
-            sums.add(digest, name)
+        for digest, name in entry.sums:
+            if name.startswith("valid/"):  # not in the order of frames, which share that of their lens
+                sums.add_other(digest, name)
+            else:
+                sums.add(digest, name)
     for name in [*names, "capture.json"]:
         sums.add_other(sha256(folder / name), name)
     sums.write(folder / "SHA256SUMS")

@@ -15,21 +15,18 @@ class Checksums:
 
     def __init__(self) -> None:
         self._folders: dict[str, IO[bytes]] = {}
-        self._last: dict[str, str] = {}
         self._others: dict[str, str] = {}
 
     def add(self, digest: str, name: str) -> None:
-        """Of a file in a folder, after those before it there; the one that was last may come again."""
+        """Of a file in a folder, after those before it there."""
         folder = name.rpartition("/")[0]
         if folder not in self._folders:
             self._folders[folder] = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
             weakref.finalize(self, self._folders[folder].close)
-        if self._last.get(folder) != name:
-            self._folders[folder].write(_line(digest, name))
-            self._last[folder] = name
+        self._folders[folder].write(_line(digest, name))
 
     def add_other(self, digest: str, name: str) -> None:
-        """Of one of few files, in any order; not in a folder of `add`."""
+        """Of one of few files, in any order, any number of times; not in a folder of `add`."""
         self._others[name] = digest
 
     def write(self, path: Path) -> None:

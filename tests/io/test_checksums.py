@@ -14,10 +14,12 @@ def test_lines_are_sorted_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(checksums, "IN_MEMORY", in_memory)
     sums, expected = Checksums(), set()
     for number in range(12):
-        for folder in ("color/cam", "color/cam-b", "color/cam0", "depth/cam", "valid/cam"):
-            name = f"{folder}/{'lens' if folder.startswith('valid') else f'{number:06d}'}.png"
-            sums.add(f"{number % 16:064x}" if "lens" not in name else "f" * 64, name)
+        for folder in ("color/cam", "color/cam-b", "color/cam0", "depth/cam"):
+            name = f"{folder}/{number:06d}.png"
+            sums.add(f"{number:064x}", name)
             expected.add(name)
+        sums.add_other("f" * 64, f"valid/cam/{number % 3}.png")
+        expected.add(f"valid/cam/{number % 3}.png")
     for name in ("joints.npz", "capture.json", "joint_topics/a.npz", "frames.csv"):
         sums.add_other("0" * 64, name)
         expected.add(name)
