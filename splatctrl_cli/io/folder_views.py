@@ -5,6 +5,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.io.folder_description import CameraTable, Description, ListedView, PosesTable
@@ -135,9 +137,16 @@ def _pose(table: PosesTable | None, view: ListedView, lens: CameraTable, options
 
 
 def _scale(description: Description, view: ListedView, options: SourceOptions) -> float:
+    """Metres per count. Raises InputError for one that no image has."""
     if options.depth_scale is not None:
         return options.depth_scale
-    return description.depth.scale if view.depth_scale is None else view.depth_scale
+    scale = description.depth.scale if view.depth_scale is None else view.depth_scale
+    if not 0 < scale < np.inf:
+        raise InputError(
+            f"{description.path}: depth of {view.name}: expected metres per count, got {scale}",
+            remedy="correct the file, or give --depth-scale",
+        )
+    return scale
 
 
 def _listed(description: Description, options: SourceOptions, loss: LossReport) -> list[ListedView]:

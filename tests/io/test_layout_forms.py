@@ -355,3 +355,11 @@ def test_grey_tiff_images_of_bop_are_read(tmp_path: Path) -> None:
         cv2.imwrite(str(path.with_suffix(".tif")), pixels)
         path.unlink()
     check(frames_of(folder), 1e-4)
+
+
+@pytest.mark.parametrize("scale", [0.0, -0.001, math.nan, math.inf])
+def test_a_depth_unit_that_is_none_is_refused(tmp_path: Path, scale: float) -> None:
+    folder = of_transforms(tmp_path, integer_depth_scale=scale)
+    with pytest.raises(InputError, match=r"depth of frame_0: expected metres per count, got .*give --depth-scale"):
+        open_source(folder)
+    assert frames_of(folder, SourceOptions(depth_scale=1e-3))[0].depth[1, 1] > 1.0
