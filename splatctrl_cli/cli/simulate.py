@@ -36,7 +36,10 @@ def register(subparsers: Subparsers) -> None:
         help="a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal",
     )
     parser.add_argument(
-        "--dtu", action="store_true", help="write PATH/dtu too: a DTU scan of a scene that stands still"
+        "--dtu",
+        action="store_true",
+        help="write PATH/dtu and PATH/idr too: a DTU scan of a scene that stands still, in MVSNet's layout and in"
+        " IDR's, with masks of its things",
     )
 
 
@@ -67,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         write_json(folder / "truth.json", truth_document(truth))
         if args.dtu:
             with stopwatch.stage("dtu"):
-                _write_scan(folder / "dtu")
+                _write_scan(folder)
         metrics = _metrics(truth, num_frames)
         write_run(
             folder,
@@ -131,9 +134,10 @@ def _truth(folder: Path, recording: "Recording", contrast: dict[str, float]) -> 
     )
 
 
-def _write_scan(root: Path) -> None:
+def _write_scan(folder: Path) -> None:
     from splatctrl_cli.io.dtu import DtuView, write_dtu
-    from splatctrl_cli.simulate.turntable import views
+    from splatctrl_cli.io.idr import write_idr
+    from splatctrl_cli.simulate.turntable import object_mask, views
 
     scan = [
         DtuView(
@@ -142,10 +146,12 @@ def _write_scan(root: Path) -> None:
             depth=frame.depth,
             intrinsics=frame.intrinsics,
             T_world_camera=frame.T_world_camera,
+            mask=object_mask(frame),
         )
         for frame in views()
     ]
-    write_dtu(root, "scan1", scan)
+    write_dtu(folder / "dtu", "scan1", scan)
+    write_idr(folder / "idr", "scan1", scan)
 
 
 def _sizes(folder: Path) -> dict[str, int]:

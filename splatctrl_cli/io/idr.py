@@ -8,13 +8,15 @@ There is no depth: SCAN/depth may hold depth_map_0000.pfm (and depth_visual_0000
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.arrays import read_arrays
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.io.arrays import read_arrays, savez
 from splatctrl_cli.io.dtu import (
     MILLIMETRES,
     DtuScan,
@@ -25,7 +27,8 @@ from splatctrl_cli.io.dtu import (
     read_image,
     read_mask,
 )
-from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.io.pfm import write_pfm
+from splatctrl_cli.records import Float64, Intrinsics, UInt8
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 _MOST = 1 << 24  # bytes of cameras: 500 each
@@ -102,6 +105,53 @@ def read_idr(
         files=tuple(files),
         without_depth=tuple(without_depth),
     )
+
+
+def write_idr(root: Path, scan: str, views: Sequence[DtuView], *, with_depth: bool = True) -> Path:
+    """Write views as the folder of one scan, with a mask for every view that has one; returns it.
+
+    The sphere around the object is about the point that the cameras' axes come nearest to, and half as far from it as
+    the nearest camera.
+    """
+    folder = root / scan
+    (folder / "image").mkdir(parents=True)
+    center, radius = _sphere(views)
+    scale = np.diag([radius, radius, radius, 1.0])
+    scale[:3, 3] = center
+    matrices: dict[str, Float64] = {}
+    for number, view in enumerate(views):
+        matrices |= {f"world_mat_{number}": projection(view), f"scale_mat_{number}": scale}
+        _write_png(folder / "image" / f"{number:06d}.png", view.color[:, :, ::-1])
+        if view.mask is not None:
+            _write_png(folder / "mask" / f"{number:03d}.png", np.where(view.mask, 255, 0).astype(np.uint8))
+        if with_depth:
+            (folder / "depth").mkdir(exist_ok=True)
+            write_pfm(folder / "depth" / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
+    savez(folder / CAMERAS[0], matrices)
+    return folder
+
+
+def projection(view: DtuView) -> Float64:
+    """World points [mm] to pixels, (4, 4)."""
+    k = view.intrinsics
+    T_camera_world = invert_transform(view.T_world_camera)
+    T_camera_world[:3, 3] *= MILLIMETRES
+    K = np.array([[k.fx, 0.0, k.cx, 0.0], [0.0, k.fy, k.cy, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return K @ T_camera_world
+
+
+def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
+    """Centre (3,) and radius, [mm]."""
+    centers = MILLIMETRES * np.array([view.T_world_camera[:3, 3] for view in views])
+    axes = np.array([view.T_world_camera[:3, 2] for view in views])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # what of a vector is no way along the axis
+    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
+    return middle, 0.5 * float(np.linalg.norm(centers - middle, axis=1).min())
+
+
+def _write_png(path: Path, image: UInt8) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
 
 
 def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:

@@ -5,12 +5,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.records import Intrinsics, RgbdFrame
+from splatctrl_cli.records import Bool, Intrinsics, RgbdFrame
 from splatctrl_cli.simulate.render import Camera, Renderer
 from splatctrl_cli.simulate.tabletop import furniture, things
 
 NUM_VIEWS = 8
 SIZE = (256, 208)  # width, height [px]
+LEAST_DEPTH = 1e-4  # [m] by which a thing stands before the furniture
 TARGET = (0.60, 0.02, 0.06)  # [m] the middle of the things
 
 
@@ -42,3 +43,12 @@ def views() -> Iterator[RgbdFrame]:
             intrinsics=intrinsics,
             T_world_camera=camera.T_world_camera,
         )
+
+
+def object_mask(frame: RgbdFrame) -> Bool:
+    """(H, W) True where a view shows one of the things, not the furniture."""
+    camera = Camera(
+        name=frame.camera, intrinsics=frame.intrinsics, T_world_camera=frame.T_world_camera, is_training=True
+    )
+    behind = Renderer(camera, furniture(), color_rays=0).depth([])
+    return np.asarray((frame.depth > 0) & ((behind == 0) | (frame.depth < behind - LEAST_DEPTH)))

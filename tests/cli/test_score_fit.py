@@ -10,7 +10,8 @@ import pytest
 from splatctrl_cli.cli import score_fit
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.io.dtu import read_dtu
-from tests.io.make_idr import half_size, write_idr
+from splatctrl_cli.io.idr import write_idr
+from tests.io.make_idr import half_size
 
 QUICK = ("--fit", "--fit-iterations", "6", "--fit-splats", "400", "--threads", "1")
 

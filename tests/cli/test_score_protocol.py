@@ -12,8 +12,9 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.evaluate.cloud import spaced
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
+from splatctrl_cli.io.idr import write_idr
 from splatctrl_cli.records import Float64
-from tests.io.make_idr import half_size, write_idr
+from tests.io.make_idr import half_size
 from tests.io.make_observed import write_observed
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")

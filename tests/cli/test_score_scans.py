@@ -9,7 +9,8 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.io.dtu import read_dtu
-from tests.io.make_idr import half_size, write_idr
+from splatctrl_cli.io.idr import write_idr
+from tests.io.make_idr import half_size
 
 HOLDOUT = ("--protocol", "holdout:0")
 QUICK = ("-q", "--max-splats", "300", "--set", "scene.first_iterations=4", "--set", "scene.refine_iterations=0")

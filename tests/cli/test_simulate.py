@@ -36,8 +36,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_it_writes_log_truth_robot_run_and_scan(recorded: Path) -> None:
     names = sorted(path.name for path in recorded.iterdir())
-    assert names == ["dtu", "log.mcap", "robot.urdf", "robot_spheres.yaml", "run.json", "truth.json"]
+    assert names == ["dtu", "idr", "log.mcap", "robot.urdf", "robot_spheres.yaml", "run.json", "truth.json"]
     assert sorted(path.name for path in (recorded / "dtu").iterdir()) == ["Cameras", "Depths_raw", "Rectified"]
+    assert sorted(path.name for path in (recorded / "idr" / "scan1").iterdir()) == [
+        "cameras_sphere.npz",
+        "depth",
+        "image",
+        "mask",
+    ]
     run = json.loads((recorded / "run.json").read_text())
     assert (run["command"], run["config"]["fps"], run["metrics"]["joint_states"]) == ("simulate", 5.0, 31)
 

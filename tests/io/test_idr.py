@@ -10,9 +10,8 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.io.dtu_source import DtuSource
-from splatctrl_cli.io.idr import decompose, read_idr
+from splatctrl_cli.io.idr import decompose, projection, read_idr, write_idr
 from splatctrl_cli.records import Intrinsics
-from tests.io.make_idr import projection, write_idr
 
 
 def view(number: int) -> DtuView:
@@ -34,9 +33,9 @@ VIEWS = [view(number) for number in range(3)]
 
 @pytest.mark.parametrize("scale", [1.0, -1.0, 0.37, -250.0])
 def test_a_projection_of_any_scale_gives_the_camera_back(scale: float) -> None:
-    K, T_world_camera = decompose(projection(VIEWS[1], scale)[:3], "test")
+    K, T_world_camera = decompose(scale * projection(VIEWS[1])[:3], "test")
     k = VIEWS[1].intrinsics
-    np.testing.assert_allclose(K, [[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], atol=1e-9)
+    np.testing.assert_allclose(K, np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]]), atol=1e-9)
     np.testing.assert_allclose(T_world_camera, VIEWS[1].T_world_camera, atol=1e-12)
     assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
 
