@@ -63,8 +63,9 @@ def run(args: argparse.Namespace) -> int:
     chosen = _round(selected) if args.isotropic else selected
     _check_layout(args.layout, chosen, source)
     kept = {key: value for key, value in comments.items() if key not in LAYOUT_COMMENTS}
+    name = source.name if source.name.isprintable() else ascii(source.name)
     with output_path(out, force=args.force, is_folder=False) as partial:
-        back = _write(partial, kind, chosen, {**kept, "exported_from": f"{source.name} sha256 {sha256(source)}"})
+        back = _write(partial, kind, chosen, {**kept, "exported_from": f"{name} sha256 {sha256(source)}"})
         result = {
             "file": str(out),
             "format": kind.name,

@@ -11,6 +11,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag1_log import Bag1Log
 from splatctrl_cli.io.compressed_log import UnpackedFile, UnpackedFileLog, UnpackedMessagesLog, check_compression
 from splatctrl_cli.io.db3_log import Db3Log
+from splatctrl_cli.io.listing import names_in
 from splatctrl_cli.io.mcap_log import McapLog
 from splatctrl_cli.io.raw_log import Damage, RawLog, RawMessage, Topic
 
@@ -132,7 +133,7 @@ def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:
 
 
 def _storage_files(path: Path) -> list[Path]:
-    return [p for p in sorted(path.iterdir()) if p.name.endswith((".mcap", ".db3", ".mcap.zstd", ".db3.zstd"))]
+    return [path / name for name in names_in(path) if name.endswith((".mcap", ".db3", ".mcap.zstd", ".db3.zstd"))]
 
 
 def _metadata(path: Path) -> tuple[dict[str, Any], str]:

@@ -16,6 +16,7 @@ from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.known_space import known_space
 from splatctrl_cli.io.large_log import survey_to_describe
 from splatctrl_cli.io.layouts import layout_of, open_layout, readable_in
+from splatctrl_cli.io.listing import files_below, names_in
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig import camera_topics, missing
@@ -112,6 +113,10 @@ def _first(entry: TopicSurvey) -> str:
     return "-"
 
 
+_KNOWN_FILES = ("run.json", "splats.ply", "occupancy.npz", "field.json")
+_MOST_ROWS = 1000  # of a table of files
+
+
 def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     if is_capture(path):
         return _describe_capture(path)
@@ -119,11 +124,8 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
         return describe_log(open_raw_log(path), options)
     if (layout := layout_of(path)) is not None:
         return _describe_images(path, open_layout(path, options), layout.name)
-    files = sorted(p for p in path.rglob("*") if p.is_file())
-    names = {p.relative_to(path).as_posix() for p in files}
-    is_dtu = any(name.startswith("Cameras/") for name in names) and any(
-        name.startswith("Rectified/") for name in names
-    )
+    names = {name for name in _KNOWN_FILES if (path / name).is_file()}
+    is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
         inside = readable_in(path)
         raise InputError(
@@ -135,9 +137,12 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     field = _field_facts(path / "field.json") if "field.json" in names else {}
     kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
     kind = "field folder" if field else kind
-    top = sorted(p for p in path.iterdir())
-    rows: list[list[object]] = [[p.name + "/" if p.is_dir() else p.name, _count(p), _size(p)] for p in top]
-    facts: dict[str, object] = {"files": len(files), "bytes": sum(p.stat().st_size for p in files)}
+    rows: list[list[object]] = []
+    for name in names_in(path)[:_MOST_ROWS]:
+        file = path / name
+        rows.append([name + "/" if file.is_dir() else name, *files_below(file)])
+    count, size = files_below(path)
+    facts: dict[str, object] = {"files": count, "bytes": size}
     if "splats.ply" in names:
         facts["splats"] = describe_file(path / "splats.ply").facts
     if "occupancy.npz" in names:
@@ -218,11 +223,3 @@ def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, ki
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
     return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), notes=tuple(loss.notes))
-
-
-def _count(path: Path) -> int:
-    return sum(1 for p in path.rglob("*") if p.is_file()) if path.is_dir() else 1
-
-
-def _size(path: Path) -> int:
-    return sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) if path.is_dir() else path.stat().st_size

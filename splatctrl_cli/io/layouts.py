@@ -19,6 +19,7 @@ from splatctrl_cli.io import (
 )
 from splatctrl_cli.io.folder_description import Description
 from splatctrl_cli.io.image_folder import ImageFolderSource
+from splatctrl_cli.io.listing import names_in
 from splatctrl_cli.io.options import SourceOptions
 
 _LOGS = (".mcap", ".bag", ".db3")
@@ -75,7 +76,8 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
 def readable_in(folder: Path) -> str:
     """What of a folder can be read by itself, in words; empty where nothing."""
     found = []
-    for path in sorted(folder.iterdir())[:_MOST_LOOKED_AT]:
+    for name in names_in(folder)[:_MOST_LOOKED_AT]:
+        path = folder / name
         if path.is_file() and path.suffix in _LOGS:
             found.append(path.name)
         elif path.is_dir() and (layout := layout_of(path)) is not None:

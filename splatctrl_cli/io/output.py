@@ -45,8 +45,12 @@ def output_path(
     is a folder that no command wrote, and when its parent cannot be written; WriteError where `is_write_failure`
     (a full disk); every other error as it is.
     """
-    _check_replaceable(path, is_folder=is_folder)
-    if path.exists() and not force:
+    try:
+        _check_replaceable(path, is_folder=is_folder)
+        is_there = path.exists()
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}", remedy="give another --out") from None
+    if is_there and not force:
         raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
     partial = partial_path(path)
 
@@ -116,11 +120,7 @@ def _check_replaceable(path: Path, *, is_folder: bool) -> None:
         raise UsageError(f"{path}: is a file, expected a folder to write", remedy="give another --out")
     if not is_folder and path.is_dir():
         raise UsageError(f"{path}: is a folder, expected a file to write", remedy="give another --out")
-    try:
-        is_foreign = path.is_dir() and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}", remedy="give another --out") from None
-    if is_foreign:
+    if path.is_dir() and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS):
         raise UsageError(f"{path}: was not written by splatctrl (no run.json)", remedy="give another --out")
 
 
