@@ -14,6 +14,7 @@ import numpy as np
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.io.arrays import DAMAGE, npy_of
+from splatctrl_cli.io.capture_header import check_header
 from splatctrl_cli.io.capture_index import FileSums, FrameRows
 from splatctrl_cli.io.capture_joints import read_joints
 from splatctrl_cli.io.capture_writer import COLUMNS, FORMAT, VERSION, write_capture
@@ -222,9 +223,7 @@ def read_capture_header(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{file}: expected version {VERSION}, got {header.get('version')}", remedy="use a newer splatctrl"
         )
-    for key in ("world_frame", "has_clock", "joint_names", "cameras", "loss", "sources", "name"):
-        if key not in header:
-            raise InputError(f"{file}: {key} is missing", remedy="run `splatctrl ingest` again")
+    check_header(file, header)
     _check_index(path)
     return header
 
@@ -247,5 +246,5 @@ def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | N
             return np.asarray(npy_of(data), dtype=np.float32)
         except DAMAGE:
             return None
-    counts = decode_file(data, color=False)
-    return None if counts is None else metres(counts, camera["depth_scale"])
+    counts, scale = decode_file(data, color=False), camera.get("depth_scale")
+    return None if counts is None or scale is None else metres(counts, scale)

@@ -1,0 +1,69 @@
+"""What capture.json has to say for the rest of a capture to be read by it."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import LossReport
+
+_MOST = 1 << 16  # pixels of a side
+
+
+def check_header(file: Path, header: Mapping[str, Any]) -> None:
+    """Raise InputError naming the first entry that is missing or of another kind."""
+    for name, is_right, expected in _ENTRIES:
+        if name not in header:
+            raise InputError(f"{file}: {name} is missing", remedy="run `splatctrl ingest` again")
+        if not is_right(header[name]):
+            raise InputError(f"{file}: {name}: expected {expected}", remedy="run `splatctrl ingest` again")
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _are_names(value: object) -> bool:
+    return isinstance(value, list) and all(map(_is_text, value))
+
+
+def _are_cameras(value: object) -> bool:
+    return isinstance(value, dict) and all(map(_is_camera, value.values()))
+
+
+def _is_camera(value: object) -> bool:
+    if not isinstance(value, dict):
+        return False
+    sides = [value.get(name) for name in ("width", "height")]
+    scale = value.get("depth_scale")
+    return (
+        all(isinstance(side, int) and 0 < side <= _MOST for side in sides)
+        and all(_is_number(value.get(name)) for name in ("fx", "fy", "cx", "cy"))
+        and min(value["fx"], value["fy"]) > 0
+        and (scale is None or (_is_number(scale) and scale > 0))
+    )
+
+
+def _is_loss(value: object) -> bool:
+    counts = {field.name for field in fields(LossReport)} - {"notes"}
+    return isinstance(value, dict) and all(
+        _are_names(entry) if name == "notes" else name in counts and isinstance(entry, int)
+        for name, entry in value.items()
+    )
+
+
+_ENTRIES: tuple[tuple[str, Callable[[object], bool], str], ...] = (
+    ("world_frame", _is_text, "a name"),
+    ("has_clock", lambda value: isinstance(value, bool), "true or false"),
+    ("joint_names", _are_names, "a list of names"),
+    ("cameras", _are_cameras, "by name width, height, fx, fy, cx, cy and depth_scale of each"),
+    ("loss", _is_loss, "counts by name, and notes"),
+    ("sources", lambda value: isinstance(value, dict), "sha256 by name"),
+    ("name", _is_text, "a name"),
+)
