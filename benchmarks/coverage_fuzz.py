@@ -9,6 +9,7 @@ does not end the run, and inputs at fault are kept.
 import argparse
 import hashlib
 import json
+import os
 import re
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli.cli.common import table
+from splatctrl_cli.cli.main import MAX_PIXELS
 
 MEMORY, SECONDS = 2048, 20  # [MiB], for one input
 LONGEST = 1 << 16  # bytes of an input
@@ -78,7 +80,8 @@ def campaign(name: str, folder: Path, seconds: int, keep: Path) -> Campaign:
     folder.mkdir()
     command = [sys.executable, "-m", "benchmarks.coverage_fuzz", "--one", name, str(folder), str(seconds)]
     start = time.monotonic()
-    done = subprocess.run(command, capture_output=True, check=False)
+    limits = os.environ | {"OPENCV_IO_MAX_IMAGE_PIXELS": str(MAX_PIXELS)}  # as the command line has it
+    done = subprocess.run(command, capture_output=True, check=False, env=limits)
     took = time.monotonic() - start
     statuses, started = _STATUS.findall(done.stderr), _STARTED.findall(done.stderr)
     told = folder / "faults" / "faults.json"

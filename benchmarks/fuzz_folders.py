@@ -8,10 +8,10 @@ import numpy as np
 
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.io.dtu import DtuView, write_dtu
+from splatctrl_cli.io.idr import write_idr
 from splatctrl_cli.io.output import write_json
 from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.records import Intrinsics, OccupancyGrid, SplatSet
-from tests.io.make_idr import write_idr
 from tests.io.test_layouts import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
 
 Commands = tuple[tuple[str, ...], ...]

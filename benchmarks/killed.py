@@ -139,14 +139,15 @@ def kill_and_resume(task: Task, folder: Path, num: int, moments: random.Random) 
         box.mkdir()
         target = box / task.out
         arguments = [*task.arguments, "-o", str(target)]
+        again = [*arguments, "--resume", "--force"]  # it may have been killed when all was done
         moment = moments.uniform(0.0, seconds)
         if _wait(_start(arguments), moment):
             continue
         kills += 1
         went_on += partial_path(target).exists()
-        if kills % 3 == 0 and not _wait(_start([*arguments, "--resume"]), moments.uniform(0.0, seconds)):
+        if kills % 3 == 0 and not _wait(_start(again), moments.uniform(0.0, seconds)):
             kills, twice = kills + 1, twice + 1
-        _wait(_start([*arguments, "--resume", "--force"]), None)
+        _wait(_start(again), None)
         if exact(target) != whole or partial_path(target).exists():
             faults.append(f"{task.name}, killed after {moment:.3f} s: goes on to other bytes")
     return [f"{seconds:.2f}", kills, went_on, twice, len(faults)], faults
