@@ -14,6 +14,7 @@ from splatctrl_cli.io.poses import AXES, CONVENTIONS, FORMATS, rigid
 from splatctrl_cli.io.registration import DISTORTION_MODELS
 from splatctrl_cli.records import Float64, Intrinsics
 
+SMALLEST = 1e-2  # [px] of a size or focal length
 DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
 
 
@@ -249,7 +250,7 @@ def check_camera(camera: CameraTable, where: str) -> None:
     """Raises InputError naming a size or focal length that no camera has."""
     for name in ("width", "height", "fx", "fy"):
         value = getattr(camera, name)
-        if not 0 < value < 1e5:
+        if not SMALLEST <= value < 1e5:
             raise InputError(
                 f"{where}.{name}: expected a positive number of pixels, got {value}", remedy="see docs/input.md"
             )

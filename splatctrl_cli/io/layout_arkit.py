@@ -98,9 +98,9 @@ def _lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
             remedy="download lowres_wide_intrinsics",
         )
     values = read_numbers(pincams[near])
-    if len(values) != 6:
+    if len(values) != 6 or not np.isfinite(values).all():
         raise InputError(
-            f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {len(values)} numbers",
+            f"{pincams[near]}: expected width, height, fx, fy, cx, cy, got {values}",
             remedy="copy the file again",
         )
     width, height, fx, fy, cx, cy = values

@@ -14,10 +14,8 @@ from splatctrl_cli.io.folder_description import CameraTable, DepthTable, Descrip
 from splatctrl_cli.io.layout import described, given_lens, image_size, images_of, pose_or_none
 from splatctrl_cli.io.layout_tum import paired_views
 from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.poses import read_numbers
+from splatctrl_cli.io.poses import read_numbers, stamp_of_text
 from splatctrl_cli.records import Float64
-
-_MICROSECOND_NS = 1000
 
 
 def matches(folder: Path) -> bool:
@@ -46,8 +44,8 @@ def read(folder: Path, options: SourceOptions) -> Description:
 
 
 def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
-    found = [(path.stem.partition("-")[2], path) for path in images_of(folder).values()]
-    return [(int(time) * _MICROSECOND_NS, path) for time, path in found if time.isdigit()]
+    found = [(stamp_of_text(f"{path.stem.partition('-')[2]}e-6"), path) for path in images_of(folder).values()]
+    return [(stamp_ns, path) for stamp_ns, path in found if stamp_ns is not None]
 
 
 def _poses(path: Path) -> list[Float64]:

@@ -29,6 +29,8 @@ __all__ = [
 MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
 _CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
+_PNG_HEAD = struct.Struct(">16xIIB")
+_MOST_EXPANSION = 1100  # deflate's is 1032
 _MOSAICS = frozenset({*BAYER, *BAYER_16})
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 
@@ -160,6 +162,8 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
     """
     if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
         return None
+    if data.startswith(PNG) and _says_more_than_it_holds(data):
+        return None
     if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
         return None
     flags = cv2.IMREAD_COLOR if color else cv2.IMREAD_UNCHANGED
@@ -171,6 +175,14 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
     except cv2.error:
         return None
     return None if pixels is None else np.asarray(pixels)
+
+
+def _says_more_than_it_holds(png: bytes) -> bool:
+    """Whether a PNG's head announces an image that its bytes cannot unpack to, for which memory would be taken."""
+    if len(png) < _PNG_HEAD.size:
+        return True
+    width, height, bits = _PNG_HEAD.unpack_from(png)
+    return bool(width * height * bits // 8 > _MOST_EXPANSION * len(png))
 
 
 def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:

@@ -18,6 +18,7 @@ FORMATS = ("matrix-blocks", "trajectory-log", "tum", "nerfstudio", "matrix-files
 CONVENTIONS = ("camera_to_world", "world_to_camera")
 AXES = ("opencv", "opengl")
 OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+_MOST_NS = 1 << 62
 MAX_ENTRY = 1e6  # [m] of a pose
 POSE_TOLERANCE_NS = 20_000_000  # before the first and after the last pose of a trajectory
 _MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes what is no number (12-Scenes)
@@ -155,9 +156,10 @@ class Trajectory:
 
 
 def stamp_of_text(text: str) -> int | None:
-    """Nanoseconds of seconds as written, without the rounding of floats; None where the text is no number."""
+    """Nanoseconds of seconds as written, without the rounding of floats; None where the text is no time."""
     try:
-        return round(Decimal(text) * 1_000_000_000)
+        stamp_ns = round(Decimal(text) * 1_000_000_000)
+        return stamp_ns if abs(stamp_ns) < _MOST_NS else None
     except (InvalidOperation, ValueError, OverflowError):
         return None
 

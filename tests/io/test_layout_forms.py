@@ -15,6 +15,7 @@ from splatctrl_cli.io import layout_nerfstudio
 from splatctrl_cli.io.layout_frames import COLOR_LENS, DEPTH_LENS, T_COLOR_DEPTH
 from splatctrl_cli.io.layout_tum import marker_to_camera
 from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.poses import stamp_of_text
 from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from tests.io.make_layout import (
@@ -363,3 +364,23 @@ def test_a_depth_unit_that_is_none_is_refused(tmp_path: Path, scale: float) -> N
     with pytest.raises(InputError, match=r"depth of frame_0: expected metres per count, got .*give --depth-scale"):
         open_source(folder)
     assert frames_of(folder, SourceOptions(depth_scale=1e-3))[0].depth[1, 1] > 1.0
+
+
+@pytest.mark.parametrize("text", ["1e300", "-99999999999999999999", "nan", "inf", "x"])
+def test_a_stamp_that_is_no_time_is_none(text: str) -> None:
+    assert stamp_of_text(text) is None
+
+
+def test_a_lens_of_arkit_scenes_that_is_none_is_refused(tmp_path: Path) -> None:
+    folder = make_arkit(tmp_path)
+    next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text("inf 6 10 11 3.5 2.5")
+    with pytest.raises(InputError, match=r"expected width, height, fx, fy, cx, cy, got .*copy the file again"):
+        open_source(folder)
+
+
+def test_a_focal_length_of_next_to_nothing_is_refused(tmp_path: Path) -> None:
+    folder = make_scannet(tmp_path, (WIDTH // 2, HEIGHT // 2))
+    file = folder / "intrinsic/intrinsic_depth.txt"
+    file.write_text(file.read_text().replace("5.0", "1e-320"))
+    with pytest.raises(InputError, match="expected a positive number of pixels, got 1e-320"):
+        open_source(folder)

@@ -1,6 +1,7 @@
 """Image messages: encodings, byte order, row step."""
 
 import struct
+import zlib
 from types import SimpleNamespace
 from typing import Any
 
@@ -372,3 +373,12 @@ def test_other_pixels_in_a_file_are_neither_colour_nor_depth() -> None:
     recorded = file_message("64FC1; tiff compressed ", ".tiff", np.ones((4, 4), np.float64))
     with pytest.raises(UndecodableMessageError, match="pixels of float64, neither colour nor depth"):
         read_image(recorded, COMPRESSED_IMAGE)
+
+
+def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_memory_is_taken() -> None:
+    png = bytes(cv2.imencode(".png", np.zeros((64, 64), np.uint16))[1])
+    assert decode_file(png, color=False) is not None  # a flat image, packed as well as can be
+    head = struct.pack(">II", 30_000, 30_000) + png[24:29]
+    bomb = png[:16] + head + struct.pack(">I", zlib.crc32(b"IHDR" + head)) + png[33:]
+    assert decode_file(bomb, color=False) is None
+    assert decode_file(png[:20] + png[-12:], color=False) is None
