@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from splatctrl_cli.cli.common import Console, check_gate_names, check_gates, configured, table
 from splatctrl_cli.cli.score_cloud import cloud_settings
 from splatctrl_cli.cli.score_fit_picture import draw_methods
-from splatctrl_cli.cli.score_reference import words
+from splatctrl_cli.cli.score_reference import is_folder_of_views, words
 from splatctrl_cli.cli.score_report import cell, protocol_lines
 from splatctrl_cli.cli.score_scans import masks_of_scan
 from splatctrl_cli.errors import InputError, UsageError
@@ -81,8 +81,8 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--fit",
         action="store_true",
-        help="fit the scans of --dtu (--scan A,B; default: all), or the folder of --reference, with both methods,"
-        f" then score them (default protocol of scans: {PROTOCOL})",
+        help="fit the scans of --dtu (--scan A,B; default: all), or the image folder of --reference, with both"
+        f" methods, then score them (default protocol of scans: {PROTOCOL})",
     )
     group.add_argument(
         "--fit-iterations", type=int, metavar="N", help="of each method (default: those of the configuration, 2300)"
@@ -138,9 +138,9 @@ def _refuse(args: argparse.Namespace) -> None:
         raise UsageError(f"--fit: makes the scenes itself, got {args.scene}", remedy="leave SCENE or --fit out")
     if args.dtu is not None and args.holdout:
         raise UsageError("--fit: goes by a protocol", remedy=f"give --protocol holdout:{args.holdout}")
-    if args.reference is not None and args.reference.suffix != ".toml":
+    if args.reference is not None and not is_folder_of_views(args.reference):
         raise UsageError(
-            f"--fit: expected scans (--dtu) or the TOML of an image folder, got {args.reference}",
+            f"--fit: expected scans (--dtu) or an image folder, got {args.reference}",
             remedy="the baseline fits views of a scene that stands still",
         )
 

@@ -81,9 +81,10 @@ def open_held_out(args: argparse.Namespace, path: Path) -> tuple["RecordSource",
     from splatctrl_cli.io.source import open_source
 
     protocol = score_protocol(args.protocol)
-    if path.suffix != ".toml" or not args.protocol.startswith("holdout:"):
+    if not is_folder_of_views(path) or not args.protocol.startswith("holdout:"):
         raise UsageError(
-            f"--protocol {args.protocol}: expected --dtu, or holdout:RULE and the TOML of an image folder",
+            f"--protocol {args.protocol}: expected --dtu, or holdout:RULE and an image folder (its TOML, or that"
+            " of a dataset)",
             remedy="leave --protocol out, or give --dtu ROOT",
         )
     if args.holdout:
@@ -92,6 +93,14 @@ def open_held_out(args: argparse.Namespace, path: Path) -> tuple["RecordSource",
     numbers = range(sum(1 for _ in open_source(path, options).poses()))
     split = protocol.split(numbers, str(path))
     return open_source(path, replace(options, holdout=tuple(map(str, split.scored)))), protocol, split
+
+
+def is_folder_of_views(path: Path) -> bool:
+    """Whether a recording is images in a folder, by a TOML or in a dataset's layout; not a log, not a capture."""
+    from splatctrl_cli.io.bag_log import is_bag_folder
+    from splatctrl_cli.io.capture import is_capture
+
+    return path.suffix == ".toml" or (path.is_dir() and not is_capture(path) and not is_bag_folder(path))
 
 
 def refuse_scan_options(args: argparse.Namespace) -> None:

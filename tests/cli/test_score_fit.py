@@ -105,7 +105,7 @@ def test_bad_usage_is_refused_before_anything_is_fitted(
 
 def test_a_log_has_no_baseline(sample_data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["score", "--reference", str(sample_data / "tabletop" / "log.mcap"), *QUICK]) == 2
-    assert "expected scans (--dtu) or the TOML of an image folder" in capsys.readouterr().err
+    assert "expected scans (--dtu) or an image folder, got " in capsys.readouterr().err
 
 
 def test_what_reconstruct_refuses_is_passed_on(

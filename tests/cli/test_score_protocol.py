@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.cli.score_reference import is_folder_of_views
 from splatctrl_cli.evaluate.cloud import spaced
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.io.idr import write_idr
@@ -132,6 +133,14 @@ def test_bad_usage_names_the_thing(
 ) -> None:
     assert run(place, "mvsnet", *arguments) == 2
     assert message in capsys.readouterr().err
+
+
+def test_images_in_a_folder_are_told_from_logs_and_captures(tmp_path: Path) -> None:
+    for name, content in (("views/transforms.json", "{}"), ("capture/capture.json", "{}"), ("bag/metadata.yaml", "")):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(content)
+    names = ("views", "capture", "bag", "log.mcap", "views.toml")
+    assert [is_folder_of_views(tmp_path / name) for name in names] == [True, False, False, False, True]
 
 
 def test_pictures_of_every_view_of_the_extremes_or_none(place: Path, tmp_path: Path) -> None:
