@@ -15,6 +15,7 @@ from splatctrl_cli.cli.common import (
     check_gate_names,
     check_gates,
 )
+from splatctrl_cli.cli.score_baseline import PREFIX, add_baseline, changes, read_baseline
 from splatctrl_cli.cli.score_cloud import add_cloud, cloud_figures, cloud_settings
 from splatctrl_cli.cli.score_fit import add_fit, run_fit
 from splatctrl_cli.cli.score_reference import (
@@ -84,6 +85,7 @@ def register(subparsers: Subparsers) -> None:
         "--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none come along"
     )
     add_cloud(parser)
+    add_baseline(parser)
     add_fit(parser)
     add_source(parser)
     add_output(parser, default="none, the scores are only printed", what="folder for scores and pictures")
@@ -103,7 +105,9 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) != default:
             raise UsageError(f"--{name.replace('_', '-')}: only with --fit", remedy="leave it out")
     names = _gated()
-    check_gate_names(args.require, names)
+    changed = [PREFIX + name for name in names]
+    earlier = None if args.baseline is None else read_baseline(args.baseline)
+    check_gate_names(args.require, [*names, *changed] if earlier else names, {"--baseline": changed})
     console = Console(args)
     from splatctrl_cli.io.output import output_path
 
@@ -115,8 +119,10 @@ def run(args: argparse.Namespace) -> int:
         else:
             result, source = score_scene(args, console, folder)
             is_damaged = bool(source.loss.damaged)
+    if earlier is not None:
+        result["metrics"] |= changes(result, earlier, args.baseline)
     console.result(result, lines_of_scans(result) if scenes else lines_of(result))
-    check_gates(args.require, dict.fromkeys(names, None) | result["metrics"])
+    check_gates(args.require, dict.fromkeys([*names, *changed], None) | result["metrics"])
     return DAMAGED if is_damaged else 0
 
 

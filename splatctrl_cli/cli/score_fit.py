@@ -136,6 +136,8 @@ def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
 def _refuse(args: argparse.Namespace) -> None:
     if args.scene is not None:
         raise UsageError(f"--fit: makes the scenes itself, got {args.scene}", remedy="leave SCENE or --fit out")
+    if args.baseline is not None:
+        raise UsageError("--baseline: not with --fit", remedy="score the scenes that --fit -o leaves")
     if args.dtu is not None and args.holdout:
         raise UsageError("--fit: goes by a protocol", remedy=f"give --protocol holdout:{args.holdout}")
     if args.reference is not None and not is_folder_of_views(args.reference):

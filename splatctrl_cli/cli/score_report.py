@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import table
+from splatctrl_cli.cli.score_baseline import PREFIX, change_cells
 from splatctrl_cli.cli.score_cloud import CloudSettings
 from splatctrl_cli.cli.score_reference import Reference
 from splatctrl_cli.cli.score_views import Scores
@@ -151,8 +152,9 @@ def lines_of(result: dict[str, Any]) -> list[str]:
         for view, stamp in zip(result["views"], stamps, strict=True)
     ]
     views.append([f"mean of {metrics['num_views']:.0f}", "-", *(cell(name, metrics[name]) for name in columns)])
-    lines = table(("view", "stamp [s]", *(COLUMNS[name] for name in columns)), views)
-    lines.insert(len(lines) - 1, lines[1])
+    changed = ["change", "-", *change_cells(columns, metrics)]
+    lines = table(("view", "stamp [s]", *(COLUMNS[name] for name in columns)), with_change(views, changed, metrics))
+    lines.insert(2 + len(result["views"]), lines[1])
     lines += ["", *protocol_lines(result["protocol"])]
     lines.append(
         f"{_count(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
@@ -165,6 +167,11 @@ def lines_of(result: dict[str, Any]) -> list[str]:
     if metrics["free_mass"] is not None:
         lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")
     return lines
+
+
+def with_change(rows: list[list[Any]], change: list[Any], metrics: Mapping[str, Any]) -> list[list[Any]]:
+    """The rows of a table, and that of the changes where there was a baseline."""
+    return [*rows, change] if f"{PREFIX}num_views" in metrics else rows
 
 
 def protocol_lines(protocol: dict[str, Any]) -> list[str]:

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.score_baseline import change_cells
 from splatctrl_cli.cli.score_reference import words
-from splatctrl_cli.cli.score_report import COLUMNS, cell, cloud_lines, protocol_lines
+from splatctrl_cli.cli.score_report import COLUMNS, cell, cloud_lines, protocol_lines, with_change
 from splatctrl_cli.errors import InputError
 
 if TYPE_CHECKING:
@@ -125,8 +126,11 @@ def lines_of_scans(result: dict[str, Any]) -> list[str]:
         for scan, one in results.items()
     ]
     last = [f"mean of {len(results)}", metrics["num_views"], *(cell(name, metrics[name]) for name in columns)]
-    lines = table(("scan", "views", *(COLUMNS[name] for name in columns)), [*rows, last])
-    lines.insert(len(lines) - 1, lines[1])
+    changed = ["change", "-", *change_cells(columns, metrics)]
+    lines = table(
+        ("scan", "views", *(COLUMNS[name] for name in columns)), with_change([*rows, last], changed, metrics)
+    )
+    lines.insert(2 + len(rows), lines[1])
     lines += ["", *protocol_lines(result["protocol"])]
     if "chamfer" in metrics:
         lines += cloud_lines(metrics, "; ".join(one["protocol"]["definitions"]["cloud"] for one in results.values()))

@@ -167,6 +167,30 @@ def test_warnings_are_printed_counted_and_can_be_gated(
     assert scored(capsys, place, "mvsnet", "--require", "num_warnings<=0")["warnings"] == []
 
 
+def test_figures_are_compared_with_those_of_an_earlier_score(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("--protocol", HOLDOUT, "-q")
+    assert run(place, "mvsnet", *given, "--images", "none", "-o", tmp_path / "out") == 0
+    path = tmp_path / "out" / "score.json"
+    earlier = json.loads(path.read_text())
+    earlier["metrics"]["psnr_all"] += 1.5
+    path.write_text(json.dumps(earlier))
+    gate = ("--baseline", path, "--require", "change_psnr_all>=-1", "--require", "change_ssim_all>=0")
+    capsys.readouterr()
+    assert run(place, "mvsnet", *given, *gate) == 1
+    said = capsys.readouterr()
+    assert said.err == "splatctrl: gate failed: change_psnr_all is -1.5, required >= -1\n"
+    (change,) = [line.split() for line in said.out.splitlines() if line.startswith("change")]
+    assert change[1:6] == ["-", "+0.00", "-1.50", "+0.0000", "+0.0000"]
+    assert run(place, "mvsnet", *given, *gate[2:]) == 2
+    assert "change_psnr_all>=-1: a figure of --baseline; give it" in capsys.readouterr().err
+    assert run(place, "mvsnet", *given, "--masks", place / "masks", "--baseline", path) == 4
+    assert "not comparable: mask_rule: expected object mask, got none; score the base" in capsys.readouterr().err
+    assert run(place, "mvsnet", *given, "--baseline", tmp_path / "out" / "run.json") == 4
+    assert "run.json: expected the score.json of an earlier score" in capsys.readouterr().err
+
+
 def surface(views: list[DtuView]) -> Float64:
     """What the views' depth measured [m], world."""
     parts = []
