@@ -146,7 +146,7 @@ def check_gate_names(
                 raise UsageError(f"--require {requirement}: a figure of {options}", remedy="give it, or gate another")
         if name not in names:
             near = difflib.get_close_matches(name, names, n=1)
-            choices = ", ".join(list(names)[:8]) + (", ..." if len(names) > 8 else "")
+            choices = ", ".join(names)
             raise UsageError(
                 f"--require {requirement}: unknown metric",
                 remedy=f"did you mean {near[0]}?" if near else f"known here: {choices}",

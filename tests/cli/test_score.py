@@ -256,6 +256,7 @@ def test_a_training_camera_is_scored_only_when_allowed(scored: Path, capsys: pyt
     [
         (["--cameras", "cam9"], 4, "fake.mcap: no camera 'cam9'; use one of: cam0, cam3"),
         (["--require", "sharpness>=1"], 2, "unknown metric; known here: num_views, valid_share, "),
+        (["--require", "sharpness>=1"], 2, ", chamfer, accuracy_beyond, "),
         (["--require", "psnr_sen>=1"], 2, "unknown metric; did you mean psnr_seen?"),
         (["--require", "psnr_seen"], 2, "--require psnr_seen: expected METRIC>=NUMBER"),
         (["--require", "psnr_seen>=nan"], 2, "--require psnr_seen>=nan: expected METRIC>=NUMBER"),
