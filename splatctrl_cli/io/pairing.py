@@ -8,8 +8,16 @@ from numpy.typing import NDArray
 Stamps = Sequence[int] | NDArray[np.int64]
 
 
+_BLOCK = 1 << 14  # pairs that are Python's numbers at once
+
+
 def pair_by_stamp(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> list[tuple[int, int]]:
-    """Index pairs (colour, depth) at most `tolerance_ns` apart, each index once, the closest pairs first.
+    """`paired` as a list of (colour, depth)."""
+    return [(i, j) for i, j in paired(color_ns, depth_ns, tolerance_ns).tolist()]
+
+
+def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.int64]:
+    """Index pairs (K, 2) of colour and depth at most `tolerance_ns` apart, each index once, the closest pairs first.
 
     Returned by colour stamp. Of equally close pairs the earlier one wins.
     """
@@ -20,10 +28,13 @@ def pair_by_stamp(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> list
     i = np.repeat(np.arange(len(color)), count)  # every pair that is close enough
     j = order[np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)]
     closest = np.lexsort((j, i, depth[j], color[i], np.abs(color[i] - depth[j])))
-    is_free_color, is_free_depth = np.ones(len(color), dtype=np.bool_), np.ones(len(depth), dtype=np.bool_)
-    pairs: list[tuple[int, int]] = []
-    for a, b in zip(i[closest].tolist(), j[closest].tolist(), strict=True):
-        if is_free_color[a] and is_free_depth[b]:
-            is_free_color[a] = is_free_depth[b] = False
-            pairs.append((a, b))
-    return sorted(pairs, key=lambda pair: (color[pair[0]], pair[0]))
+    partner = np.full(len(color), -1, dtype=np.int64)
+    is_free = np.ones(len(depth), dtype=np.bool_)
+    for start in range(0, len(closest), _BLOCK):
+        block = closest[start : start + _BLOCK]
+        for a, b in zip(i[block].tolist(), j[block].tolist(), strict=True):
+            if is_free[b] and partner[a] < 0:
+                is_free[b], partner[a] = False, b
+    found = np.flatnonzero(partner >= 0)
+    found = found[np.argsort(color[found], kind="stable")]
+    return np.stack([found, partner[found]], axis=1)

@@ -20,7 +20,7 @@ from splatctrl_cli.io.masks import human_mask, mask_by_color
 from splatctrl_cli.io.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid
 from splatctrl_cli.io.options import SourceOptions, still_note
 from splatctrl_cli.io.output import sha256
-from splatctrl_cli.io.pairing import pair_by_stamp
+from splatctrl_cli.io.pairing import paired
 from splatctrl_cli.io.planned_images import PlannedImages, keeps_files
 from splatctrl_cli.io.raw_log import Damage, RawLog
 from splatctrl_cli.io.rig import Camera, build_cameras, nearest_gap_ns
@@ -103,7 +103,7 @@ class RosLogSource:
                 self._images(found, topic) for topic in (camera.color_topic, camera.depth_topic)
             )
             tolerance_ns = round(self._options.pairing_tolerance_s * _SECOND)
-            pairs = np.array(pair_by_stamp(color_ns, depth_ns, tolerance_ns), dtype=np.int64).reshape(-1, 2)
+            pairs = paired(color_ns, depth_ns, tolerance_ns)
             if not len(pairs):
                 gap = nearest_gap_ns(color_ns.tolist(), depth_ns.tolist()) / _SECOND
                 raise InputError(
