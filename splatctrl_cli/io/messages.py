@@ -178,11 +178,14 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 
 
 def _says_more_than_it_holds(png: bytes) -> bool:
-    """Whether a PNG's head announces an image that its bytes cannot unpack to, for which memory would be taken."""
+    """Whether a PNG announces an image, or a chunk, that its bytes do not hold: OpenCV takes memory for either."""
     if len(png) < _PNG_HEAD.size:
         return True
     width, height, bits = _PNG_HEAD.unpack_from(png)
-    return bool(width * height * bits // 8 > _MOST_EXPANSION * len(png))
+    at, end = len(PNG), len(png)
+    while at < end and png[at + 4 : at + 8] != b"IEND":
+        at += 12 + int.from_bytes(png[at : at + 4], "big")
+    return bool(at + 12 > end or width * height * bits // 8 > _MOST_EXPANSION * end)
 
 
 def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:

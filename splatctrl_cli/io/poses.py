@@ -86,7 +86,8 @@ def read_tum(path: Path) -> dict[str, Float64]:
     """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written."""
     poses: dict[str, Float64] = {}
     for where, words, values in read_rows(path):
-        if len(values) != 8 or not 0 < np.linalg.norm(values[4:]) < np.inf:
+        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_ENTRY).all())
+        if not is_pose or np.linalg.norm(values[4:]) == 0:
             raise InputError(
                 f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",
                 remedy="check [poses] format and file",

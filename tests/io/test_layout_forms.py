@@ -371,6 +371,15 @@ def test_a_stamp_that_is_no_time_is_none(text: str) -> None:
     assert stamp_of_text(text) is None
 
 
+@pytest.mark.parametrize("word", ["nan", "inf", "1e200"])
+def test_a_pose_of_tum_that_is_none_is_named_by_its_line(tmp_path: Path, word: str) -> None:
+    folder = make_tum(tmp_path / "fr3_x")
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join([*lines, f"1305031109.0 {word} 0 0 {word} 0 0 1"]))
+    with pytest.raises(InputError, match=r"groundtruth.txt:8: expected 'stamp tx ty tz qx qy qz qw'"):
+        open_source(folder)
+
+
 def test_a_lens_of_arkit_scenes_that_is_none_is_refused(tmp_path: Path) -> None:
     folder = make_arkit(tmp_path)
     next((folder / "41069021_frames/lowres_wide_intrinsics").iterdir()).write_text("inf 6 10 11 3.5 2.5")

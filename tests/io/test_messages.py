@@ -382,3 +382,5 @@ def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_me
     bomb = png[:16] + head + struct.pack(">I", zlib.crc32(b"IHDR" + head)) + png[33:]
     assert decode_file(bomb, color=False) is None
     assert decode_file(png[:20] + png[-12:], color=False) is None
+    assert decode_file(png[:33] + b"\x7f" + png[34:], color=False) is None  # a chunk of two gigabytes
+    assert decode_file(png + b"behind the end", color=False) is not None
