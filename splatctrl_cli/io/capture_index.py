@@ -44,10 +44,15 @@ class FrameRows(Sequence[Mapping[str, str]]):
         return len(self._offsets)
 
     def __getitem__(self, number: int) -> Mapping[str, str]:  # type: ignore[override]
-        """A row by its number."""
-        with self._file.open("rb") as stream:
-            _, values = next(_rows(stream, self._offsets[number]))
-        return self._row(values)
+        """A row by its number. Raises InputError where the file is no longer what it was."""
+        try:
+            with self._file.open("rb") as stream:
+                _, values = next(_rows(stream, self._offsets[number]), (0, []))
+            row = self._row(values)
+            _check(row)
+        except (UnicodeDecodeError, csv.Error, ValueError, TypeError):
+            raise InputError(f"{self._file}: changed while it was read", remedy="try again") from None
+        return row
 
     def _row(self, values: Sequence[str]) -> Mapping[str, str]:
         return dict(zip(self._names, values, strict=True))

@@ -96,6 +96,9 @@ class PlannedImages:
                 position += 1
                 if position < num:
                     planned = self._plan[position]
+        if position < num:
+            name = self._log.path.name
+            damage.add(f"{name}: {num - position} frames that were there are gone: it changed while it was read")
 
     def _take(self, key: Key) -> RawMessage:
         topic, number = key
