@@ -173,7 +173,7 @@ def _arrays(made: Path, folder: Path) -> list[Reader]:
     (made / "field").mkdir()
     grids = {p.suffix: p for p in write_grid(made / "field", random_grid("sdf", "gradient"), ["npz", "vti", "nrrd"])}
     read = _file(folder, "x.npz", lambda path: read_arrays(path, most=1 << 20))
-    damage = (*DAMAGE, SplatCtrlError)
+    damage = (*DAMAGE, SplatCtrlError, OSError)
     return [
         Reader(name="arrays", read=read, seeds=_bytes(arrays), errors=damage),
         Reader(name="npy", read=npy_of, seeds=_bytes(made / "a.npy"), errors=damage),

@@ -52,7 +52,7 @@ def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, lev
 def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) -> dict[str, NDArray[np.generic]]:
     """The arrays `names` (default: all) of a ``.npz``, of together at most `most` bytes.
 
-    Raises FileNotFoundError, KeyError for an array that is not there, ValueError for objects, for more bytes than
+    Raises OSError, KeyError for an array that is not there, ValueError for objects, for more bytes than
     `most` and for other bytes than the array's own head says, and what is in `DAMAGE`.
     """
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:

@@ -93,7 +93,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     except IsADirectoryError:
         raise InputError(f"{path}: expected a file, got a folder", remedy="give the field.npz in it") from None
     except (*DAMAGE, OSError) as error:
-        if isinstance(error, OSError) and error.errno != errno.EINVAL:  # which is a place before the file's start
+        if isinstance(error, OSError) and error.errno not in {None, errno.EINVAL}:  # bz2's; a place before the start
             raise
         raise InputError(f"{path}: not a whole distance grid: {error}", remedy="bake it again") from None
 
