@@ -172,7 +172,8 @@ def _missing_views(source: "DtuSource", protocol: "ScoreProtocol | None") -> lis
             " than of a whole scan; add the views, or name those to score as holdout:0,8"
         )
     if source.has_depth and source.loss.notes:
-        lines.append(f"{len(source.loss.notes)} views lack depth, such as {source.loss.notes[0]}")
+        more = len(source.loss.notes) - 1
+        lines.append(source.loss.notes[0] + (f" (and {more} more)" if more else ""))
     return lines
 
 

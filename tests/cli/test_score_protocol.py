@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.cli.score_reference import is_folder_of_views
+from splatctrl_cli.cli.score_reference import _missing_views, is_folder_of_views
 from splatctrl_cli.evaluate.cloud import spaced
 from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
+from splatctrl_cli.io.dtu_source import DtuSource
 from splatctrl_cli.io.idr import write_idr
+from splatctrl_cli.io.protocols import score_protocol
 from splatctrl_cli.records import Float64
 from tests.io.make_idr import half_size
 from tests.io.make_observed import write_observed
@@ -189,6 +191,23 @@ def test_figures_are_compared_with_those_of_an_earlier_score(
     assert "not comparable: mask_rule: expected object mask, got none; score the base" in capsys.readouterr().err
     assert run(place, "mvsnet", *given, "--baseline", tmp_path / "out" / "run.json") == 4
     assert "run.json: expected the score.json of an earlier score" in capsys.readouterr().err
+
+
+def test_views_that_are_missing_are_named(
+    place: Path, views: list[DtuView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_dtu(tmp_path / "dtu", "scan1", views)
+    (tmp_path / "dtu/Depths_raw/scan1/depth_map_0004.pfm").unlink()
+    scene = ["score", str(place / "scene"), "--dtu", str(tmp_path / "dtu"), "--protocol"]
+    assert main([*scene, "holdout:every5", "-q"]) == 2
+    assert "of which 0 did not train the scene, and 1 others did" in capsys.readouterr().err
+    assert main([*scene, "holdout:0,4", "-q"]) == 4
+    assert "got no view 4; the scan has views 0-3, 5-7" in capsys.readouterr().err
+    reference = DtuSource(tmp_path / "dtu", protocol=score_protocol("holdout:every5"))
+    first, second = _missing_views(reference, score_protocol("holdout:every5"))
+    assert first.startswith("dtu/scan1: views 4 are not there: 'holdout:every5' counts those that are, and scores")
+    assert second == "rect_005_3_r5000.png: without depth, left out"
+    assert _missing_views(DtuSource(place / "mvsnet"), score_protocol("holdout:every5")) == []
 
 
 def surface(views: list[DtuView]) -> Float64:
