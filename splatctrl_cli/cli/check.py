@@ -1,6 +1,7 @@
 """``splatctrl check``: what is wrong with a recording, before it costs an hour."""
 
 import argparse
+import statistics
 import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
@@ -124,8 +125,10 @@ def _agreement(report: "CheckReport") -> list["Finding"]:
         remedy += f", or keep one with --cameras {both[0]}" if len(both) > 1 else ": is it the pose of another frame?"
         findings.append(error("agreement", where, text, remedy, value=round(1e3 * pair.median, 2), unit="mm"))
     if good:
-        text = f"where two views see one surface their depths differ by {1e3 * max(good):.1f} mm at most"
-        text += f" (medians of {len(good)} pairs of cameras, each with itself included)"
+        text = f"where views see one surface their depths differ by {1e3 * max(good):.1f} mm (median of its pixels)"
+        if len(good) > 1:
+            middle = 1e3 * statistics.median(good)
+            text = f"{text} in the worst of {len(good)} pairs of cameras or views of one, by {middle:.1f} mm in most"
         findings.append(note("agreement", "cameras", text, value=round(1e3 * max(good), 2), unit="mm"))
     return findings
 
@@ -149,6 +152,7 @@ def _lines(report: "CheckReport") -> Iterator[str]:
         yield ""
         yield from table(["topic", "messages", "hz", "longest gap s", "delay s"], [*map(_rate_row, rates)])
     if len(rates) < len(report.rates):
+        yield from () if rates else ("",)
         others = len(report.rates) - len(rates)
         yield f"{others} topic{'' if others == 1 else 's'} that no command reads"
     yield ""

@@ -22,6 +22,7 @@ MIN_PIXELS = 100
 CLOSE_NS = 100_000_000  # between a frame and the joint states around it
 ROWS = 60  # of an image
 NUM_SWAPPED = 8  # frames that exchanged joints are tried on
+SWAPPED = 0.4  # of the misfit that may remain
 REACH, STEP, FINE = 0.32, 0.04, 0.02  # [s] of clock offsets that are tried, and between them, first and then
 CHEAPER, SAVED = 0.9, 0.0005  # [-], [m] of the misfit at offset 0 that a better one must reach
 MAX_SPREAD, OTHER_SCALE = 0.04, 0.04  # [-] of depth over predicted depth: its spread, and its departure from 1
@@ -161,7 +162,7 @@ def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Post
         agreement = arm_agreement(model, few, _exchanged(posture, i, j))
         if agreement is not None and agreement.is_good and (best is None or agreement.misfit < best[0]):
             best = agreement.misfit, (i, j)
-    if best is None or plain is None or best[0] > 0.6 * plain.misfit:
+    if best is None or plain is None or best[0] > SWAPPED * plain.misfit:
         return None
     return best[1]
 

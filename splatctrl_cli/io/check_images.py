@@ -13,10 +13,10 @@ from splatctrl_cli.io.shot import PLAUSIBLE_DEPTH
 from splatctrl_cli.records import Float32, Intrinsics, UInt8
 
 ROWS = 240  # that a kept depth image has at most
-NUM_KEPT = 8  # depth images of a camera
+NUM_KEPT = 12  # depth images of a camera
 COLUMNS = 64  # of a thumbnail, as motion is judged by (state_motion)
 NUM_THUMBNAILS = 300
-NUM_DECODED = 400
+NUM_DECODED = 300
 LITTLE_DEPTH, SOME_DEPTH = 0.10, 0.5  # of the pixels
 SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 TABLE_DEPTH = (0.15, 8.0)  # [m] between which a median is no surprise

@@ -9,7 +9,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.check_alignment import alignment_findings
 from splatctrl_cli.io.check_cameras import calibration_findings, tf_findings
 from splatctrl_cli.io.check_images import depth_findings, image_findings, sample_findings, thumbnail_lens
-from splatctrl_cli.io.check_report import CheckReport, needs, usable_frames
+from splatctrl_cli.io.check_report import CheckReport, damage_findings, needs, usable_frames
 from splatctrl_cli.io.check_rig import CheckedCamera, camera_findings, checked_camera, nearest, ready
 from splatctrl_cli.io.check_robot import motion_findings
 from splatctrl_cli.io.check_states import log_states
@@ -52,7 +52,7 @@ def check_log(
     options.refuse(("root", "holdout"), "a log", log.path)
     watch = LogWatch(log, options, num_images)
     found = survey(watch, by_log_time=options.stamps == "log")
-    findings = [warning("damaged", log.path.name, text, "copy the file again") for text in found.damage.notes]
+    findings = damage_findings(log.path.name, found.damage.notes)
     findings += file_findings(watch.spans)
     cameras = _chosen(log, found, options)
     rig = [(topics, ready(log, found, topics, options)) for topics in cameras]

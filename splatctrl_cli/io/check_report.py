@@ -1,10 +1,11 @@
 """The shape of what `check` says about a recording, and what each later command would lack."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from splatctrl_cli.io.check_times import Rate
-from splatctrl_cli.io.finding import ORDER, Finding, Severity, worst_first
+from splatctrl_cli.io.finding import ORDER, Finding, Severity, warning, worst_first
 from splatctrl_cli.records import RgbdFrame
 
 
@@ -109,6 +110,15 @@ def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
         Need(command="reconstruct", lacks=()),
         Need(command="score", lacks=scoring),
         Need(command="replay", lacks=(states_lack,) if states_lack else ()),
+    ]
+
+
+def damage_findings(where: str, notes: Sequence[str]) -> list[Finding]:
+    """One for each kind of damage, with how often it is met."""
+    remedy = "copy the file again; if it stays, look at what wrote these messages"
+    return [
+        warning("damaged", where, text if num == 1 else f"{text} ({num} times)", remedy, value=num)
+        for text, num in Counter(notes).items()
     ]
 
 

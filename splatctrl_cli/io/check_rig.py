@@ -23,6 +23,7 @@ from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 MIN_PAIRED = 0.95  # of the images of the rarer topic
 LATE_PAIR = 0.010  # [s] between colour and depth at which an arm at 1 m/s is 1 cm apart
 MAX_PAIRED = 20_000  # stamps of a topic that are paired
+FEWEST = 5  # images that a rate is judged by
 SLOWER = 1.5  # of the images of one topic that the other has at least, for a note
 
 
@@ -140,7 +141,7 @@ def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> lis
         text = f"{len(pairs)} of {rarer} images find a partner within {1e3 * options.pairing_tolerance_s:g} ms"
         remedy = "let the driver synchronise colour and depth, or give --pairing-tolerance"
         findings.append(warning("pairing", where, text, remedy, value=len(pairs) / rarer))
-    if other > SLOWER * rarer and max(len(color), len(depth)) < MAX_PAIRED:
+    if other > SLOWER * rarer and rarer >= FEWEST and max(len(color), len(depth)) < MAX_PAIRED:
         names = ("depth", "colour") if len(depth) < len(color) else ("colour", "depth")
         text = f"{rarer} {names[0]} images to {other} of {names[1]}: {other - len(pairs)} {names[1]} images go unused"
         remedy = "record both at one rate; more frames show more, and what moves is seen sooner"

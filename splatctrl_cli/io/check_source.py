@@ -10,7 +10,7 @@ from splatctrl_cli.io.capture import is_capture
 from splatctrl_cli.io.check_alignment import alignment_findings
 from splatctrl_cli.io.check_cameras import lens_findings, pose_findings
 from splatctrl_cli.io.check_images import ImageWatch, depth_findings, sample_findings, strided_lens
-from splatctrl_cli.io.check_report import CheckReport, needs, usable_frames
+from splatctrl_cli.io.check_report import CheckReport, damage_findings, needs, usable_frames
 from splatctrl_cli.io.check_robot import motion_findings
 from splatctrl_cli.io.check_states import robot_findings
 from splatctrl_cli.io.check_times import TimesWatch, time_findings
@@ -140,7 +140,7 @@ def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
 
 def _losses(source: ShotSource, where: str) -> list[Finding]:
     loss = source.loss
-    findings = [warning("damaged", where, text, "copy it again, or run ingest again") for text in loss.notes[:50]]
+    findings = damage_findings(where, loss.notes[:50])
     if not loss.damaged:
         findings = [note("loss", where, text) for text in loss.notes[:50]]
     for name, words in _LOST.items():

@@ -21,17 +21,19 @@ BASELINE = 0.02  # [m] between two views that are compared
 SCALES = (0.001, 0.01, 0.1, 0.2, 0.25, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0)
 SCALES = (*SCALES, *(1 / s for s in reversed(SCALES[:-1])))
 FINE = np.linspace(0.92, 1.08, 17)
-FIT = 0.02  # of the depth within which a point fits
+FIT = 0.01  # of the depth, from a surface, within which a point fits it
 FEW_LANDED = 0.6  # of the most: with fewer, the share that fits is taken of as many
 SAME_FIT = 0.9  # of the best share of points, for another to be as good
+OTHER_SCALE = 0.08  # of its logarithm, that a scale must differ from 1 to be named
 TRUSTED = 0.2  # of the most points that land: with so many that fit, depths are taken as they are
+UNUSUAL = 0.75  # of the largest usual depth: beyond it views that do not meet are doubtful
 BESIDE = (1 / 1.5, 1.5)  # of the best scale: where one of them fits as well, the scale cannot be told
 MORE_FIT, TIMES_FIT = 0.07, 1.12  # by which more points must fit
 LEAST_FIT = 0.4  # of the points that must fit then
 WIDTHS = (0.05, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)  # [m] of a residual that counts, by round
 WIDE = (0.15, 0.15, 0.12, 0.1, 0.08, 0.06)  # before them, where a camera is far off
 FLAT = 2e-3  # eigenvalue (of the mean normal equation) below which a direction is not seen
-CUT = 0.03  # [m] of a residual, in the cost
+CUT = 0.015  # [m] of a residual, in the cost
 CHEAPER = 0.04  # share of the cost that a move must save
 MOVED, TURNED = 0.012, 0.8  # [m], [deg] from which a move is named
 GOOD_SHARE = 0.45  # of the points that must lie within 1 % of the depth after a move
@@ -79,11 +81,14 @@ def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None]) -
     pairs = _pairs(views)
     if not pairs:
         return ViewsCheck(findings=[], scaled=list(frames), corrected=list(frames))
-    scales = wrong_scales(views, pairs)
+    scales, moves = wrong_scales(views, pairs), wrong_poses(views, pairs)
     scaled = _scaled(frames, scales)
     if scales:
-        views = [_view(frame) for frame in _chosen(scaled)]
-    moves = wrong_poses(views, pairs)
+        fitted = [_view(frame) for frame in _chosen(scaled)]
+        if _cost(fitted, pairs)[1] > _cost(_all_moved(views, moves), pairs)[1]:
+            moves = wrong_poses(fitted, pairs)
+        else:  # moves explain more
+            scales, scaled = {}, list(frames)
     findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs)
     findings += [_pose_finding(move, sorted(used)) for move in moves]
     by_camera = {move.camera: move.T_camera_corrected for move in moves}
@@ -139,7 +144,7 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
 
 def _overlap_findings(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Finding]:
     """Of depths that are unusual, and with which views that would meet at a tenth or at ten times do not."""
-    low, high = TABLE_DEPTH
+    low, high = TABLE_DEPTH[0], UNUSUAL * TABLE_DEPTH[1]
     depths = np.concatenate([view.points[:, 2] for view in views])
     if not len(depths) or low <= (median := float(np.median(depths))) <= high:
         return []
@@ -182,8 +187,8 @@ def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
     elif len(cameras) == 2:
         where, what = f"cameras {' and '.join(cameras)}", f"their views fit where {move.camera} is moved by {by}"
         remedy = "calibrate both cameras' poses again (hand-eye): two do not tell which of them is wrong"
-    falls = f"{what}: depths then differ by {1e3 * move.after:.0f} mm instead of {1e3 * move.before:.0f}"
-    text = f"{falls} (mean, each counted as {1e3 * CUT:.0f} mm at most)"
+    falls = f"points then lie {1e3 * move.after:.1f} mm off surfaces instead of {1e3 * move.before:.1f}"
+    text = f"{what}: {falls} (mean, each counted as {1e3 * CUT:.0f} mm at most)"
     return warning("views-pose", where, text, remedy, value=round(1e3 * move.distance, 1), unit="mm")
 
 
@@ -259,6 +264,13 @@ def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> t
     return points, lands & (surface[:, 2] > 0), surface, b.normals[v, u]
 
 
+def _distances(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
+    """Distance [m] of the points of view a from the planes of view b's surface that they land on, and their depth."""
+    points, lands, surface, normals = _landed(a, b, scale_a, scale_b)
+    lands &= np.any(normals != 0, axis=1)
+    return np.abs(np.einsum("ki,ki->k", points - surface, normals))[lands], points[lands, 2]
+
+
 def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
     """The factor on these cameras' depths with which far more points fit than without; None where there is none."""
     medians = [float(np.median(v.points[:, 2])) for v in views if v.frame.camera in cameras and len(v.points)]
@@ -282,7 +294,8 @@ def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera
     if min(num_fit / max(num, 1) for num_fit, num in beside if num > MIN_LANDED // 10) > SAME_FIT * fit[best]:
         return None  # a flat wall fits at any scale
     near = [tried[best] * factor for factor in FINE]
-    return float(near[int(np.argmax([_fitting(views, pairs, cameras, s, FIT / 4)[0] for s in near]))])
+    scale = float(near[int(np.argmax([_fitting(views, pairs, cameras, s, FIT / 4)[0] for s in near]))])
+    return scale if abs(np.log(scale)) > OTHER_SCALE else None
 
 
 def _fitting(
@@ -293,10 +306,9 @@ def _fitting(
     for i, j in pairs:
         a, b = views[i], views[j]
         scales = [scale if view.frame.camera in cameras else 1.0 for view in (a, b)]
-        points, lands, surface, _ = _landed(a, b, *scales)
-        off = np.abs(points[lands, 2] - surface[lands, 2])
-        num_fit += int((off < fit * points[lands, 2]).sum())
-        num += int(lands.sum())
+        off, depth = _distances(a, b, *scales)
+        num_fit += int((off < fit * depth).sum())
+        num += len(off)
     return num_fit, num
 
 
@@ -352,13 +364,12 @@ def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
 
 
 def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Mean difference in depth [m], each cut at `CUT`, and the share within 1 % of the depth."""
+    """Mean distance from surfaces [m], each cut at `CUT`, and the share of points that fit."""
     total = num = num_good = 0.0
     for i, j in pairs:
-        points, lands, surface, _ = _landed(views[i], views[j])
-        off = np.abs(points[lands, 2] - surface[lands, 2])
+        off, depth = _distances(views[i], views[j])
         total += float(np.minimum(off, CUT).sum())
-        num_good += float((off < 0.01 * points[lands, 2]).sum())
+        num_good += float((off < FIT * depth).sum())
         num += len(off)
     return (total / num, num_good / num) if num >= MIN_LANDED else (CUT, 0.0)
 
@@ -371,6 +382,13 @@ def _moved(views: Sequence[_View], camera: str, T: Float64) -> list[_View]:
         else view
         for view in views
     ]
+
+
+def _all_moved(views: Sequence[_View], moves: Sequence[Move]) -> list[_View]:
+    moved = list(views)
+    for move in moves:
+        moved = _moved(moved, move.camera, move.T_camera_corrected)
+    return moved
 
 
 def _move(camera: str, T: Float64, before: float, after: float) -> Move:
