@@ -384,3 +384,32 @@ def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_me
     assert decode_file(png[:20] + png[-12:], color=False) is None
     assert decode_file(png[:33] + b"\x7f" + png[34:], color=False) is None  # a chunk of two gigabytes
     assert decode_file(png + b"behind the end", color=False) is not None
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+@pytest.mark.parametrize("lazily", [False, True])
+def test_a_png_with_a_palette_or_a_gamma_has_the_values_that_are_written(lazily: bool) -> None:
+    """Six colours of a row; a gamma says how to show them, not what was measured."""
+    signature, row = b"\x89PNG\r\n\x1a\n", bytes([0, *range(6)])
+    palette = signature + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 3, 0, 0, 0))
+    palette += chunk(b"PLTE", RGB[0].tobytes()) + chunk(b"IDAT", zlib.compress(row)) + chunk(b"IEND", b"")
+    plain = signature + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 2, 0, 0, 0))
+    plain += chunk(b"gAMA", struct.pack(">I", 100_000))
+    plain += chunk(b"IDAT", zlib.compress(b"\0" + RGB[0].tobytes())) + chunk(b"IEND", b"")
+    for data in (palette, plain):
+        recorded = SimpleNamespace(header=header(5, "o"), format="png", data=np.frombuffer(data, np.uint8))
+        image = read_image(recorded, COMPRESSED_IMAGE, lazily=lazily)
+        assert np.array_equal(color_of(image), RGB[:1])
+
+
+def test_an_interlaced_png_is_read() -> None:
+    """Adam7: the seven passes of an image of one row are its first, fifth, third, and the even pixels."""
+    passes = [(0,), (4,), (), (2,), (), (1, 3, 5), ()]
+    rows = b"".join(b"\0" + RGB[0, list(columns)].tobytes() for columns in passes if columns)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 2, 0, 0, 1))
+    png += chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    pixels = decode_file(png, color=True)
+    assert pixels is not None and np.array_equal(pixels[..., ::-1], RGB[:1])
