@@ -195,6 +195,8 @@ class CaptureSource:
     def _checked(self, name: str) -> Path:
         """The path of a file that is as it was written. Raises InputError for another."""
         file = self._path / name
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise InputError(f"{file}: lies outside the capture", remedy=_AGAIN)
         if not file.is_file() or self._sums.get(name) != sha256(file):
             raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=_AGAIN)
         return file

@@ -6,13 +6,14 @@ commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4) float64; what K is stands
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.arrays import npy_of
+from splatctrl_cli.io.arrays import npy_head, npy_of
 from splatctrl_cli.io.joint_log import COLUMNS, JointLog, JointStream
 from splatctrl_cli.io.joints import joint_records
 from splatctrl_cli.io.options import SourceOptions
@@ -136,8 +137,19 @@ def _write_rows(path: Path, rows: Rows) -> None:
 
 
 def _blocks(path: Path) -> Iterator[Float64]:
-    rows = np.load(path, mmap_mode="r", allow_pickle=False)
-    yield from (np.array(rows[first:last]) for first, last in ranges(len(rows)))
+    """Of a .npy file as `_write_rows` writes it. Raises ValueError for another."""
+    with path.open("rb") as stream:
+        shape, is_by_columns, dtype = npy_head(stream)
+        if dtype != np.dtype("<f8") or is_by_columns or not shape:
+            raise ValueError(f"{path.name}: expected rows of float64, got {dtype} {shape}")
+        if 8 * prod(shape) != path.stat().st_size - stream.tell():
+            raise ValueError(f"{path.name}: does not hold the {shape[0]} rows that it announces")
+        for first, last in ranges(shape[0]):
+            size = (last - first) * prod(shape[1:])
+            values = np.frombuffer(stream.read(8 * size), dtype)  # no map: a file that shrinks would kill the program
+            if values.size != size:
+                raise ValueError(f"{path.name}: ends after {first + values.size} of {shape[0]} rows")
+            yield values.reshape(last - first, *shape[1:])
 
 
 def _combined(loss: LossReport, other: LossReport, sign: int, notes: list[str]) -> LossReport:
