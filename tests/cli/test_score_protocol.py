@@ -99,7 +99,16 @@ def test_the_report_says_by_what_its_figures_came_about(place: Path, capsys: pyt
     assert "mask rule: object mask; averaging: mean over the views; resolution: 128x104; backgr" in out
     assert "dB mask" in out
     assert "mask" in out.splitlines()[0]
-    protocol = scored(capsys, place, "idr")["protocol"]
+    result = scored(capsys, place, "idr")
+    assert " ".join(result) == (
+        "scene reference cameras training_cameras has_clock snapshots recording protocol metrics warnings"
+        " skipped_views views"
+    )
+    protocol = result["protocol"]
+    assert " ".join(protocol) == (
+        "name source layout training_views scored_views left_out_views split mask_rule resolution"
+        " published_resolution published_scans background averaging lpips definitions"
+    )
     assert (protocol["training_views"], protocol["scored_views"]) == ([1, 2, 3, 5, 6, 7], [0, 4])
     assert len(protocol["background"]) == 3
 
