@@ -38,31 +38,25 @@ class DepthToColor:
         """
         target = self.color_intrinsics
         depth = depth if self.undistortion is None else self.undistortion.depth(depth)
-        valid = depth > 0
-        points = transform_points(self.T_color_depth, back_project(self.depth_intrinsics, depth)[valid])
-        points = points[points[:, 2] > 0]
-        points = points[np.argsort(-points[:, 2], kind="stable")]  # far first, so that the nearest is written last
-        z = points[:, 2]
-        u = target.fx * points[:, 0] / z + target.cx
-        v = target.fy * points[:, 1] / z + target.cy
+        x, y, z = transform_points(self.T_color_depth, back_project(self.depth_intrinsics, depth)[depth > 0]).T
+        front = z > 0
+        z = z[front]
+        u = target.fx * x[front] / z + target.cx
+        v = target.fy * y[front] / z + target.cy
         half_u = 0.5 * max(1.0, target.fx / self.depth_intrinsics.fx)
         half_v = 0.5 * max(1.0, target.fy / self.depth_intrinsics.fy)
-        first_u, first_v = np.ceil(u - half_u).astype(np.int64), np.ceil(v - half_v).astype(np.int64)
-        rows, columns, depths = [], [], []
+        first_u, first_v = np.ceil(u - half_u), np.ceil(v - half_v)
+        nearest, depths = np.full(target.height * target.width, np.inf, dtype=np.float32), z.astype(np.float32)
         for dv in range(int(np.floor(2 * half_v)) + 1):
+            row = first_v + dv
+            is_row = (row < v + half_v) & (row >= 0) & (row < target.height)
             for du in range(int(np.floor(2 * half_u)) + 1):
-                column, row = first_u + du, first_v + dv
-                lands = (column < u + half_u) & (row < v + half_v)
-                lands &= (column >= 0) & (column < target.width) & (row >= 0) & (row < target.height)
-                rows.append(np.where(lands, row, -1))
-                columns.append(column)
-                depths.append(z)
-        row, column = np.stack(rows, axis=1).ravel(), np.stack(columns, axis=1).ravel()
-        flat = np.stack(depths, axis=1).ravel()
-        lands = row >= 0
-        warped = np.zeros((target.height, target.width), dtype=np.float32)
-        warped[row[lands], column[lands]] = flat[lands]
-        return warped
+                column = first_u + du
+                lands = is_row & (column < u + half_u) & (column >= 0) & (column < target.width)
+                pixels = (row[lands] * target.width + column[lands]).astype(np.int64)
+                np.minimum.at(nearest, pixels, depths[lands])
+        nearest[np.isinf(nearest)] = 0.0
+        return nearest.reshape(target.height, target.width)
 
 
 class Undistortion:
