@@ -25,9 +25,10 @@ from splatctrl_cli.robot.model import RobotModel
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """The recording as `check` keeps it."""
+    """The recording as `check` keeps it; few: every second frame of three cameras."""
 
     frames: Sequence[RgbdFrame]
+    few: Sequence[RgbdFrame]
     states: StateColumns
     model: RobotModel
 
@@ -38,9 +39,6 @@ class Table:
         found = motion_findings(frames, ImageMotion(), states, self.model)
         return [finding for finding in found if finding.severity is not Severity.NOTE]
 
-    def with_frames(self, camera: str, **changes: object) -> list[RgbdFrame]:
-        return [replace(f, **changes) if f.camera == camera else f for f in self.frames]  # type: ignore[arg-type]
-
 
 @pytest.fixture(scope="module")
 def table(sample_data: Path) -> Table:
@@ -50,7 +48,16 @@ def table(sample_data: Path) -> Table:
     states, _, _ = log_states(survey(log), SourceOptions(), model)
     assert states is not None
     frames = check_log(log, SourceOptions()).frames
-    return Table(frames=frames, states=states, model=model)
+    stamps = sorted({frame.stamp_ns for frame in frames})[::2]
+    few = [frame for frame in frames if frame.stamp_ns in stamps and frame.camera != "cam3"]
+    return Table(frames=frames, few=few, states=states, model=model)
+
+
+@pytest.fixture(autouse=True)
+def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatctrl_cli.io.check_views.NUM_PAIRS", 24)
+    monkeypatch.setattr("splatctrl_cli.io.check_views.NUM_POINTS", 700)
+    monkeypatch.setattr("splatctrl_cli.io.check_views.MIN_LANDED", 300)
 
 
 def moved(frames: Sequence[RgbdFrame], camera: str, position: tuple[float, ...], degrees: float) -> list[RgbdFrame]:
@@ -85,11 +92,11 @@ def test_a_camera_that_stands_elsewhere_is_named_with_its_move(
     check = table.views(moved(table.frames, "cam1", position, degrees))
     (finding,) = check.findings
     assert (finding.code, finding.where, finding.severity) == ("views-pose", "camera cam1", Severity.WARNING)
-    assert finding.value == pytest.approx(1e3 * position[0], abs=3)
-    assert abs(float(finding.what.split(" mm and ")[1].split(" deg")[0]) - degrees) < 0.2
+    assert finding.value == pytest.approx(1e3 * position[0], abs=5)
+    assert abs(float(finding.what.split(" mm and ")[1].split(" deg")[0]) - degrees) < 0.3
     original = next(f for f in table.frames if f.camera == "cam1").T_world_camera
     corrected = next(f for f in check.corrected if f.camera == "cam1").T_world_camera
-    assert np.abs(corrected - original)[:3, 3].max() < 0.003
+    assert np.abs(corrected - original)[:3, 3].max() < 0.005
 
 
 def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
@@ -121,28 +128,28 @@ def test_depth_of_another_camera_is_named(table: Table) -> None:
 @pytest.mark.parametrize("late_s", [0.08, -0.08])
 def test_joints_of_another_clock_are_named_with_the_offset(table: Table, late_s: float) -> None:
     states = replace(table.states, stamp_ns=table.states.stamp_ns + round(late_s * 1e9))
-    (finding,) = table.motion(table.frames, states)
+    (finding,) = table.motion(table.few, states)
     assert (finding.code, finding.where, finding.severity) == ("robot-clock", "joint states", Severity.WARNING)
     assert finding.value == pytest.approx(-1e3 * late_s, abs=10)
 
 
 def test_one_camera_of_another_clock_is_named(table: Table) -> None:
-    frames = [replace(f, stamp_ns=f.stamp_ns + 100_000_000) if f.camera == "cam1" else f for f in table.frames]
+    frames = [replace(f, stamp_ns=f.stamp_ns + 100_000_000) if f.camera == "cam1" else f for f in table.few]
     (finding,) = table.motion(frames, table.states)
     assert (finding.code, finding.where) == ("robot-clock", "camera cam1")
     assert finding.value == pytest.approx(100, abs=10)
 
 
 def test_exchanged_joints_are_named(table: Table) -> None:
-    (finding,) = table.motion(table.frames, table.states.of_joints(np.array([0, 2, 1, 3, 4, 5, 6])))
-    assert (finding.code, finding.where) == ("arm", "cameras cam0, cam1, cam2, cam3")
+    (finding,) = table.motion(table.few, table.states.of_joints(np.array([0, 2, 1, 3, 4, 5, 6])))
+    assert (finding.code, finding.where) == ("arm", "cameras cam0, cam1, cam2")
     assert finding.remedy.startswith("exchange joint2 and joint3: ")
 
 
 def test_a_joint_whose_zero_is_off_is_found(table: Table) -> None:
     position = np.asarray(table.states.position[0 : len(table.states)]).copy()
     position[:, 1] += np.radians(5)
-    (finding,) = table.motion(table.frames, replace(table.states, position=position))
+    (finding,) = table.motion(table.few, replace(table.states, position=position))
     assert finding.code == "arm"
     assert finding.value == pytest.approx(30, abs=8)
     assert "the joints' zeros" in finding.remedy
