@@ -148,6 +148,13 @@ def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Map
     return values
 
 
+def _inside(name: str) -> str:
+    """The name itself. Raises ValueError where it leads out of its folder."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise ValueError(f"{name} lies outside the scene")
+    return name
+
+
 @dataclass(frozen=True)
 class SceneFolder:
     """A scene that `reconstruct` wrote."""
@@ -231,12 +238,12 @@ class SceneFolder:
                 return tuple(
                     Snapshot(
                         stamp_ns=int(row["stamp_ns"]),
-                        path=self.path / row["file"],
+                        path=self.path / _inside(row["file"]),
                         num_splats=int(row["num_splats"]),
                     )
                     for row in csv.DictReader(stream)
                 )
-        except (OSError, KeyError, ValueError) as error:
+        except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
             raise InputError(f"{path}: cannot be read: {error}") from None
 
     def snapshot_at(self, stamp_ns: int) -> Snapshot:

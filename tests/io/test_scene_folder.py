@@ -170,6 +170,14 @@ def test_a_threshold_that_is_no_probability_is_named(tmp_path: Path, value: str)
         describe(tmp_path / "scene")
 
 
+@pytest.mark.parametrize("row", ["300", "300,snapshots/000000.ply", "x,snapshots/000000.ply,3", "300,../evil.ply,3"])
+def test_a_row_of_snapshots_that_is_none_is_named(tmp_path: Path, row: str) -> None:
+    file = written(tmp_path / "scene") / "snapshots.csv"
+    file.write_text(f"{file.read_text()}{row}\n")
+    with pytest.raises(InputError, match=r"snapshots.csv: cannot be read"):
+        open_scene(tmp_path / "scene").splats_at(300)
+
+
 def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such scene"):
         open_scene(tmp_path / "nowhere")
