@@ -33,6 +33,8 @@ def read_pfm(path: Path) -> Float32:
         raise InputError(
             f"{path}: expected one channel (Pf) of scale 1, got {header[1].decode()} of scale {header[4].decode()}"
         )
+    if width == 0 or height == 0:
+        raise InputError(f"{path}: expected pixels, got {width}x{height}", remedy="copy the file anew")
     start = header.end()
     if len(content) - start != 4 * width * height:
         raise InputError(

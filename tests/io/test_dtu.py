@@ -226,6 +226,7 @@ def test_pfm_of_either_byte_order_starts_at_the_bottom_row(tmp_path: Path, is_li
         (b"PF\n2 2\n-1.0\n", "expected one channel"),
         (b"Pf\n2 2\n-2.5\n" + b"\0" * 16, "of scale 1, got Pf of scale -2.5"),
         (b"Pf\n2 2\n-1.0\n" + b"\0" * 15, "expected 16 bytes for 2x2, got 15"),
+        (b"Pf\n0 " + b"8" * 55 + b"\n-1.0\n", "expected pixels, got 0x888"),
     ],
 )
 def test_damaged_pfm_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
