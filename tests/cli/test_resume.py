@@ -128,7 +128,8 @@ def test_a_full_disk_is_exit_code_6_and_what_was_written_goes_on(
 
 
 def test_a_file_size_limit_is_a_full_disk_too(recording: Path, tmp_path: Path) -> None:
-    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)); "
+    limited = "import resource, sys; sys.dont_write_bytecode = True; "
+    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)); "
     limited += "from splatctrl_cli.cli.main import main; sys.exit(main(sys.argv[1:]))"
     words = [sys.executable, "-c", limited, *command(recording, "log", tmp_path / "scene")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
