@@ -9,12 +9,15 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.io.splat_formats import FORMATS
 from tests.io.make_log import LogRecipe, make_log
+from tests.io.test_gaussian_ply import gaussian_set
 from tests.io.test_layouts import make_tum
 
 RUN = """
 import contextlib, io, sys
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.io.splat_formats import FORMATS
 for line in sys.stdin:
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
@@ -72,3 +75,20 @@ def test_a_pipe_of_the_shell_and_dev_null_are_read(tmp_path: Path, capsys: pytes
     os.close(read)
     assert Path(os.devnull).read_text() == ""
     assert capsys.readouterr().err == ""
+
+
+def test_a_name_that_is_no_text_is_described_and_not_written_down(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=1)).rename(tmp_path / os.fsdecode(b"a\xff\nb.mcap"))
+    assert main(["info", str(log), "--json"]) == 0
+    assert main(["ingest", str(log), "-o", str(tmp_path / "x.capture")]) == 4
+    assert "is no UTF-8 text; give the file another name" in capsys.readouterr().err.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == [log]
+
+
+def test_a_splat_file_of_any_name_is_exported(tmp_path: Path) -> None:
+    given = tmp_path / os.fsdecode(b"a\xff\nb.ply")
+    FORMATS[".ply"].write(given, gaussian_set(4), {})
+    assert main(["export", str(given), "-o", str(tmp_path / "out.ply")]) == 0
+    assert r"exported_from: 'a\udcff\nb.ply' sha256" in (tmp_path / "out.ply").read_bytes()[:2000].decode("latin-1")

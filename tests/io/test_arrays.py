@@ -10,6 +10,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate import perceptual
 from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.io.arrays import DAMAGE, read_arrays, savez
+from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.grid import MOST_PACKED, read_npz
 from splatctrl_cli.io.idr import read_idr
 from splatctrl_cli.io.npz_columns import NpzFile
@@ -55,6 +56,17 @@ def test_gigabytes_of_zeros_in_a_small_file_are_refused_unread(
     assert path.stat().st_size < 40_000_000
     with pytest.raises(InputError, match=said):
         read(path)
+
+
+@pytest.mark.parametrize("name", ["sdf", "features"])
+def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "x.npz"
+    savez(path, {name: np.zeros(3)})
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 6] = 255
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"x.npz: not a readable .npz: zip file version 25.5"):
+        describe(path)
 
 
 def test_as_many_voxels_are_read_as_reconstruct_makes() -> None:

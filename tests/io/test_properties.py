@@ -20,6 +20,7 @@ from splatctrl_cli.io.db3_log import Db3Log
 from splatctrl_cli.io.mcap_log import McapLog
 from splatctrl_cli.io.mcap_records import BadRecordError, parse_record
 from splatctrl_cli.io.pairing import pair_by_stamp
+from splatctrl_cli.io.poses import read_tum
 from splatctrl_cli.io.raw_log import Damage
 from splatctrl_cli.io.rvl import decode_rvl
 from splatctrl_cli.io.splat_differences import differences
@@ -194,6 +195,19 @@ def test_a_moving_frame_is_rigid_at_all_times_and_where_it_was_seen(samples: Any
     assert (corners.min(axis=0) - 1e-9 <= T[:3, 3]).all() and (T[:3, 3] <= corners.max(axis=0) + 1e-9).all()
     assert tree.lookup("world", "camera", stamps[0] - 1) is None
     assert tree.lookup("world", "camera", stamps[-1] + 1) is None
+
+
+@few(80)
+@given(st.lists(st.one_of(st.floats(), st.floats(-1, 1)), min_size=8, max_size=8))
+def test_a_line_of_poses_is_rigid_or_refused(tmp_path_factory: pytest.TempPathFactory, numbers: list[float]) -> None:
+    path = tmp_path_factory.getbasetemp() / "poses.txt"
+    path.write_text(" ".join(map(repr, numbers)) + "\n")
+    try:
+        (T,) = read_tum(path).values()
+    except InputError:
+        return
+    assert np.isfinite(T).all()
+    assert T[:3, :3].T @ T[:3, :3] == pytest.approx(np.eye(3), abs=1e-6)
 
 
 KINDS = st.sampled_from(["<f4", "<f8", ">f4", "|u1", "<u2", "<i8", "<U3"])
