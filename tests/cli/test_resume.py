@@ -131,7 +131,7 @@ def test_a_file_size_limit_is_a_full_disk_too(recording: Path, tmp_path: Path) -
     limited = "import resource, sys; sys.dont_write_bytecode = True; "
     limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)); "
     limited += "from splatctrl_cli.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    words = [sys.executable, "-c", limited, *command(recording, "log", tmp_path / "scene")]
+    words = [sys.executable, "-B", "-c", limited, *command(recording, "log", tmp_path / "scene")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 6
     assert done.stderr.count("\n") == 1
