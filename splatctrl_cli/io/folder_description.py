@@ -212,7 +212,10 @@ def _content(path: Path) -> dict[str, Any]:
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
     known = {f.name for f in fields(Description)} - {"path", "listed", "is_depth_resized", "unpaired", "notes"}
     _check_keys(content, known, str(path), "")
-    folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
+    try:
+        folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()
+    except RuntimeError:  # ~ of a person who is not here
+        raise InputError(f"{path}: root: no home folder of {content.get('root')}", remedy="give --root") from None
     if not folder.is_dir():
         raise InputError(f"{path}: root {folder}: no such folder", remedy="correct `root`, or give --root")
     description = Description(

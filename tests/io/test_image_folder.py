@@ -196,6 +196,13 @@ def test_a_wrong_choice_or_type_is_named(tmp_path: Path) -> None:
     assert "camera.width: expected int, got '8'" in refusal(path)
 
 
+def test_a_root_in_the_home_of_nobody_is_named(tmp_path: Path) -> None:
+    make_folder(tmp_path)
+    path = tmp_path / "x.toml"
+    path.write_text('root = "~nobody-of-that-name/x"\n')
+    assert "root: no home folder of ~nobody-of-that-name/x" in refusal(path)
+
+
 def test_a_missing_root_or_pose_file_is_named(tmp_path: Path) -> None:
     path = described(tmp_path)
     assert "no such folder" in refusal(path, SourceOptions(root=tmp_path / "elsewhere"))
