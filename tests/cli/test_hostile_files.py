@@ -88,6 +88,9 @@ def states(folder: Path, shape: tuple[int, ...]) -> list[str]:
     return ["check", str(folder / "x.toml")]
 
 
+BLOATED = (  # a header of no pixels, then a chunk that announces 0x77000000 bytes
+    b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + bytes(22) + b"\x77" + bytes(13) + b"\xc6H\xb72\xdb\x84\0\0\0IEND\xaeB`\x82"
+)
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
 CASES: dict[str, Callable[[Path], list[str]]] = {
     "billion laughs": lambda d: xml(d, f'<!DOCTYPE robot [<!ENTITY a0 "ha">{LAUGHS}]><robot name="&a11;"/>'),
@@ -96,6 +99,7 @@ CASES: dict[str, Callable[[Path], list[str]]] = {
     "depth announced": lambda d: images(d, "npy", npy(HUGE)),
     "depth of objects": lambda d: images(d, "npy", npy((4,), "|O", pickle.dumps([1]))),
     "depth of a thousand million pixels": lambda d: images(d, "png", png(32767, 32767)),
+    "a chunk of 2 GiB in a PNG": lambda d: saved(d / "x.png", BLOATED),
     "image": lambda d: saved(d / "x.png", png(32767, 32767)),
     "array announced": lambda d: saved(d / "x.npy", npy(HUGE)),
     "pickled array": lambda d: saved(d / "x.npy", npy((4,), "|O", pickle.dumps([1]))),
