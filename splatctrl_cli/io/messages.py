@@ -30,6 +30,7 @@ MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
 _CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
 _PNG_HEAD = struct.Struct(">16xIIB")
+_PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
 _MOST_EXPANSION = 1100  # deflate's is 1032
 _MOSAICS = frozenset({*BAYER, *BAYER_16})
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
@@ -178,14 +179,20 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
 
 
 def _says_more_than_it_holds(png: bytes) -> bool:
-    """Whether a PNG announces an image, or a chunk, that its bytes do not hold: OpenCV takes memory for either."""
+    """Whether a PNG announces an image, or a chunk, that its bytes do not hold: OpenCV takes memory for either.
+
+    So it does for one without pixels, or with a chunk that must be understood and that no PNG has.
+    """
     if len(png) < _PNG_HEAD.size:
         return True
     width, height, bits = _PNG_HEAD.unpack_from(png)
-    at, end = len(PNG), len(png)
-    while at < end and png[at + 4 : at + 8] != b"IEND":
+    at, end, has_pixels = len(PNG), len(png), False
+    while at < end and (kind := png[at + 4 : at + 8]) != b"IEND":
+        has_pixels |= kind == b"IDAT"
+        if kind[:1].isupper() and kind not in _PNG_CHUNKS:
+            return True
         at += 12 + int.from_bytes(png[at : at + 4], "big")
-    return bool(at + 12 > end or width * height * bits // 8 > _MOST_EXPANSION * end)
+    return bool(not has_pixels or at + 12 > end or width * height * bits // 8 > _MOST_EXPANSION * end)
 
 
 def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:

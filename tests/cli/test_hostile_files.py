@@ -91,6 +91,11 @@ def states(folder: Path, shape: tuple[int, ...]) -> list[str]:
 BLOATED = (  # a header of no pixels, then a chunk that announces 0x77000000 bytes
     b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + bytes(22) + b"\x77" + bytes(13) + b"\xc6H\xb72\xdb\x84\0\0\0IEND\xaeB`\x82"
 )
+BARE = bytes.fromhex(  # its only chunk beside the first and last is of a kind that there is not
+    "89504e470d0a1a0a0000000d49484452000000080000000610000000008bfe5c6400000042494441444154081d05c131"
+    "01c2001000b1fe9f86aa40052aba62000f9582900c48410ac91cc74a5692397f495692797c939564cdf393ac246bae3b"
+    "2bc9cabc5f594956feeef223b7b430db84000049454e44ae426082"
+)
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
 CASES: dict[str, Callable[[Path], list[str]]] = {
     "billion laughs": lambda d: xml(d, f'<!DOCTYPE robot [<!ENTITY a0 "ha">{LAUGHS}]><robot name="&a11;"/>'),
@@ -100,6 +105,7 @@ CASES: dict[str, Callable[[Path], list[str]]] = {
     "depth of objects": lambda d: images(d, "npy", npy((4,), "|O", pickle.dumps([1]))),
     "depth of a thousand million pixels": lambda d: images(d, "png", png(32767, 32767)),
     "a chunk of 2 GiB in a PNG": lambda d: saved(d / "x.png", BLOATED),
+    "a PNG without pixels": lambda d: saved(d / "x.png", BARE),
     "image": lambda d: saved(d / "x.png", png(32767, 32767)),
     "array announced": lambda d: saved(d / "x.npy", npy(HUGE)),
     "pickled array": lambda d: saved(d / "x.npy", npy((4,), "|O", pickle.dumps([1]))),
