@@ -1,6 +1,5 @@
 """Colour and depth pairs out of a log into a capture folder and out of it again, beside decoding alone."""
 
-import shutil
 import sys
 import tempfile
 import time
@@ -44,8 +43,8 @@ def run(options: Options) -> Result:
         opened = CaptureSource(capture, SourceOptions())
         numbers = np.random.default_rng(0).integers(0, num, 100).tolist()
         tasks: dict[str, Callable[[], object]] = {
-            "kept": partial(_ingest, files, folder / "out"),
-            "encoded": partial(_ingest, raw, folder / "out"),
+            "kept": partial(_ingest, files, folder),
+            "encoded": partial(_ingest, raw, folder),
             "decoded": partial(_read, files),
             "capture": partial(_read, capture),
             "decoding": partial(_decode, images, num),
@@ -175,9 +174,8 @@ def _info(types: Any, header: Any, frame: RgbdFrame) -> dict[str, Any]:
     }
 
 
-def _ingest(log: Path, out: Path) -> None:
-    shutil.rmtree(out, ignore_errors=True)
-    write_capture(out, open_source(log))
+def _ingest(log: Path, folder: Path) -> None:
+    write_capture(Path(tempfile.mkdtemp(dir=folder)), open_source(log))  # what is there goes with the folder, untimed
 
 
 def _read(path: Path) -> int:

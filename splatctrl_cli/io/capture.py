@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from splatctrl_cli.errors import InputError
@@ -141,11 +140,11 @@ class CaptureSource:
         valid = self._valid(row["valid"], camera) if row.get("valid") else None
         if color_bytes is None or depth_bytes is None or (row.get("valid") and valid is None):
             return None
-        bgr, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
-        if bgr is None or depth is None:
+        color, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
+        if color is None or depth is None:
             self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
             return None
-        if not bgr.shape[:2] == depth.shape == (camera["height"], camera["width"]):
+        if not color.shape[:2] == depth.shape == (camera["height"], camera["width"]):
             size = f"{camera['width']}x{camera['height']}"
             self._damaged.append(f"{row['color']}, {row['depth']}: expected images of {size} as capture.json says")
             return None
@@ -154,7 +153,7 @@ class CaptureSource:
             RgbdFrame(
                 stamp_ns=int(row["stamp_ns"]),
                 camera=row["camera"],
-                color=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8),
+                color=color,
                 depth=depth,
                 intrinsics=intrinsics,
                 T_world_camera=_pose(row),

@@ -125,15 +125,14 @@ class ImageFolderSource:
 
     def _shot(self, view: View) -> Shot | None:
         color_bytes = view.color.read_bytes()
-        bgr = decode_file(color_bytes, color=True)
+        color = decode_file(color_bytes, color=True)
         depth = self._depth(view)
-        if bgr is None or depth is None:
-            broken = view.color if bgr is None else view.depth
+        if color is None or depth is None:
+            broken = view.color if color is None else view.depth
             self._damaged.append(f"{broken}: not an image that can be read")
             return None
         lens = self._lens(view)
-        _check_size(view.color, bgr, view.lens)
-        color = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        _check_size(view.color, color, view.lens)
         if self._description.is_depth_resized:
             depth = cv2.resize(depth, (view.lens.width, view.lens.height), interpolation=cv2.INTER_NEAREST)
         _check_size(view.depth, depth, self._description.depth_camera or view.lens)

@@ -41,8 +41,7 @@ class ImageMessage:
     """An image as recorded.
 
     width, height [px]; decode gives pixels (H, W[, channels]) in `encoding`, or raises UndecodableMessageError;
-    compressed is the image file's bytes where the message held one (JPEG, PNG) that decodes to `pixels` in OpenCV's
-    BGR order.
+    compressed is the image file's bytes where the message held one (JPEG, PNG) that decodes to `pixels`.
     """
 
     stamp_ns: int
@@ -120,7 +119,7 @@ def _plain(form: str, data: bytes) -> tuple[str, tuple[int, int], bytes, bool] |
     size = (head.height, head.width)
     if is_depth or (head.channels, head.bits) == (1, 16):
         return ("16UC1", size, file, False) if head.bits == 16 else None
-    return ("mono8" if head.channels == 1 else "bgr8", size, file, head.channels != 1)
+    return ("mono8" if head.channels == 1 else "rgb8", size, file, head.channels != 1)
 
 
 def _decoded(form: str, data: bytes, *, color: bool) -> NDArray[Any]:
@@ -153,11 +152,14 @@ def num_invalid(depth: NDArray[Any]) -> int:
 
 def metres(counts: NDArray[Any], scale: float) -> Float32:
     """Integer depth counts (H, W) as float32 [m]; the one formula, so that re-reading gives the same bits."""
-    return counts.astype(np.float32) * np.float32(scale)
+    depth = counts.astype(np.float32)
+    depth *= np.float32(scale)
+    return depth
 
 
 def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
-    """Pixels of a JPEG, PNG, WebP, ... file as OpenCV reads it (BGR), its orientation tag ignored.
+    """Pixels of a JPEG, PNG, WebP, ... file, its orientation tag ignored: RGB of eight bits, or (not color) as OpenCV
+    has them, of three channels in its order BGR.
 
     None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
     """
@@ -167,12 +169,12 @@ def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
         return None
     if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
         return None
-    flags = cv2.IMREAD_COLOR if color else cv2.IMREAD_UNCHANGED
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if color else cv2.IMREAD_UNCHANGED
     buffer = np.frombuffer(data, dtype=np.uint8)
     if buffer.size == 0:
         return None
     try:
-        pixels = cv2.imdecode(buffer, flags | cv2.IMREAD_IGNORE_ORIENTATION if color else flags)
+        pixels = cv2.imdecode(buffer, flags)
     except cv2.error:
         return None
     return None if pixels is None else np.asarray(pixels)
@@ -198,6 +200,8 @@ def _says_more_than_it_holds(png: bytes) -> bool:
 def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:
     if "compressedDepth" in form:
         return _compressed_depth(form, data)
+    if data.startswith(JPEG) and (head := image_head(data)) is not None and head.channels == 3:
+        return _decoded(form, data, color=True), "rgb8", data
     pixels = _decoded(form, data, color=False)
     recorded = form.partition(";")[0].strip()
     if pixels.ndim == 2 and recorded in _MOSAICS and pixels.dtype == (np.uint8 if recorded in BAYER else np.uint16):
@@ -206,8 +210,8 @@ def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes
         return pixels, "16UC1", data
     if pixels.ndim == 2 and pixels.dtype == np.float32:  # TIFF, as compressed_image_transport stores 32FC1
         return pixels, "32FC1", None
-    if pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] != 3):
-        pixels = _decoded(form, data, color=pixels.ndim != 2)  # to three channels of eight bits
+    if pixels.ndim == 3 and (pixels.dtype != np.uint8 or pixels.shape[2] != 3):
+        return _decoded(form, data, color=True), "rgb8", data
     if pixels.dtype != np.uint8:
         raise UndecodableMessageError(
             f"compressed image ({form}): pixels of {pixels.dtype}, neither colour nor depth"

@@ -130,13 +130,16 @@ def is_png(data: bytes | None) -> bool:
 
 def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot | JointState]:
     """Joint states (sorted) and shots (sorted) by stamp, joint states first."""
-    position = 0
+    states = iter(joints)  # a file's, a block at a time
+    state = next(states, None)
     for shot in shots:
-        while position < len(joints) and joints[position].stamp_ns <= shot.stamp_ns:
-            yield joints[position]
-            position += 1
+        while state is not None and state.stamp_ns <= shot.stamp_ns:
+            yield state
+            state = next(states, None)
         yield shot
-    yield from (joints[index] for index in range(position, len(joints)))
+    if state is not None:
+        yield state
+    yield from states
 
 
 def check_depth(depth: Float32, where: str, scale: float) -> bool:

@@ -44,7 +44,7 @@ def test_topics_come_with_count_rate_size_and_encoding(tmp_path: Path) -> None:
         "10.00",
         "32x24 16UC1 in frame 'cam0_optical'",
     ]
-    assert topics["/cam0/color/image_raw/compressed"][4] == "32x24 bgr8 compressed in frame 'cam0_optical'"
+    assert topics["/cam0/color/image_raw/compressed"][4] == "32x24 rgb8 compressed in frame 'cam0_optical'"
 
 
 @pytest.mark.parametrize(

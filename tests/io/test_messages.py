@@ -341,7 +341,7 @@ def test_colour_png_of_sixteen_bits_or_with_alpha_keeps_bytes_that_decode_alike(
         assert np.array_equal(color_of(image), RGB)
         assert image.compressed is not None
         again = decode_file(image.compressed, color=True)
-        assert again is not None and np.array_equal(again[..., ::-1], RGB)
+        assert again is not None and np.array_equal(again, RGB)
 
 
 def with_orientation(jpeg: bytes) -> bytes:
@@ -412,4 +412,11 @@ def test_an_interlaced_png_is_read() -> None:
     png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 6, 1, 8, 2, 0, 0, 1))
     png += chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
     pixels = decode_file(png, color=True)
-    assert pixels is not None and np.array_equal(pixels[..., ::-1], RGB[:1])
+    assert pixels is not None and np.array_equal(pixels, RGB[:1])
+
+
+def test_a_jpeg_decoded_as_rgb_has_the_pixels_of_opencvs_own_order() -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    jpeg = bytes(cv2.imencode(".jpg", pixels)[1])
+    bgr, rgb = decode_file(jpeg, color=False), decode_file(jpeg, color=True)
+    assert bgr is not None and rgb is not None and np.array_equal(bgr[..., ::-1], rgb)
