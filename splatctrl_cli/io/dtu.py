@@ -15,6 +15,7 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.io.messages import decode_file
 from splatctrl_cli.io.pfm import read_pfm, write_pfm
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
 
@@ -191,11 +192,11 @@ def _images(folder: Path) -> dict[int, Path]:
 
 
 def read_image(path: Path) -> UInt8:
-    """The image (H, W, 3) as RGB. Raises InputError for what is none."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    """The image (H, W, 3) as RGB, its orientation tag ignored. Raises InputError for what is none, or was cut."""
+    image = decode_file(path.read_bytes(), color=True) if path.is_file() else None
     if image is None:
         raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
-    return np.ascontiguousarray(image[:, :, ::-1])
+    return np.asarray(image, dtype=np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool:
@@ -296,8 +297,8 @@ def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
     depth = read_pfm(path)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))
     if visual.is_file():
-        shown = cv2.imread(str(visual), cv2.IMREAD_GRAYSCALE)
-        if shown is None or shown.shape != depth.shape:
+        shown = cv2.cvtColor(read_image(visual), cv2.COLOR_RGB2GRAY)
+        if shown.shape != depth.shape:
             raise InputError(f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
         depth = np.where(shown > VISIBLE_ABOVE, depth, np.float32(0))
     width, height = size
