@@ -5,6 +5,7 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -102,6 +103,22 @@ def test_a_damaged_image_is_left_out_and_counted(tmp_path: Path) -> None:
     assert source.loss.damaged == 2
     assert "depth/cam0/000002.png: its checksum differs" in source.loss.notes[0]
     assert "color/cam0/000004.jpg: missing" in source.loss.notes[1]
+
+
+@pytest.mark.parametrize("kind", ["color", "depth"])
+def test_an_image_of_another_size_than_its_camera_is_left_out_and_counted(tmp_path: Path, kind: str) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    name = f"{kind}/cam0/000002.{'jpg' if kind == 'color' else 'png'}"
+    pixels = np.full((5, 6), 1250, np.uint16) if kind == "depth" else np.zeros((5, 6, 3), np.uint8)
+    before = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    cv2.imwrite(str(folder / name), pixels)
+    sums = (folder / "SHA256SUMS").read_text()
+    after = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    (folder / "SHA256SUMS").write_text(sums.replace(f"{before}  {name}", f"{after}  {name}"))
+    source = open_source(folder)
+    assert sum(isinstance(record, RgbdFrame) for record in source.records()) == 4
+    assert source.loss.damaged == 1
+    assert "expected images of 32x24 as capture.json says" in source.loss.notes[-1]
 
 
 def test_losses_of_the_log_stay_with_the_capture(tmp_path: Path) -> None:

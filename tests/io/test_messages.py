@@ -213,14 +213,16 @@ def test_webp_is_read_and_a_cut_one_refused() -> None:
         read_image(whole, COMPRESSED_IMAGE)
 
 
-def test_float_depth_of_the_compressed_transport_is_inverse_depth() -> None:
+@pytest.mark.parametrize("lazily", [False, True])
+def test_float_depth_of_the_compressed_transport_is_inverse_depth(lazily: bool) -> None:
     a, b = 100.0, 2.0
     depth = np.where(COUNTS > 2, a / (COUNTS.astype(np.float64) - b), 0)
     png = cv2.imencode(".png", COUNTS)[1].tobytes()
     data = np.frombuffer(struct.pack("<iff", 0, a, b) + png, np.uint8)
     form = SimpleNamespace(header=header(5, "o"), format="32FC1; compressedDepth png", data=data)
-    image = read_image(form, COMPRESSED_IMAGE)
+    image = read_image(form, COMPRESSED_IMAGE, lazily=lazily)
     assert depth_of(image, None) == pytest.approx(depth, rel=1e-6)
+    assert image.compressed is None  # its counts are no depth
 
 
 def encoded_rvl(pixels: np.ndarray[Any, np.dtype[np.uint16]]) -> bytes:

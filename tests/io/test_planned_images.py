@@ -8,7 +8,8 @@ from mcap.writer import Writer as McapWriter
 
 from splatctrl_cli.io import planned_images
 from splatctrl_cli.io.mcap_log import McapLog
-from splatctrl_cli.io.planned_images import HeldMessages
+from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.planned_images import HeldMessages, PlannedImages
 from splatctrl_cli.io.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.io.ros_log import RosLogSource
 from splatctrl_cli.io.source import open_source
@@ -76,3 +77,18 @@ def test_the_plan_takes_few_bytes_a_frame(tmp_path: Path) -> None:
     assert {topic: int(counts.sum()) for topic, counts in uses.items()} == {
         f"/cam{i}/{name}": 5 for i in range(2) for name in ("color/image_raw/compressed", "depth/image_raw")
     }
+
+
+def test_frames_come_by_stamp_then_camera_in_whatever_order_these_are_named(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    named = [SourceOptions(cameras=names) for names in (("cam0", "cam1"), ("cam1", "cam0"))]
+    orders = [[(s, c) for s, c, _ in open_source(log, options).poses()] for options in named]
+    assert orders[0] == orders[1] == sorted(orders[0])
+
+
+def test_images_that_no_frame_needs_any_more_are_let_go(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"))))
+    assert isinstance(source, RosLogSource)
+    images = PlannedImages(source._log, source._plan)
+    most = [len(images._held._messages) for _ in images.of_frames(Damage(), lambda _: True)]
+    assert len(most) == 10 and max(most) <= 4 and most[-1] == 0

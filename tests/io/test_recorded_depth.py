@@ -2,7 +2,8 @@
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,3 +130,39 @@ def test_a_frame_that_was_left_undecoded_is_refused_where_it_does_not_decode(tmp
         _ = shots[2].frame
     assert sum(isinstance(item, RgbdFrame) for item in source.records()) == 4  # and counted where it is decoded
     assert source.loss.damaged == 1
+
+
+@pytest.mark.parametrize("size", [(WIDTH // 2, HEIGHT // 2), (WIDTH, HEIGHT)])
+def test_png_depth_of_another_camera_is_registered_and_not_kept(tmp_path: Path, size: tuple[int, int]) -> None:
+    make_log(tmp_path / "raw.mcap", LogRecipe(depth_frame="cam0_depth", depth_size=size))
+    with_png_depth(tmp_path / "raw.mcap", tmp_path / "png.mcap")
+    write_capture(tmp_path / "x.capture", open_source(tmp_path / "png.mcap"))
+    of_log, of_capture = (
+        [r.depth for r in open_source(tmp_path / name).records() if isinstance(r, RgbdFrame)]
+        for name in ("png.mcap", "x.capture")
+    )
+    assert len(of_log) == 5 and of_log[0].shape == (HEIGHT, WIDTH) and not of_log[0].all()
+    assert all(np.abs(a - b).max() <= 1e-6 for a, b in zip(of_log, of_capture, strict=True))
+
+
+def test_depth_in_another_unit_than_its_cameras_is_counted_again(tmp_path: Path) -> None:
+    make_log(tmp_path / "raw.mcap")
+    with_png_depth(tmp_path / "raw.mcap", tmp_path / "png.mcap")
+
+    class Mixed:
+        """The log, with the last frame's depth in units of half a millimetre."""
+
+        def __init__(self) -> None:
+            self._source = open_source(tmp_path / "png.mcap")
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._source, name)
+
+        def shots(self) -> Iterator[Any]:
+            *shots, last = self._source.shots()
+            yield from shots
+            yield replace(last, depth_unit=5e-4, read_depth=lambda: last.depth * np.float32(0.5))
+
+    write_capture(tmp_path / "x.capture", Mixed())
+    depths = [r.depth[1, 1] for r in open_source(tmp_path / "x.capture").records() if isinstance(r, RgbdFrame)]
+    assert depths == pytest.approx([1.25] * 4 + [0.625], abs=1e-6)
