@@ -20,7 +20,7 @@ from splatctrl_cli.io.messages import decode_file, metres, num_invalid
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.output import sha256
 from splatctrl_cli.io.registration import DepthToColor, Undistortion
-from splatctrl_cli.io.shot import Shot, check_depth, is_kept
+from splatctrl_cli.io.shot import Shot, check_depth, is_kept, is_png
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
@@ -145,7 +145,7 @@ class ImageFolderSource:
         valid = self._valid(view, lens)
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
         is_counts = lens.registration is None and not _is_float(self._description.depth.encoding, view.depth)
-        is_plain = lens.undistortion is None and is_kept(color_bytes)
+        is_plain = lens.undistortion is None
         return Shot.of(
             RgbdFrame(
                 stamp_ns=view.stamp_ns,
@@ -157,10 +157,19 @@ class ImageFolderSource:
                 human=human,
                 valid=valid,
             ),
-            color_file=color_bytes if is_plain else None,
+            color_file=color_bytes if is_plain and is_kept(color_bytes) else None,
             depth_unit=view.depth_scale if is_counts else None,
+            depth_file=self._depth_file(view) if is_counts and is_plain and valid is None else None,
             origin=f"{view.color.name} {view.depth.name}",
         )
+
+    def _depth_file(self, view: View) -> bytes | None:
+        """The PNG of a view's depth, where its counts are the depth as they are."""
+        table = self._description.depth
+        if table.encoding != "uint16" or table.invalid > 0 or self._description.is_depth_resized:
+            return None
+        data = view.depth.read_bytes()
+        return data if is_png(data) else None
 
     def _lens(self, view: View) -> _Lens:
         """That of a view's camera, made once."""

@@ -8,6 +8,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, project, transform_points
+from splatctrl_cli.io.capture_writer import write_capture
 from splatctrl_cli.io.source import SourceOptions, open_source
 from splatctrl_cli.records import Record, RgbdFrame
 
@@ -311,3 +312,20 @@ def test_masks_of_another_size_or_name_are_refused(tmp_path: Path) -> None:
     assert "expected an 8-bit grey mask of 8x6, as the colour images, got 9x6" in refusal(path)
     path = with_masks(tmp_path / "b", ("99",), np.zeros((6, 8), np.uint8))
     assert "is named like a colour image" in refusal(path)
+
+
+@pytest.mark.parametrize("change", ["", 'encoding = "uint16-rotated3"', "invalid = 10000"])
+def test_png_depth_goes_into_a_capture_as_it_is_unless_its_counts_change(tmp_path: Path, change: str) -> None:
+    path = described(tmp_path)
+    path.write_text(path.read_text().replace("scale = 1e-4\n", f"scale = 1e-4\n{change}\n"))
+    recorded = []
+    for number, file in enumerate(sorted((tmp_path / "images/depth").iterdir())):
+        pixels = np.full((6, 8), 10000 + number, np.uint16)
+        pixels[0] = 8000
+        cv2.imwrite(str(file), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])  # not as a capture writes them
+        recorded.append(file.read_bytes())
+    write_capture(tmp_path / "x.capture", open_source(path))
+    kept = [file.read_bytes() for file in sorted((tmp_path / "x.capture/depth").rglob("*.png"))]
+    assert len(kept) == 3 and (sorted(kept) == sorted(recorded)) == (not change)
+    of_folder, of_capture = (frames_of(list(open_source(p).records())) for p in (path, tmp_path / "x.capture"))
+    assert all(np.array_equal(a.depth, b.depth) for a, b in zip(of_folder, of_capture, strict=True))
