@@ -42,7 +42,7 @@ def register(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--quick",
-        type=int,
+        type=_num_images,
         nargs="?",
         const=QUICK,
         metavar="N",
@@ -55,6 +55,14 @@ def register(subparsers: Subparsers) -> None:
     )
     add_lock(parser)
     add_source(parser)
+
+
+def _num_images(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        hint = f"put it behind the input, or write --quick={QUICK}"
+        raise argparse.ArgumentTypeError(f"expected a number of images, got {text!r}: {hint}") from None
 
 
 def run(args: argparse.Namespace) -> int:

@@ -30,7 +30,7 @@ def register(subparsers: Subparsers) -> None:
         help=".mcap, .bag, .db3, ROS 2 bag folder, folder of a dataset, or .toml of an image folder;"
         " several logs of one session are read as one",
     )
-    add_output(parser, default="SOURCE.capture", what="capture folder")
+    add_output(parser, default="NAME.capture in this folder, NAME that of SOURCE", what="capture folder")
     parser.add_argument(
         "--resume", action="store_true", help="go on with an interrupted run (to the same bytes) if it left one"
     )

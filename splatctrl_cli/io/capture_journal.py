@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 
 JOURNAL = "ingest.jsonl"  # in the folder while it is partial
 
@@ -98,6 +98,12 @@ def read_identity(folder: Path) -> Mapping[str, Any] | None:
     path = folder / JOURNAL
     first = next(_lines(path), None) if path.is_file() else None
     return None if first is None else first.get("identity")
+
+
+def check_not_partial(folder: Path) -> None:
+    """Raise InputError for what an interrupted run left."""
+    if (folder / JOURNAL).is_file():
+        raise InputError(f"{folder}: an ingest that was interrupted", remedy="go on with its command and --resume")
 
 
 def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:

@@ -9,6 +9,7 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.io.capture import is_capture, read_capture_header
+from splatctrl_cli.io.capture_journal import check_not_partial
 from splatctrl_cli.io.describe_file import describe_file
 from splatctrl_cli.io.describe_grid import covers, header_facts
 from splatctrl_cli.io.grid_channels import FORMAT
@@ -120,6 +121,7 @@ _MOST_ROWS = 1000  # of a table of files
 def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     if is_capture(path):
         return _describe_capture(path)
+    check_not_partial(path)
     if is_bag_folder(path):
         return describe_log(open_raw_log(path), options)
     if (layout := layout_of(path)) is not None:
@@ -132,7 +134,8 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
             f"{path}: a folder of no known kind",
             remedy=f"give one that is in it: {inside}"
             if inside
-            else "expected a capture, ROS 2 bag, MVSNet scan or output of splatctrl; for images give their .toml",
+            else "expected a capture, ROS 2 bag, dataset folder (docs/formats.md), MVSNet scan, output of splatctrl;"
+            " for other images give their .toml",
         )
     field = _field_facts(path / "field.json") if "field.json" in names else {}
     kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
@@ -200,7 +203,7 @@ def _describe_capture(path: Path) -> Summary:
         "sources": len(header["sources"]),
     }
     grid = Grid(name="cameras", header=("camera", "frames", "size", "fx", "depth_scale"), rows=rows)
-    return Summary(path=str(path), kind="capture", facts=facts, grids=(grid,), notes=tuple(loss["notes"]))
+    return Summary(path=str(path), kind="capture", facts=facts, grids=(grid,), notes=tuple(loss.get("notes", ())))
 
 
 def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, kind: str) -> Summary:

@@ -77,10 +77,13 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
     loss.notes.extend(still_note(name) for name in options.camera_poses if any(v.lens.name == name for v in views))
     if not views:
         file = "" if description.poses is None else description.poses.file
-        raise InputError(
-            f"{description.path}: {file} has no pose for any image ({names[0]}, ...)",
-            remedy="check [poses] format and the numbers in the file names, or give --camera-pose",
-        )
+        if file and "*" not in file and not (description.root / file).is_file():
+            raise InputError(
+                f"{description.root / file}: no such file, and no other says where the camera was",
+                remedy="copy it too, or give --camera-pose NAME=identity for a camera that stands still",
+            )
+        remedy = "check the clock or the numbers that images and poses share, or give --camera-pose"
+        raise InputError(f"{description.path}: {file} has no pose for any image ({names[0]}, ...)", remedy=remedy)
     if held and all(view.camera == HOLDOUT for view in views):
         remedy = "leave some to train with"
         if options.holdout is not None:

@@ -17,6 +17,7 @@ from splatctrl_cli.io import (
     layout_sun3d,
     layout_tum,
 )
+from splatctrl_cli.io.capture_journal import check_not_partial
 from splatctrl_cli.io.folder_description import Description
 from splatctrl_cli.io.image_folder import ImageFolderSource
 from splatctrl_cli.io.listing import names_in
@@ -59,6 +60,7 @@ def layout_of(folder: Path) -> Layout | None:
 
 def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
     """The records of a dataset's folder. Raises InputError where it has no layout that is known."""
+    check_not_partial(folder)
     layout = layout_of(folder)
     if layout is None:
         names = ", ".join(known.name for known in LAYOUTS)

@@ -62,7 +62,10 @@ class SourceOptions:
         for name in names:
             if getattr(self, name) != getattr(default, name):
                 flag = flags.get(name, name.replace("_", "-"))
-                raise InputError(f"{path}: --{flag} does not apply to {kind}", remedy="leave it out")
+                remedy = "leave it out"
+                if (name, kind) == ("holdout", "a capture"):
+                    remedy = "give it to `splatctrl ingest`, which makes a camera `holdout` of these views"
+                raise InputError(f"{path}: --{flag} does not apply to {kind}", remedy=remedy)
 
 
 def still_note(camera: str) -> str:

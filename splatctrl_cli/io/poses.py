@@ -23,6 +23,7 @@ MAX_ENTRY = 1e6  # [m] of a pose
 POSE_TOLERANCE_NS = 20_000_000  # before the first and after the last pose of a trajectory
 _MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes what is no number (12-Scenes)
 MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
+_CORRECT = "correct the file, or [poses] where a .toml names it"
 
 
 def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
@@ -76,7 +77,8 @@ def read_trajectory_log(path: Path) -> dict[str, Float64]:
         head = lines[index].split()
         if len(head) != 3 or not head[0].isdigit():
             raise InputError(
-                f"{where}: expected three integers, got {lines[index]!r}", remedy="check [poses] format and file"
+                f"{where}: expected three integers, got {lines[index]!r}",
+                remedy=_CORRECT,
             )
         poses[str(int(head[0]))] = _matrix(lines[index + 1 : index + 5], where)
     return poses
@@ -90,7 +92,7 @@ def read_tum(path: Path) -> dict[str, Float64]:
         if not is_pose or np.linalg.norm(values[4:]) == 0:
             raise InputError(
                 f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",
-                remedy="check [poses] format and file",
+                remedy=_CORRECT,
             )
         poses[words[0]] = transform_from(values[1:4], values[4:8])
     return poses
@@ -122,11 +124,12 @@ def read_nerfstudio(path: Path) -> tuple[dict[str, Any], dict[str, Float64]]:
         content = json.loads(path.read_text(encoding="utf-8"))
         matrices = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=np.float64) for f in content["frames"]}
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a transforms.json: {error}", remedy="check [poses] format and file") from None
+        raise InputError(f"{path}: not a transforms.json: {error}", remedy=_CORRECT) from None
     for name, matrix in matrices.items():
         if matrix.shape != (4, 4):
             raise InputError(
-                f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}", remedy="check [poses] format and file"
+                f"{path}: {name}: expected a 4x4 matrix, got {matrix.shape}",
+                remedy=_CORRECT,
             )
     return content, matrices
 
@@ -184,7 +187,7 @@ def _lines(path: Path) -> list[str]:
 def _matrix(lines: list[str], where: str) -> Float64:
     rows = [_numbers(line.split(), where) for line in lines]
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
-        raise InputError(f"{where}: expected a 4x4 matrix", remedy="check [poses] format and file")
+        raise InputError(f"{where}: expected a 4x4 matrix", remedy=_CORRECT)
     return np.array(rows)
 
 
@@ -193,5 +196,6 @@ def _numbers(words: list[str], where: str) -> list[float]:
         return [np.nan if _MSVC_NAN.fullmatch(word) else float(word) for word in words]
     except ValueError:
         raise InputError(
-            f"{where}: expected numbers, got {' '.join(words)!r}", remedy="check [poses] format and file"
+            f"{where}: expected numbers, got {' '.join(words)!r}",
+            remedy=_CORRECT,
         ) from None

@@ -43,7 +43,7 @@ class RosLogSource:
         self._options = options
         found = survey(log, by_log_time=options.stamps == "log")
         _check_not_empty(log, found)
-        self._rig = build_cameras(log, found, options)
+        self._rig = _rig(log, found, options)
         self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
         self.cameras = tuple(camera.name for camera in self._rig)
         self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
@@ -215,6 +215,19 @@ def _scale(depth: ImageMessage, scale: float | None) -> float:
     if scale is not None:
         return scale
     return MILLIMETRE if depth.is_counts else 1.0
+
+
+def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
+    """The cameras. Raises InputError for what they lack, which in a damaged log may be what was lost."""
+    try:
+        return build_cameras(log, found, options)
+    except InputError as error:
+        if not found.damage.count:
+            raise
+        raise InputError(
+            f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
+            remedy=f"copy the file again; if this is all there is: {error.remedy}",
+        ) from None
 
 
 def _check_not_empty(log: RawLog, found: Survey) -> None:

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.io import ros_log
 from splatctrl_cli.io.capture import CaptureSource, write_capture
 from splatctrl_cli.io.capture_journal import JOURNAL
+from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.shot import Shot
 from splatctrl_cli.io.source import open_source
@@ -103,3 +104,12 @@ def test_a_frame_is_read_by_its_number(tmp_path: Path) -> None:
         assert alone.origin == shots[number].origin
     (folder / "depth/cam1/000003.png").unlink()
     assert source.shot_at(3) is None
+
+
+def test_what_an_interrupted_ingest_left_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    partial = interrupted(log, tmp_path / "x.capture", monkeypatch, 2)
+    with pytest.raises(InputError, match="an ingest that was interrupted; go on with its command and --resume"):
+        open_source(partial)
+    with pytest.raises(InputError, match="an ingest that was interrupted"):
+        describe(partial)

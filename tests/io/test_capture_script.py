@@ -29,6 +29,7 @@ def test_the_script_of_the_page_writes_a_capture(tmp_path: Path, capsys: pytest.
     assert [record.position.tolist() for record in records if isinstance(record, JointState)] == [[0.0]]
     assert source.loss.damaged == 0
     assert main(["check", str(tmp_path / "mine.capture"), "--fail-on", "warning"]) == 0
+    assert main(["info", str(tmp_path / "mine.capture")]) == 0
     packed, back = tmp_path / "mine.mcap", tmp_path / "back.capture"
     assert main(["capture", "pack", str(tmp_path / "mine.capture"), "-o", str(packed), "-q"]) == 0
     assert main(["capture", "unpack", str(packed), "-o", str(back), "-q"]) == 0

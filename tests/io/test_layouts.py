@@ -244,3 +244,11 @@ def test_a_real_nerfstudio_folder_opens_by_itself(real_data: Path) -> None:
     frames = frames_of(real_data / "tabletop_views", SourceOptions(depth_scale=1e-4))
     assert len(frames) == 12
     assert (frames[0].intrinsics.fx, frames[0].intrinsics.cx) == (288.0, 159.5)
+
+
+def test_a_tum_folder_without_its_poses_names_the_file(tmp_path: Path) -> None:
+    folder = make_tum(tmp_path / "rgbd_dataset_freiburg3_x")
+    (folder / "groundtruth.txt").unlink()
+    with pytest.raises(InputError, match=r"groundtruth.txt: no such file.*; copy it too, or give --camera-pose"):
+        open_source(folder)
+    assert open_source(folder, SourceOptions(camera_poses={"camera": (0, 0, 0, 0, 0, 0, 1)})).cameras == ("camera",)
