@@ -15,7 +15,7 @@ from splatctrl_cli.cli.common import Console, check_gate_names, check_gates, con
 from splatctrl_cli.cli.score_cloud import cloud_settings
 from splatctrl_cli.cli.score_fit_picture import draw_methods
 from splatctrl_cli.cli.score_reference import is_folder_of_views, words
-from splatctrl_cli.cli.score_report import cell, protocol_lines
+from splatctrl_cli.cli.score_report import COLUMNS, cell, protocol_lines
 from splatctrl_cli.cli.score_scans import masks_of_scan
 from splatctrl_cli.errors import InputError, UsageError
 
@@ -30,19 +30,10 @@ PAPER = {"3dgs": ("23.27", "50,000-100,000"), "budget": ("23.33", "10,000")}  # 
 PROTOCOL = "dtu-holdout8"  # the paper names neither scans nor views
 FIRST_ITERATIONS = 300  # of ours: on the first time step, the rest refines
 KEYS = {"3dgs": "3dgs", "budget": "ours"}
-EACH = {
-    "psnr_seen": "dB seen",
-    "psnr_all": "dB all",
-    "psnr_masked": "dB mask",
-    "ssim_seen": "SSIM seen",
-    "ssim_all": "SSIM all",
-    "ssim_published": "SSIM publ.",
-    "lpips": "LPIPS",
-    "lpips_published": "LPIPS publ.",
-    "depth_median_seen": "depth mm seen",
-    "depth_median_all": "depth mm all",
-    "chamfer": "Chamfer mm",
-}
+EACH = (
+    *("psnr_seen", "psnr_all", "psnr_masked", "ssim_seen", "ssim_all", "ssim_published", "lpips", "lpips_published"),
+    *("depth_median_seen", "depth_median_all", "chamfer"),
+)
 OWN = ("psnr", "splats", "memory", "seconds")
 GATED = (
     *("psnr_gain", *(f"{what}_{key}" for key in KEYS.values() for what in (*OWN, *EACH))),
@@ -324,7 +315,7 @@ def _each(fits: Sequence[Fitted]) -> list[str]:
     for fit in fits:
         figures = [cell(name, fit.score["metrics"][name]) for name in names]
         rows.append([fit.scan, METHODS[fit.method], fit.splats, *figures, f"{fit.memory:.0f}", f"{fit.seconds:.0f}"])
-    return table(("scan", "method", "splats", *(EACH[name] for name in names), "memory MiB", "fit s"), rows)
+    return table(("scan", "method", "splats", *(COLUMNS[name] for name in names), "memory MiB", "fit s"), rows)
 
 
 def _whole(value: float | None) -> str:

@@ -21,7 +21,9 @@ from splatctrl_cli.io.mcap_file import McapFile
 from splatctrl_cli.io.mcap_log import McapLog
 from splatctrl_cli.io.mcap_records import CHUNK, MAGIC
 from splatctrl_cli.io.raw_log import MAX_NOTES, Damage
+from splatctrl_cli.io.source import SourceOptions, open_source
 from splatctrl_cli.io.unpacking import MAX_BLOCK
+from tests.io.make_log import LogRecipe, make_log
 
 GIB = 1 << 30
 
@@ -295,3 +297,14 @@ def test_a_pass_that_was_not_finished_says_nothing_of_the_checksums(tmp_path: Pa
     log = McapLog(path)
     assert next(log.messages(Damage())).log_time_ns == 1
     assert len(list(log.messages(Damage()))) < 40
+
+
+def test_a_log_whose_damage_took_what_is_missing_says_so(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(chunk_size=1))  # a chunk a message, tf first
+    data = bytearray(log.read_bytes())
+    for chunk in McapFile(log).chunk_indexes()[:1]:
+        data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 0xFF
+    log.write_bytes(bytes(data))
+    expected = r"no tf .*; but the log is damaged: .*chunk.*; copy the file again; if this is all there is: "
+    with pytest.raises(InputError, match=expected):
+        open_source(log, SourceOptions(world_frame="world"))
