@@ -47,7 +47,7 @@ from tests.io.test_bag_log import as_ros1_bag, as_ros2_folder
 from tests.io.test_foxglove import descriptor_set
 from tests.io.test_gaussian_ply import gaussian_set
 from tests.io.test_layouts import make_nerfstudio, make_redwood, make_tum
-from tests.io.test_messages import encoded_rvl
+from tests.io.test_rvl import encoded_rvl
 
 Read = Callable[[bytes], object]
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) * 700

@@ -27,7 +27,7 @@ from splatctrl_cli.io.splat_differences import differences
 from splatctrl_cli.io.splat_formats import FORMATS
 from splatctrl_cli.io.tf_tree import MAX_GAP_NS, TfTree
 from splatctrl_cli.records import GaussianSet
-from tests.io.test_messages import encoded_rvl
+from tests.io.test_rvl import encoded_rvl
 from tests.properties import few
 
 TOPICS = ("/a", "/b/c", "/d e")
