@@ -39,6 +39,8 @@ RECORDINGS = [
     Recording(path="open3d_rgbd/RGBD"),
     Recording(path="open3d_rgbd/livingroom1", example="livingroom1", cameras=HELD),
     Recording(path="open3d_rgbd/livingroom1"),
+    Recording(path="office_sun3d/fragment-1"),
+    Recording(path="office_sun3d/fragment-2"),
     Recording(
         path="realsense_bag/single_depth_color_640x480.bag",
         options=SourceOptions(pairing_tolerance_s=0.11, camera_poses={"device_0": STILL}),
