@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.scenes import TRAINING, sample_robot
-from splatctrl_cli.cli.known_scene import splat_fields
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.explain import runs_of
@@ -18,6 +17,7 @@ from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.control.standstill import BoxZone, StopZone, Zone, monitored_standstill
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.target import Guide
+from splatctrl_cli.jobs.known_scene import splat_fields
 from splatctrl_cli.records import Bool, Box, DistanceField, Float64
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture

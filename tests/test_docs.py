@@ -10,11 +10,11 @@ from string import Template
 
 import pytest
 
-from splatctrl_cli.cli.common import check_gate_names
 from splatctrl_cli.cli.main import COMMANDS, build_parser, main
-from splatctrl_cli.cli.replay_baseline import read_baselines
-from splatctrl_cli.cli.replay_metrics import metric_names
 from splatctrl_cli.config import load_config
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.jobs.replay_baseline import read_baselines
+from splatctrl_cli.jobs.replay_metrics import metric_names
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])

@@ -5,7 +5,8 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent / "splatctrl_cli"
 RANK = {
-    "cli": 3,
+    "cli": 4,
+    "jobs": 3,
     **dict.fromkeys(["io", "scene", "field", "control", "simulate", "evaluate", "batch"], 2),
     "robot": 1,
     **dict.fromkeys(["records", "geometry", "config", "errors", "kernels", "mesh_distance"], 0),

@@ -1,17 +1,15 @@
 """What subcommands share: common options, tables and JSON on stdout, log lines on stderr, gates."""
 
 import argparse
-import difflib
 import json
-import math
-import operator
 import re
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.errors import GateFailed, UsageError
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.gates import gate
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
@@ -63,7 +61,7 @@ def add_gates(parser: argparse.ArgumentParser) -> None:
         "--require",
         action="append",
         default=[],
-        type=_gate,
+        type=gate,
         metavar="METRIC>=VALUE",
         help="fail (exit 1) unless it holds",
     )
@@ -124,86 +122,6 @@ def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[objec
     yield line(header)
     yield "  ".join("-" * width for width in widths)
     yield from map(line, rows())
-
-
-FirstTime = Callable[[str, Callable[[float], bool]], float | None]
-"""Metric name, whether a value holds -> the first time [s] that does not."""
-
-_COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
-
-
-def check_gate_names(
-    requirements: Sequence[str], names: Collection[str], elsewhere: Mapping[str, Collection[str]] | None = None
-) -> None:
-    """Raise UsageError for a requirement on a metric that is not among `names`; to be called before the work.
-
-    elsewhere: the metrics that other options would give, by those options.
-    """
-    for requirement in requirements:
-        name, _, _ = _parse_gate(requirement)
-        for options, others in (elsewhere or {}).items():
-            if name not in names and name in others:
-                raise UsageError(f"--require {requirement}: a figure of {options}", remedy="give it, or gate another")
-        if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
-            choices = ", ".join(names)
-            raise UsageError(
-                f"--require {requirement}: unknown metric",
-                remedy=f"did you mean {near[0]}?" if near else f"known here: {choices}",
-            )
-
-
-def check_gates(
-    requirements: Sequence[str],
-    metrics: Mapping[str, float | None],
-    *,
-    first_time: "FirstTime | None" = None,
-) -> None:
-    """Raise GateFailed naming every requirement that does not hold; a metric that is None fails its gate.
-
-    first_time gives the first time [s] at which a metric's own states break a requirement, None where it has none.
-    """
-    check_gate_names(requirements, metrics)
-    failed = []
-    for requirement in requirements:
-        name, comparison, bound = _parse_gate(requirement)
-        value = metrics[name]
-        if value is None or not _COMPARISONS[comparison](value, bound):
-            when = None if first_time is None else first_time(name, _holding(comparison, bound))
-            failed.append(
-                f"{name} is {'unknown' if value is None else f'{value:.6g}'}, required {comparison} {bound:g}"
-                + ("" if when is None else f", first at {when:.3f} s")
-            )
-    if failed:
-        raise GateFailed("gate failed: " + "; ".join(failed))
-
-
-def _holding(comparison: str, bound: float) -> Callable[[float], bool]:
-    def holds(value: float) -> bool:
-        return bool(_COMPARISONS[comparison](value, bound))
-
-    return holds
-
-
-def _gate(text: str) -> str:
-    """`text` itself, for argparse. Raises UsageError where it is no requirement."""
-    _parse_gate(text)
-    return text
-
-
-def _parse_gate(requirement: str) -> tuple[str, str, float]:
-    """Metric, comparison and bound."""
-    match = re.fullmatch(r"\s*([\w.]+)\s*(>=|<=|>|<)\s*(\S+)\s*", requirement)
-    try:
-        bound = float(match[3]) if match else math.nan
-    except ValueError:
-        bound = math.nan
-    if not match or not math.isfinite(bound):
-        raise UsageError(
-            f"--require {requirement}: expected METRIC>=NUMBER (or <=, >, <)",
-            remedy="quote it for the shell, like --require 'psnr_seen>=20'",
-        )
-    return match[1], match[2], bound
 
 
 def _plain(value: object) -> object:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
-from splatctrl_cli.cli.resume import check_same_run
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
 
@@ -45,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from splatctrl_cli.io.output import Stopwatch, output_path, write_run
     from splatctrl_cli.io.ros_log import RosLogSource
     from splatctrl_cli.io.source import open_session
+    from splatctrl_cli.jobs.resume import check_same_run
 
     console, stopwatch = Console(args), Stopwatch()
     options = source_options(args)

@@ -1,7 +1,6 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,23 +11,26 @@ from splatctrl_cli.cli.common import (
     add_config,
     add_gates,
     add_output,
-    check_gate_names,
-    check_gates,
     configured,
     table,
 )
 from splatctrl_cli.cli.score_reference import add_scan, open_dtu, open_held_out, refuse_scan_options
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
-    from splatctrl_cli.io.shot import ShotSource
-    from splatctrl_cli.records import Box, LossReport, PointCloud, RecordSource
-    from splatctrl_cli.robot.model import RobotModel
+    from splatctrl_cli.jobs.reconstruct import ReconstructResult
+    from splatctrl_cli.records import Box, RecordSource
 
 DAMAGED = 3
 DEFAULT_POSE_JUMP = 1.0  # [m]
+DECIDING_OPTIONS = (
+    *("cameras", "camera", "camera_pose", "world_frame", "depth_scale", "pairing_tolerance", "joint_topic"),
+    *("holdout", "scan", "box"),
+)  # what decides the bytes of a scene, beside the configuration
+PASSED_ON = ("urdf", "spheres", "points", "allow_disagreement", "force", "resume", "seed", "threads")
 GATED = (
     *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet"),
     *("loss", "psnr"),
@@ -89,7 +91,7 @@ def add_disagreement(parser: argparse._ActionsContainer) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.cli.reconstruction import training_cameras
+    from splatctrl_cli.jobs.reconstruct import ReconstructRequest, reconstruct
 
     if args.device == "cuda":
         raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
@@ -98,86 +100,33 @@ def run(args: argparse.Namespace) -> int:
 
         return run_gaussians(args, _config(args), _open(args), _box(args))
     check_gate_names(args.require, GATED)
-    console, config = Console(args), _config(args)
-    source = _open(args)
-    training_cameras(source)
-    robot = _robot(args, source)
-    for doubt in () if robot is None else robot.doubts:
-        console.log(f"warning: {doubt}")
-    metrics = _fit(args, config, source, robot, console)
-    check_gates(args.require, {name: _number(metrics[name]) for name in GATED})
-    return DAMAGED if source.loss.damaged else 0
+    request = ReconstructRequest(
+        source=_open(args),
+        out=args.out or Path("scene"),
+        config=_config(args),
+        box=_box(args),
+        options={name: getattr(args, name) for name in DECIDING_OPTIONS},
+        **{name: getattr(args, name) for name in PASSED_ON},
+    )
+    console = Console(args)
+    result = reconstruct(request, console)
+    console.result(
+        {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed},
+        [*_lines(result), f"wrote {result.out}"],
+    )
+    check_gates(args.require, {name: _number(result.metrics[name]) for name in GATED})
+    return DAMAGED if result.loss.damaged else 0
 
 
-def _fit(
-    args: argparse.Namespace, config: "Config", source: "RecordSource", robot: "RobotModel | None", console: Console
-) -> dict[str, object]:
-    """Reconstruct into the output folder, or go on with what an interrupted run left of it; returns the metrics."""
-    from splatctrl_cli.cli.reconstruction import Reconstruction
-    from splatctrl_cli.cli.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
-    from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
-    from splatctrl_cli.io.scene_writer import CHECKPOINT
-
-    stopwatch, box, out = Stopwatch(), _box(args), args.out or Path("scene")
-    checkpoint_file = partial_path(out) / CHECKPOINT
-    goes_on = args.resume and checkpoint_file.is_file()
-    if args.resume and not goes_on:
-        console.log(f"{partial_path(out)}: has no checkpoint to go on from; starts at the beginning")
-    elif checkpoint_file.is_file() and not args.resume:
-        console.log(
-            f"warning: {partial_path(out)}: an interrupted run is replaced; --resume would have gone on with it"
-        )
-    with (
-        told_how_to_go_on(checkpoint_file),
-        output_path(out, force=args.force, is_folder=True, checkpoint=CHECKPOINT, resume=args.resume) as partial,
-    ):
-        inputs = source.digests()
-        run_identity = identity(args, config, inputs)
-        fitted = Reconstruction(
-            source,
-            robot,
-            config,
-            partial,
-            box=box,
-            cloud=_cloud(args),
-            seed=args.seed,
-            threads=args.threads,
-            identity=run_identity,
-            allow_disagreement=args.allow_disagreement,
-            checkpoint=checkpoint_to_go_on_from(partial, run_identity) if goes_on else None,
-        )
-        if goes_on:
-            console.log(f"{partial}: goes on after {fitted.num_read} time steps")
-        with stopwatch.stage("fit_since_resume" if goes_on else "fit"):
-            fitted.run(console)
-        with stopwatch.stage("write"):
-            fitted.finish()
-        metrics = fitted.metrics()
-        write_run(
-            partial,
-            command="reconstruct",
-            config=config.as_dict(),
-            inputs=inputs,
-            metrics=metrics,
-            stopwatch=stopwatch,
-            seed=args.seed,
-        )
-    removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
-    lines = _lines(metrics, removed, source.loss, sum(stopwatch.seconds.values()))
-    console.result({"scene": str(out), "metrics": metrics, "removed": removed}, [*lines, f"wrote {out}"])
-    return metrics
-
-
-def _lines(
-    metrics: Mapping[str, object], removed: Mapping[str, int], loss: "LossReport", seconds: float
-) -> list[str]:
+def _lines(result: "ReconstructResult") -> list[str]:
+    metrics, removed, loss = result.metrics, result.removed, result.loss
     psnr = metrics["psnr"]
     columns = {
         **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
         "robot": metrics["robot_splats"],
         **{name: metrics[name] for name in ("added", "relocated", "unmet")},
         "training dB": "-" if psnr is None else f"{psnr:.2f}",
-        "seconds": f"{seconds:.1f}",
+        "seconds": f"{result.seconds:.1f}",
     }
     lines = table(list(columns), [list(columns.values())])
     reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
@@ -195,12 +144,6 @@ def _box(args: argparse.Namespace) -> "Box | None":
     from splatctrl_cli.records import Box
 
     return None if args.box is None else Box.from_text(args.box)
-
-
-def _cloud(args: argparse.Namespace) -> "PointCloud | None":
-    from splatctrl_cli.io.points import read_points
-
-    return None if args.points is None else read_points(args.points)
 
 
 def _number(value: object) -> float | None:
@@ -234,36 +177,8 @@ def _open(args: argparse.Namespace) -> "RecordSource":
     refuse_scan_options(args)
     if args.protocol is not None:
         return open_held_out(args, args.source)[0]
+    from splatctrl_cli.jobs.reconstruct import check_pose_jumps
+
     source = open_source(args.source, source_options(args))
     check_pose_jumps(source, args.max_pose_jump)
     return source
-
-
-def check_pose_jumps(source: "ShotSource", limit: float) -> None:
-    """Raise InputError for a camera that is suddenly elsewhere; where nobody knows when, views may lie anywhere."""
-    from splatctrl_cli.scene.consistency import largest_jump
-
-    if not limit > 0:
-        raise UsageError(f"--max-pose-jump: expected metres, got {limit}")
-    jump = largest_jump(source.poses()) if source.has_clock else None
-    if jump is not None and jump.distance > limit:
-        later = (jump.after_ns - jump.before_ns) * 1e-9
-        raise InputError(
-            f"{source.name}: camera {jump.camera} jumps by {jump.distance:.2f} m from stamp {jump.before_ns} to"
-            f" {jump.after_ns} ns, {later:.3g} s later (expected at most {limit:g} m)",
-            remedy=f"correct the poses, leave the camera out with --cameras, or give --max-pose-jump"
-            f" {jump.distance + 0.01:.2f}",
-        )
-
-
-def _robot(args: argparse.Namespace, source: "RecordSource") -> "RobotModel | None":
-    if args.urdf is None:
-        if args.spheres is not None:
-            raise UsageError(f"--spheres {args.spheres}: belongs to a robot", remedy="give its --urdf as well")
-        return None
-    from splatctrl_cli.robot.model import RobotModel
-
-    model = RobotModel.from_urdf(args.urdf, args.spheres)
-    if source.joint_names:
-        model.joint_order(source.joint_names)
-    return model

@@ -7,9 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import Console, check_gate_names, check_gates, table
-from splatctrl_cli.cli.reconstruction import training_cameras
+from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
+from splatctrl_cli.jobs.reconstruction import training_cameras
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config

@@ -4,18 +4,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import (
-    MAX_SEED,
-    Console,
-    Subparsers,
-    add_command,
-    add_gates,
-    add_output,
-    check_gate_names,
-    check_gates,
-)
+from splatctrl_cli.cli.common import MAX_SEED, Console, Subparsers, add_command, add_gates, add_output
 from splatctrl_cli.cli.robot_options import add_lock, add_robot, locked_joints
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
 if TYPE_CHECKING:
     from splatctrl_cli.records import SphereSet

@@ -5,16 +5,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.cli.common import (
-    Console,
-    Subparsers,
-    add_command,
-    add_config,
-    add_gates,
-    add_output,
-    check_gate_names,
-    check_gates,
-)
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
 from splatctrl_cli.cli.score_baseline import PREFIX, add_baseline, changes, read_baseline
 from splatctrl_cli.cli.score_cloud import add_cloud, cloud_figures, cloud_settings
 from splatctrl_cli.cli.score_fit import add_fit, run_fit
@@ -29,6 +20,7 @@ from splatctrl_cli.cli.score_report import lines_of, result_of, write_scores
 from splatctrl_cli.cli.score_scans import lines_of_scans, scenes_of_scans, score_scans
 from splatctrl_cli.cli.source_options import add_source
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
 if TYPE_CHECKING:
     from splatctrl_cli.records import RecordSource

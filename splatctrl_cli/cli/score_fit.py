@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.cli.common import Console, check_gate_names, check_gates, configured, table
+from splatctrl_cli.cli.common import Console, configured, table
 from splatctrl_cli.cli.score_cloud import cloud_settings
 from splatctrl_cli.cli.score_fit_picture import draw_methods
 from splatctrl_cli.cli.score_reference import is_folder_of_views, words
 from splatctrl_cli.cli.score_report import COLUMNS, cell, protocol_lines
 from splatctrl_cli.cli.score_scans import masks_of_scan
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
 if TYPE_CHECKING:
     from splatctrl_cli.records import RecordSource

@@ -15,8 +15,9 @@ from splatctrl_cli.cli.bake_options import (
     names_of,
     with_options,
 )
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, check_gate_names, check_gates, configured
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, configured
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.bake_report import FieldReport
@@ -42,8 +43,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.cli.bake_report import metric_names, metrics
     from splatctrl_cli.cli.bake_run import CHECKPOINT, FOLDER, clear_leftovers
-    from splatctrl_cli.cli.resume import told_how_to_go_on
     from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
+    from splatctrl_cli.jobs.resume import told_how_to_go_on
 
     console, stopwatch, config = Console(args), Stopwatch(), with_options(configured(args), args)
     formats, labels = names_of(args.formats, FORMATS, "--formats"), labels_of(args.include)
@@ -231,11 +232,11 @@ def _baked(
 def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | None", "Baker | None"]:
     """What has to be baked; with --update also what changed, and the baker of the splats before."""
     from splatctrl_cli.cli.bake_run import BakeTask
-    from splatctrl_cli.cli.resume import deciding_versions
     from splatctrl_cli.field.baker import Baker
     from splatctrl_cli.field.incremental import changed_blocks
     from splatctrl_cli.field.selection import field_splats
     from splatctrl_cli.field.slabs import Kept
+    from splatctrl_cli.jobs.resume import deciding_versions
 
     settings = {
         **deciding_versions(),

@@ -1,6 +1,5 @@
 """``splatctrl replay --lockstep`` and ``--latency``: what is known of the scene at each time, and since when."""
 
-import argparse
 import csv
 import weakref
 from collections.abc import Callable
@@ -10,14 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import known_scene
-from splatctrl_cli.cli.common import Console
-from splatctrl_cli.cli.known_scene import KnownFields, from_splats
-from splatctrl_cli.cli.lockstep import from_log
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.cli.replay import register
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.jobs import known_scene
+from splatctrl_cli.jobs.known_scene import KnownFields, from_splats
+from splatctrl_cli.jobs.lockstep import from_log
+from splatctrl_cli.jobs.progress import SILENT
+from splatctrl_cli.jobs.replay_request import ReplayRequest
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
 
@@ -100,12 +100,17 @@ def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
 
 
 def opened(recording: Path, folder: Path, arm: RobotModel, *, latency: float) -> known_scene.KnownScene:
-    commands = argparse.ArgumentParser().add_subparsers()
-    register(commands)
-    robot = ["--urdf", str(recording / "robot.urdf")]
-    words = [str(recording / "log.mcap"), *robot, "--lockstep", "--latency", str(latency), "--mode", "closed-loop"]
-    args = commands.choices["replay"].parse_args([*words, "--cameras", "cam0,cam1", *FAST])
-    return from_log(args, load_config(None, SETTINGS), arm, folder, Console(args))
+    request = ReplayRequest(
+        log=recording / "log.mcap",
+        urdf=recording / "robot.urdf",
+        out=folder,
+        options=SourceOptions(cameras=("cam0", "cam1")),
+        lockstep=True,
+        latency=latency,
+        mode="closed-loop",
+        threads=1,
+    )
+    return from_log(request, load_config(None, SETTINGS), arm, folder, SILENT)
 
 
 def test_a_map_is_known_only_after_the_latency(desk: Desk, arm: RobotModel) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import replay_columns, replay_record, replay_store
 from splatctrl_cli.control.explain import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.io import rows, state_columns
+from splatctrl_cli.jobs import replay_columns, replay_record, replay_store
 from splatctrl_cli.records import JointState
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, splats_of, write_scene
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import replay_columns
-from splatctrl_cli.cli.replay_metrics import metric_names
+from splatctrl_cli.jobs import replay_columns
+from splatctrl_cli.jobs.replay_metrics import metric_names
 from splatctrl_cli.records import JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, splats_of, write_scene

@@ -217,7 +217,7 @@ def test_a_run_goes_on_only_as_what_it_was(
     before = {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
     given = list(interrupted)
     if changed == ["VERSION"]:
-        monkeypatch.setattr("splatctrl_cli.__version__", "99")
+        monkeypatch.setattr("splatctrl_cli.jobs.resume.__version__", "99")
         changed = []
     elif changed == ["URDF"]:
         other = tmp_path / "robot.urdf"

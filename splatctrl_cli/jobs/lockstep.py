@@ -1,11 +1,20 @@
 """A log's reconstruction in lockstep with its replay: frame sets are taken in as the replay's clock passes them."""
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import Console
-from splatctrl_cli.cli.known_scene import (
+import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.audit import Observed
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.io.capture import CaptureSource
+from splatctrl_cli.io.output import Stopwatch, write_run
+from splatctrl_cli.io.ros_log import RosLogSource
+from splatctrl_cli.io.shot import ShotSource
+from splatctrl_cli.io.splats import read_ply
+from splatctrl_cli.io.state_source import open_states
+from splatctrl_cli.jobs.known_scene import (
     KnownFields,
     KnownScene,
     fields_at,
@@ -14,84 +23,56 @@ from splatctrl_cli.cli.known_scene import (
     known_space,
     splat_fields,
 )
-from splatctrl_cli.cli.reconstruct import DEFAULT_POSE_JUMP, add_disagreement, check_pose_jumps
-from splatctrl_cli.cli.replay_goal import numbers
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.reconstruct import check_pose_jumps
+from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP, ReplayRequest
+from splatctrl_cli.records import Float64, UInt8
+from splatctrl_cli.robot.model import RobotModel
 
 if TYPE_CHECKING:
-    from splatctrl_cli.cli.reconstruction import Reconstruction
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.control.audit import Observed
-    from splatctrl_cli.io.shot import ShotSource
-    from splatctrl_cli.records import Float64, UInt8
-    from splatctrl_cli.robot.model import RobotModel
+    from splatctrl_cli.jobs.reconstruction import Reconstruction
 
 FOLDER = "scene"  # within the replay's
 
 
-def add_lockstep(parser: argparse.ArgumentParser, scene: argparse._ActionsContainer) -> None:
-    """``--lockstep`` among the choices of a scene, ``--latency``, and what reconstructing a log is let off with."""
-    scene.add_argument(
-        "--lockstep",
-        action="store_true",
-        help="reconstruct the scene from LOG's own cameras, in step with the replay; --set scene.max_splats=N",
-    )
-    parser.add_argument(
-        "--latency",
-        type=_latency,
-        default=0.0,
-        metavar="S",
-        help="a map is known this long after its frames' stamp (--scene, --lockstep; default: 0)",
-    )
-    add_disagreement(parser.add_argument_group("with --lockstep"))
-
-
-def _latency(text: str) -> float:
-    """Seconds, not below zero, for argparse."""
-    (value, *more) = numbers(text)
-    if more or value < 0:
-        raise argparse.ArgumentTypeError(f"expected seconds not below 0, got {text!r}")
-    return value
-
-
-def check_lockstep(args: argparse.Namespace) -> None:
+def check_lockstep(request: ReplayRequest) -> None:
     """Raise UsageError for options that mean nothing without it."""
-    if args.latency and args.field is not None:
+    if request.latency and request.field is not None:
         raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
-    if not args.lockstep and (args.allow_disagreement or args.max_pose_jump != DEFAULT_POSE_JUMP):
+    if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != DEFAULT_POSE_JUMP):
         raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
 
 
 def opened_scene(
-    args: argparse.Namespace, config: "Config", model: "RobotModel", folder: Path, console: Console
+    request: ReplayRequest, config: "Config", model: "RobotModel", folder: Path, console: Progress
 ) -> KnownScene:
     """The scene that the options of a replay name; what --lockstep reconstructs goes into `folder`."""
-    if args.field is not None:
+    if request.field is not None:
         if config.control.human_margin > config.control.margin:
             raise UsageError(
                 "control.human_margin: a baked field does not tell people from things", remedy="give --scene"
             )
-        return from_grid(args.field)
-    if args.scene is not None:
-        return from_splats(args.scene, config, args.threads, latency_ns=_latency_ns(args))
-    return from_log(args, config, model, folder, console)
+        return from_grid(request.field)
+    if request.scene is not None:
+        return from_splats(request.scene, config, request.threads, latency_ns=_latency_ns(request))
+    return from_log(request, config, model, folder, console)
 
 
-def _latency_ns(args: argparse.Namespace) -> int:
-    return int(args.latency * 1e9 + 0.5)
+def _latency_ns(request: ReplayRequest) -> int:
+    return int(request.latency * 1e9 + 0.5)
 
 
 def from_log(
-    args: argparse.Namespace, config: "Config", model: "RobotModel", folder: Path, console: Console
+    request: ReplayRequest, config: "Config", model: "RobotModel", folder: Path, console: Progress
 ) -> KnownScene:
     """The scene that a log's own cameras give as it goes; what is reconstructed is left in `folder`/scene.
 
     Raises InputError for a log without frames or a clock.
     """
-    from splatctrl_cli.cli.reconstruction import Reconstruction
+    from splatctrl_cli.jobs.reconstruction import Reconstruction
 
-    source = _open(args, model)
-    check_pose_jumps(source, args.max_pose_jump)
+    source = _open(request, model)
+    check_pose_jumps(source, request.max_pose_jump)
     place = folder / FOLDER
     place.mkdir()
     fitted = Reconstruction(
@@ -100,12 +81,12 @@ def from_log(
         config,
         place,
         box=None,
-        seed=args.seed,
-        threads=args.threads,
+        seed=request.seed,
+        threads=request.threads,
         identity={"command": "replay --lockstep"},
-        allow_disagreement=args.allow_disagreement,
+        allow_disagreement=request.allow_disagreement,
     )
-    lockstep = Lockstep(fitted, config, _latency_ns(args), console, ends_with_log=args.mode != "closed-loop")
+    lockstep = Lockstep(fitted, config, _latency_ns(request), console, ends_with_log=request.mode != "closed-loop")
     return lockstep.scene()
 
 
@@ -120,13 +101,10 @@ class Lockstep:
         fitted: "Reconstruction",
         config: "Config",
         latency_ns: int,
-        console: Console,
+        console: Progress,
         *,
         ends_with_log: bool,
     ) -> None:
-        import numpy as np
-
-        from splatctrl_cli.io.output import Stopwatch
 
         self._fitted, self._config, self._console = fitted, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
@@ -180,7 +158,6 @@ class Lockstep:
             self._files.append(snapshot.path)
 
     def _fields(self, file: Path) -> KnownFields:
-        from splatctrl_cli.io.splats import read_ply
 
         return splat_fields(read_ply(file)[0], self._config, self._fitted.threads)
 
@@ -197,7 +174,6 @@ class Lockstep:
 
     def _finish(self) -> None:
         """Leave a scene folder as `reconstruct` writes it, of the frame sets that were taken in."""
-        from splatctrl_cli.io.output import write_run
 
         fitted = self._fitted
         with self._stopwatch.stage("write"):
@@ -215,19 +191,15 @@ class Lockstep:
         self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")
 
 
-def _open(args: argparse.Namespace, model: "RobotModel") -> "ShotSource":
+def _open(request: ReplayRequest, model: "RobotModel") -> "ShotSource":
     """The log once more: its frames are read in step with the replay."""
-    from splatctrl_cli.cli.source_options import source_options
-    from splatctrl_cli.io.capture import CaptureSource
-    from splatctrl_cli.io.ros_log import RosLogSource
-    from splatctrl_cli.io.state_source import open_states
 
-    source = open_states(args.log, source_options(args), model.joint_names)
+    source = open_states(request.log, request.options, model.joint_names)
     if not source.cameras:
         raise InputError(
-            f"{args.log}: --lockstep: expected cameras, got joint states alone",
+            f"{request.log}: --lockstep: expected cameras, got joint states alone",
             remedy="give --scene or --field of the same place",
         )
     if not isinstance(source, RosLogSource | CaptureSource):
-        raise UsageError(f"{args.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
+        raise UsageError(f"{request.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
     return source

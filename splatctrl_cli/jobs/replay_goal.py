@@ -1,78 +1,52 @@
-"""What a replay is asked to reach: its options, and a file of waypoints."""
+"""What a replay is asked to reach, and a file of waypoints."""
 
-import argparse
 import csv
 import math
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatctrl_cli.cli.replay_twists import add_twists
+import numpy as np
+
+from splatctrl_cli.control.checks import checked_posture
+from splatctrl_cli.control.replay import Waypoint
 from splatctrl_cli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.control.replay import Waypoint
-    from splatctrl_cli.records import Float64
-    from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
 
 POSE = "x,y,z,qx,qy,qz,qw"
 POSE_COLUMNS = tuple(POSE.split(","))
 
 
-def add_goal(parser: argparse.ArgumentParser) -> None:
-    """``--frame``, the goal (one of four forms), ``--start-time``, ``--re-anchor``."""
-    parser.add_argument("--frame", metavar="LINK", help="the link to drive (default: the last of the URDF)")
-    goal = parser.add_mutually_exclusive_group()
-    goal.add_argument(
-        "--goal", type=pose, metavar=POSE, help="goal pose in world (default: the logged pose at the end)"
-    )
-    goal.add_argument("--goal-joints", type=numbers, metavar="Q1,Q2,...", help="goal posture [rad]")
-    goal.add_argument(
-        "--waypoints", type=Path, metavar="FILE", help="goals one after the other, poses or postures (.toml or .csv)"
-    )
-    goal.add_argument(
-        "--follow",
-        action="store_true",
-        help="the logged pose of each time is the goal (the default of --mode open-loop)",
-    )
-    add_twists(parser, goal)
-    parser.add_argument("--start-time", type=float, metavar="S", help="start at this time of the log [s]")
-    parser.add_argument(
-        "--re-anchor", type=seconds, metavar="S", help="put the arm back into the logged posture every S seconds"
-    )
-
-
-def check_goal(args: argparse.Namespace) -> None:
-    """Raise UsageError where a mode has no use for an option that is given."""
+def check_goal(request: ReplayRequest) -> None:
+    """Raise UsageError for an option that the mode does not use."""
     asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
     modes: dict[str, tuple[str, ...]] = {"start_time": driven, "re_anchor": driven}
     modes |= dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)
     for option, wanted in modes.items():
-        given = getattr(args, option)
-        if given is not None and given is not False and args.mode not in wanted:
+        given = getattr(request, option)
+        if given is not None and given is not False and request.mode not in wanted:
             name = "--" + option.replace("_", "-")
             raise UsageError(
-                f"{name}: expected --mode {' or '.join(wanted)}, got {args.mode}", remedy=f"leave out {name}"
+                f"{name}: expected --mode {' or '.join(wanted)}, got {request.mode}", remedy=f"leave out {name}"
             )
 
 
 def goal_waypoints(
-    args: argparse.Namespace, model: "RobotModel", frame: str, logged_end: "Float64"
+    request: ReplayRequest, model: "RobotModel", frame: str, logged_end: "Float64"
 ) -> "tuple[Waypoint, ...]":
     """The goals that the options give, at least one; else the logged pose at the end."""
-    import numpy as np
 
-    from splatctrl_cli.control.checks import checked_posture
-    from splatctrl_cli.control.replay import Waypoint
-    from splatctrl_cli.geometry import transform_from
-
-    if args.goal is not None:
-        return (Waypoint(T_world_goal=transform_from(args.goal[:3], args.goal[3:])),)
-    if args.goal_joints is not None:
-        posture = checked_posture(model, np.array(args.goal_joints), what="--goal-joints")
+    if request.goal is not None:
+        return (Waypoint(T_world_goal=transform_from(request.goal[:3], request.goal[3:])),)
+    if request.goal_joints is not None:
+        posture = checked_posture(model, np.array(request.goal_joints), what="--goal-joints")
         return (Waypoint(T_world_goal=model.frame_pose(posture, frame), posture=posture),)
-    if args.waypoints is not None:
-        return read_waypoints(args.waypoints, model, frame)
+    if request.waypoints is not None:
+        return read_waypoints(request.waypoints, model, frame)
     return (Waypoint(T_world_goal=model.frame_pose(logged_end, frame)),)
 
 
@@ -82,11 +56,6 @@ def read_waypoints(path: Path, model: "RobotModel", frame: str) -> "tuple[Waypoi
     CSV has a header; TOML an array of tables ``[[waypoint]]`` with ``pose = [...]`` or ``joints = [...]``.
     Raises InputError, naming the waypoint.
     """
-    import numpy as np
-
-    from splatctrl_cli.control.checks import checked_posture
-    from splatctrl_cli.control.replay import Waypoint
-    from splatctrl_cli.geometry import transform_from
 
     try:
         text = path.read_text(encoding="utf-8")
@@ -103,8 +72,8 @@ def read_waypoints(path: Path, model: "RobotModel", frame: str) -> "tuple[Waypoi
             waypoints.append(Waypoint(T_world_goal=model.frame_pose(posture, frame), posture=posture))
             continue
         try:
-            values = pose(",".join(str(value) for value in row))
-        except argparse.ArgumentTypeError as error:
+            values = checked_pose(row)
+        except ValueError as error:
             raise InputError(f"{what}: {error}") from None
         waypoints.append(Waypoint(T_world_goal=transform_from(values[:3], values[3:])))
     return tuple(waypoints)
@@ -144,31 +113,13 @@ def _toml_rows(path: Path, text: str) -> list[tuple[str, list[float]]]:
     return rows
 
 
-def numbers(text: str) -> tuple[float, ...]:
-    """Finite numbers joined by commas, for argparse."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected numbers joined by commas, got {text!r}") from None
-    if not all(math.isfinite(value) for value in values):
-        raise argparse.ArgumentTypeError(f"expected finite numbers, got {text!r}")
-    return values
-
-
-def pose(text: str) -> tuple[float, ...]:
-    """A pose as `POSE`, for argparse."""
-    values = numbers(text)
+def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
+    """A pose as `POSE`, as it is. Raises ValueError for another number of values, or no unit quaternion."""
     if len(values) != 7:
-        raise argparse.ArgumentTypeError(f"expected 7 numbers {POSE}, got {len(values)}")
+        raise ValueError(f"expected 7 numbers {POSE}, got {len(values)}")
+    if not all(math.isfinite(value) for value in values):
+        raise ValueError(f"expected finite numbers, got {','.join(map(str, values))}")
     length = math.hypot(*values[3:])
     if abs(length - 1.0) > 0.01:
-        raise argparse.ArgumentTypeError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
-    return values
-
-
-def seconds(text: str) -> float:
-    """Seconds above zero, for argparse."""
-    values = numbers(text)
-    if len(values) != 1 or values[0] <= 0:
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
-    return values[0]
+        raise ValueError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
+    return tuple(values)

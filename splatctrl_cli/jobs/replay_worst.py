@@ -1,39 +1,25 @@
 """``--worst-frames``: pictures of the moments at which a replay was nearest to the scene."""
 
-import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splatctrl_cli.control.arm import sphere_names
+from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
+from splatctrl_cli.jobs.replay_request import ReplayInputs
+from splatctrl_cli.records import RgbdFrame
+
 if TYPE_CHECKING:
-    from splatctrl_cli.cli.replay_modes import Replay, ReplayInputs
-    from splatctrl_cli.evaluate.worst_frames import Moment, Sight
-    from splatctrl_cli.records import RgbdFrame
+    from splatctrl_cli.jobs.replay_modes import Replay
 
 NAMES = {"exact": "exact", "barrier": "barrier", "certified": "certified bound"}  # of the fields, in a caption
 
 
-def add_worst_frames(parser: argparse.ArgumentParser) -> None:
-    """``--worst-frames``."""
-    parser.add_argument(
-        "--worst-frames",
-        type=_count,
-        default=3,
-        metavar="N",
-        help="write worst_1.png ...: camera images of the N events of least clearance (default: 3)",
-    )
-
-
-def _count(text: str) -> int:
-    """A whole number from 0, for argparse."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0, got {text!r}")
-    return int(text)
-
-
 def draw_worst_frames(folder: Path, inputs: "ReplayInputs", replay: "Replay", num: int) -> list[str]:
     """Write worst_1.png (the least clearance), worst_2.png ... into a folder; returns what there is to say of it."""
-    from splatctrl_cli.evaluate.worst_frames import draw_sight, sights_of, worst_moments
 
     audit = replay.audit
     states = worst_moments(audit.stamp_ns, audit.clearance["exact"].distance, num)
@@ -50,7 +36,6 @@ def draw_worst_frames(folder: Path, inputs: "ReplayInputs", replay: "Replay", nu
 
 
 def _frames(inputs: "ReplayInputs") -> "Iterator[RgbdFrame]":
-    from splatctrl_cli.records import RgbdFrame
 
     records = inputs.source.records() if inputs.source.cameras else ()
     return (record for record in records if isinstance(record, RgbdFrame))
@@ -58,10 +43,6 @@ def _frames(inputs: "ReplayInputs") -> "Iterator[RgbdFrame]":
 
 def _moment(inputs: "ReplayInputs", replay: "Replay", state: int) -> "Moment":
     """A state with the obstacle that is nearest to its nearest sphere."""
-    import numpy as np
-
-    from splatctrl_cli.control.arm import sphere_names
-    from splatctrl_cli.evaluate.worst_frames import Moment
 
     audit, model = replay.audit, replay.model
     stamp, worst = int(audit.stamp_ns[state]), int(audit.clearance["exact"].sphere[state])
@@ -89,7 +70,6 @@ def _moment(inputs: "ReplayInputs", replay: "Replay", state: int) -> "Moment":
 
 def _explained(sight: "Sight", number: int, replay: "Replay") -> "Sight":
     """The sight with its number, camera, and whose spheres are drawn."""
-    from dataclasses import replace
 
     first, *rest = sight.moment.caption
     whose = (

@@ -1,6 +1,5 @@
 """``--golden``: the commands of this replay against those of an earlier one, step by step."""
 
-import argparse
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatctrl_cli.errors import GateFailed, InputError, UsageError
+from splatctrl_cli.jobs.replay_request import ReplayRequest
 
 if TYPE_CHECKING:
-    from splatctrl_cli.cli.replay_modes import Replay
+    from splatctrl_cli.jobs.replay_modes import Replay
 
 TOLERANCE = 1e-6  # [rad/s]: steps.csv keeps nine digits; another machine or solver needs more
 
@@ -28,34 +28,17 @@ class Golden:
     velocity: tuple[tuple[float, ...] | None, ...]
 
 
-def add_golden(parser: argparse.ArgumentParser) -> None:
-    """``--golden`` and ``--golden-tolerance``."""
-    parser.add_argument(
-        "--golden",
-        type=Path,
-        metavar="FILE",
-        help="fail (exit 1) where a command differs from an earlier replay's (its folder, run.json or steps.csv)",
-    )
-    parser.add_argument(
-        "--golden-tolerance",
-        type=float,
-        default=TOLERANCE,
-        metavar="RAD/S",
-        help=f"by more than this, per joint (default: {TOLERANCE:g})",
-    )
-
-
-def read_golden(args: argparse.Namespace) -> Golden | None:
+def read_golden(request: ReplayRequest) -> Golden | None:
     """The earlier run that --golden names, None without one. Raises UsageError for an audit, which commands nothing,
     InputError for a file without commands.
     """
-    if args.golden is None:
+    if request.golden is None:
         return None
-    if args.mode == "audit":
+    if request.mode == "audit":
         raise UsageError("--golden: an audit commands nothing", remedy="give --mode open-loop or closed-loop")
-    if not args.golden_tolerance >= 0:
-        raise UsageError(f"--golden-tolerance: expected 0 rad/s or more, got {args.golden_tolerance:g}")
-    path: Path = args.golden
+    if not request.golden_tolerance >= 0:
+        raise UsageError(f"--golden-tolerance: expected 0 rad/s or more, got {request.golden_tolerance:g}")
+    path: Path = request.golden
     file = path / "steps.csv" if path.is_dir() else path.with_name("steps.csv") if path.suffix == ".json" else path
     try:
         with file.open(encoding="utf-8", newline="") as stream:

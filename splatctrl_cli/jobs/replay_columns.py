@@ -9,7 +9,7 @@ from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.step import ControlStep
 
 if TYPE_CHECKING:
-    from splatctrl_cli.cli.replay_modes import Replay
+    from splatctrl_cli.jobs.replay_modes import Replay
 
 Columns = dict[str, list[object]]
 

@@ -6,15 +6,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.cli.replay_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
-from splatctrl_cli.cli.replay_compare import figure_names, figures_of
-from splatctrl_cli.cli.replay_states import LOG_FIGURES
-from splatctrl_cli.cli.replay_twists import FIGURES as TWIST_FIGURES
+from splatctrl_cli.control.explain import first_intervention
+from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.replay import Outcome
+from splatctrl_cli.control.step import RowKind
+from splatctrl_cli.evaluate.clearance import least
+from splatctrl_cli.jobs.replay_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
+from splatctrl_cli.jobs.replay_compare import figure_names, figures_of
+from splatctrl_cli.jobs.replay_states import LOG_FIGURES
+from splatctrl_cli.jobs.replay_twists import FIGURES as TWIST_FIGURES
+from splatctrl_cli.records import Bool, Float64
 
 if TYPE_CHECKING:
-    from splatctrl_cli.cli.replay_modes import Replay
-    from splatctrl_cli.cli.replay_store import Figures
-    from splatctrl_cli.records import Bool, Float64
+    from splatctrl_cli.jobs.replay_modes import Replay
+    from splatctrl_cli.jobs.replay_store import Figures
 
 Metrics = dict[str, float | None]
 
@@ -64,7 +69,6 @@ def metric_names(
 
 def metrics_of(replay: "Replay") -> Metrics:
     """Every figure that is printed, written and gated on, by name; None where there is no value."""
-    from splatctrl_cli.evaluate.clearance import least
 
     audit = replay.audit
     exact = audit.clearance["exact"].distance
@@ -169,8 +173,7 @@ def _highs(replay: "Replay") -> "Mapping[str, Callable[[], Float64]]":
 
 def _flags(replay: "Replay") -> "Mapping[str, Callable[[], Bool]]":
     """Reads the states (T,) that a count counts."""
-    from splatctrl_cli.cli.replay_store import RUNGS
-    from splatctrl_cli.control.ladder import Rung
+    from splatctrl_cli.jobs.replay_store import RUNGS
 
     exact, steps, asked = replay.audit.clearance["exact"], replay.kept_steps, replay.open_loop
     flags: dict[str, Callable[[], Bool]] = {
@@ -192,10 +195,7 @@ def _flags(replay: "Replay") -> "Mapping[str, Callable[[], Bool]]":
 
 
 def _step_metrics(replay: "Replay", figures: "Figures") -> Metrics:
-    from splatctrl_cli.cli.replay_store import RUNGS
-    from splatctrl_cli.control.explain import first_intervention
-    from splatctrl_cli.control.ladder import Rung
-    from splatctrl_cli.control.step import RowKind
+    from splatctrl_cli.jobs.replay_store import RUNGS
 
     first, rung = first_intervention(replay.events), figures["rung"]
     return {
@@ -229,7 +229,6 @@ def _open_loop_metrics(replay: "Replay") -> Metrics:
 
 
 def _closed_loop_metrics(replay: "Replay") -> Metrics:
-    from splatctrl_cli.control.replay import Outcome
 
     trace, of = replay.closed_loop, replay.divergence
     assert trace is not None

@@ -1,39 +1,34 @@
 """Going on with an interrupted run: what has to be the same, and what differs."""
 
-import argparse
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from splatctrl_cli import __version__
+from splatctrl_cli.config import Config
 from splatctrl_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.io.scene_writer import Checkpoint
+from splatctrl_cli.io.output import sha256
+from splatctrl_cli.io.scene_writer import Checkpoint, read_checkpoint
+from splatctrl_cli.kernels import native
 
 DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit
-DECIDING_OPTIONS = (
-    *("cameras", "camera", "camera_pose", "world_frame", "depth_scale", "pairing_tolerance", "joint_topic"),
-    *("holdout", "scan", "box"),
-)
 
 
-def identity(args: argparse.Namespace, config: "Config", inputs: Mapping[str, str]) -> dict[str, Any]:
+def identity(
+    options: Mapping[str, object], files: Mapping[str, Path | None], config: Config, inputs: Mapping[str, str]
+) -> dict[str, Any]:
     """Everything that decides the bytes of a run, as plain values; not the number of threads, which does not.
 
-    inputs: sha256 of the recording's files, by name.
+    options: values by the names of their options; files: likewise, whose contents count; inputs: sha256 of the
+    recording's files, by name.
     """
-    from splatctrl_cli.io.output import sha256
-
-    files = [name for name in ("urdf", "spheres", "points") if getattr(args, name)]
     values = {
         **deciding_versions(),
-        "--seed": args.seed,
-        **{f"--{name.replace('_', '-')}": getattr(args, name) for name in DECIDING_OPTIONS},
-        **{f"--{name}": sha256(getattr(args, name)) for name in files},
+        **{f"--{name.replace('_', '-')}": value for name, value in options.items()},
+        **{f"--{name}": sha256(path) for name, path in files.items() if path is not None},
         "sha256": dict(inputs),
         **config.as_dict(),
     }
@@ -43,8 +38,6 @@ def identity(args: argparse.Namespace, config: "Config", inputs: Mapping[str, st
 
 def deciding_versions() -> dict[str, str]:
     """What of this program, its kernels and its packages may change a bit."""
-    from splatctrl_cli import __version__
-    from splatctrl_cli.kernels import native
 
     return {
         "splatctrl": __version__,
@@ -68,7 +61,6 @@ def told_how_to_go_on(checkpoint: Path) -> Iterator[None]:
 
 def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> "Checkpoint":
     """The checkpoint in a partial folder. Raises UsageError naming what differs `now` from when it was written."""
-    from splatctrl_cli.io.scene_writer import read_checkpoint
 
     checkpoint = read_checkpoint(folder)
     check_same_run(folder, checkpoint.progress["run"], now)

@@ -1,35 +1,39 @@
 """The methods of ``--baseline`` beside the closed loop and the log: one task, one scene, one table."""
 
-import argparse
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.cli.common import table
+import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.control.comparison import Motion, MotionFigures, Yardstick
+from splatctrl_cli.control.detour import PlanDetour
+from splatctrl_cli.control.open_loop import is_shaped
+from splatctrl_cli.control.planned import PlannedPath, planned_detours, planned_path
+from splatctrl_cli.control.replay import ReplayTask
+from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.methods_picture import methods_picture
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
+from splatctrl_cli.records import Float64
 
 if TYPE_CHECKING:
-    from splatctrl_cli.cli.common import Console
-    from splatctrl_cli.cli.known_scene import KnownFields
-    from splatctrl_cli.cli.replay_modes import Replay, ReplayInputs
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.control.audit import DistanceFunction
-    from splatctrl_cli.control.comparison import Motion, MotionFigures, Yardstick
-    from splatctrl_cli.control.detour import PlanDetour
-    from splatctrl_cli.control.planned import PlannedPath
-    from splatctrl_cli.control.replay import ReplayTask
-    from splatctrl_cli.records import Float64
+    from splatctrl_cli.jobs.known_scene import KnownFields
+    from splatctrl_cli.jobs.replay_modes import Replay
 
 BIRRT, BIRRT_IK = "birrt", "birrt-ik"
 ALWAYS = ("closed_loop", "log")  # what stands in every comparison
 ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
-_MOTION = (
+MOTION = (
     *("success", "goal_reached", "duration_s", "joint_path_rad", "effector_path_m", "effector_path_deg"),
     *("min_clearance_barrier", "min_clearance", "min_clearance_proved", "min_clearance_true", "num_interventions"),
 )
-_PLAN = ("planning_time_s", "planned_margin", "planned_self_margin", "num_edges", "num_edges_proved")
+PLAN = ("planning_time_s", "planned_margin", "planned_self_margin", "num_edges", "num_edges_proved")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +61,7 @@ def figure_names(baselines: Sequence[str], *, has_truth: bool) -> tuple[str, ...
         return ()
     methods = (*ALWAYS, *map(method_named, baselines))
     plans = {method_named(name) for name in (BIRRT, BIRRT_IK)}
-    names = [(method, name) for method in methods for name in (*_MOTION, *(_PLAN if method in plans else ()))]
+    names = [(method, name) for method in methods for name in (*MOTION, *(PLAN if method in plans else ()))]
     return tuple(f"{method}_{name}" for method, name in names if has_truth or name != "min_clearance_true")
 
 
@@ -75,24 +79,11 @@ def figures_of(comparison: Comparison) -> dict[str, float | None]:
     return found
 
 
-def lines_of(comparison: Comparison) -> list[str]:
-    """The table of all methods side by side, and a line for each plan that was not found or has a smaller margin."""
-    if not comparison.methods:
-        return []
-    figures, methods = figures_of(comparison), comparison.methods
-    names = [name for name in (*_MOTION, *_PLAN) if any(f"{method}_{name}" in figures for method in methods)]
-    rows = [(name, *(_shown(figures.get(f"{method}_{name}")) for method in methods)) for name in names]
-    lines = ["", "Side by side, from the same state to the same goal:", *table(("", *methods), rows)]
-    return lines + [
-        f"{method}: no path: {plan.outcome}" for method, plan in comparison.plans.items() if not plan.path
-    ]
-
-
 def document_of(comparison: Comparison) -> dict[str, Any]:
     """methods.json: figures by method, and what was planned."""
     figures = figures_of(comparison)
     by_method = {
-        method: {name: figures[f"{method}_{name}"] for name in (*_MOTION, *_PLAN) if f"{method}_{name}" in figures}
+        method: {name: figures[f"{method}_{name}"] for name in (*MOTION, *PLAN) if f"{method}_{name}" in figures}
         for method in comparison.methods
     }
     plans = {
@@ -104,50 +95,44 @@ def document_of(comparison: Comparison) -> dict[str, Any]:
 
 def draw_methods(folder: Path, comparison: Comparison, period: float, margin: float) -> None:
     """Write methods.png, where there is more than the replay itself."""
-    from splatctrl_cli.evaluate.methods_picture import methods_picture
 
     if comparison.figures:
         barrier = {method: figures.barrier for method, figures in comparison.figures.items()}
         methods_picture(folder / "methods.png", barrier, period, margin)
 
 
-def check_comparable(args: argparse.Namespace, baselines: Sequence[str]) -> None:
+def check_comparable(request: ReplayRequest, baselines: Sequence[str]) -> None:
     """Raise UsageError where a planner is asked for more than one goal."""
     if not {BIRRT, BIRRT_IK} & set(baselines):
         return
     for option, given in (
-        ("--waypoints", args.waypoints),
-        ("--follow", args.follow),
-        ("--re-anchor", args.re_anchor),
+        ("--waypoints", request.waypoints),
+        ("--follow", request.follow),
+        ("--re-anchor", request.re_anchor),
     ):
         if given:
             raise UsageError(f"--baseline birrt: expected a single goal, got {option}", remedy=f"leave out {option}")
 
 
 def compared(
-    args: argparse.Namespace,
+    request: ReplayRequest,
     baselines: Sequence[str],
     inputs: "ReplayInputs",
     replay: "Replay",
     config: "Config",
-    console: "Console",
+    console: Progress,
 ) -> Comparison:
     """The closed loop, the log and every baseline, each in the scene as it was known at its time.
 
     Planned paths are those of the scene known at the start; they begin there and then, as if planning took no time.
     """
-    import numpy as np
-
-    from splatctrl_cli.cli.replay_modes import logged_motion
-    from splatctrl_cli.control.comparison import Motion
-    from splatctrl_cli.control.open_loop import is_shaped
 
     trace = replay.closed_loop
     if not baselines or trace is None:
         return Comparison()
     start_ns, control = int(trace.stamp_ns[0]), config.control
-    log = logged_motion(inputs)
-    task = _task(args, inputs, trace.position[0], start_ns, log.position[-1])
+    log = inputs.motion()
+    task = _task(request, inputs, trace.position[0], start_ns, log.position[-1])
     shaped = np.array([is_shaped(step) for step in trace.steps], dtype=np.bool_)
     num = max(math.ceil((log.last_ns - start_ns) * 1e-9 / control.period - 1e-6), 0) + 1
     stamps = _stamps(start_ns, num, control.period)
@@ -173,15 +158,9 @@ def compared(
 
 
 def _planned(
-    baselines: Sequence[str], inputs: "ReplayInputs", task: "ReplayTask", config: "Config", console: "Console"
+    baselines: Sequence[str], inputs: "ReplayInputs", task: "ReplayTask", config: "Config", console: Progress
 ) -> "tuple[dict[str, PlannedPath], dict[str, Motion]]":
     """One plan for both ways to follow it, and how each went."""
-    import numpy as np
-
-    from splatctrl_cli.control.comparison import Motion
-    from splatctrl_cli.control.open_loop import is_shaped
-    from splatctrl_cli.control.planned import planned_path
-    from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
 
     scene, control, planner = inputs.scene, config.control, config.planner
     known = _Certified(distance=certified_distance(scene.at(task.stamp_ns)))
@@ -210,7 +189,6 @@ def _planned(
 
 def planned_ways_out(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> "PlanDetour | None":
     """What plans the closed loop's ways out of local minima; None where it may take none."""
-    from splatctrl_cli.control.planned import planned_detours
 
     def scene_at(stamp_ns: int) -> _Certified:
         return _Certified(distance=certified_distance(inputs.scene.at(stamp_ns)))
@@ -241,7 +219,6 @@ def certified_distance(fields: "KnownFields") -> "DistanceFunction":
 
 
 def _yardstick(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> "Yardstick":
-    from splatctrl_cli.control.comparison import Yardstick
 
     scene, truth = inputs.scene, inputs.truth
     known: list[tuple[KnownFields, DistanceFunction]] = []  # the scene in use
@@ -268,14 +245,13 @@ def _yardstick(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> 
 
 
 def _task(
-    args: argparse.Namespace, inputs: "ReplayInputs", start: "Float64", stamp_ns: int, logged_end: "Float64"
+    request: ReplayRequest, inputs: "ReplayInputs", start: "Float64", stamp_ns: int, logged_end: "Float64"
 ) -> "ReplayTask":
     """What the closed loop was asked for; without a posture the logged one at the end is where goals are sought."""
-    from splatctrl_cli.cli.replay_goal import goal_waypoints
-    from splatctrl_cli.control.replay import ReplayTask
+    from splatctrl_cli.jobs.replay_goal import goal_waypoints
 
-    frame = args.frame or inputs.model.frame_names[-1]
-    goal = goal_waypoints(args, inputs.model, frame, logged_end)[-1]
+    frame = request.frame or inputs.model.frame_names[-1]
+    goal = goal_waypoints(request, inputs.model, frame, logged_end)[-1]
     return ReplayTask(
         start=start,
         T_world_goal=goal.T_world_goal,
@@ -286,14 +262,13 @@ def _task(
 
 
 def _stamps(start_ns: int, num: int, period: float) -> Any:
-    import numpy as np
 
     return start_ns + np.round(np.arange(num) * period * 1e9).astype(np.int64)
 
 
 def _motion_values(figures: "MotionFigures | None") -> dict[str, float | None]:
     if figures is None:
-        return {"success": 0, "goal_reached": 0, **dict.fromkeys(_MOTION[2:])}
+        return {"success": 0, "goal_reached": 0, **dict.fromkeys(MOTION[2:])}
     return {
         "success": int(figures.is_success),
         "goal_reached": int(figures.has_arrived),
@@ -311,14 +286,8 @@ def _motion_values(figures: "MotionFigures | None") -> dict[str, float | None]:
 
 def _plan_values(plan: "PlannedPath") -> dict[str, float | None]:
     values = (plan.seconds, _finite(plan.margin), _finite(plan.self_margin), plan.num_edges, plan.num_proved)
-    return dict(zip(_PLAN, values, strict=True))
+    return dict(zip(PLAN, values, strict=True))
 
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _shown(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,21 +1,11 @@
 """The replays themselves: audit, open loop and closed loop over what was read, and the truth beside them."""
 
-import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.cli.common import Console
-from splatctrl_cli.cli.known_scene import KnownScene
-from splatctrl_cli.cli.replay_baseline import read_baselines, read_zone, separations
-from splatctrl_cli.cli.replay_compare import Comparison, compared, planned_ways_out
-from splatctrl_cli.cli.replay_goal import goal_waypoints
-from splatctrl_cli.cli.replay_record import ReplayRecord
-from splatctrl_cli.cli.replay_states import check_inside
-from splatctrl_cli.cli.replay_store import Figures, StoredAudit, StoredLoop, StoredOpenLoop, StoredSteps
-from splatctrl_cli.cli.replay_twists import twist_figures, twist_track
+from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.checks import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.course import LoggedMotion
@@ -23,34 +13,24 @@ from splatctrl_cli.control.explain import Event
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence
 from splatctrl_cli.control.rows import scene_margin
+from splatctrl_cli.control.standstill import Separation
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.evaluate.clearance import clearance_agreement, mark_seen
+from splatctrl_cli.evaluate.clearance import ClearanceAgreement, clearance_agreement, mark_seen
 from splatctrl_cli.io.rows import RowFile, Rows, ranges
 from splatctrl_cli.io.state_columns import StateColumns
-from splatctrl_cli.records import Float64, FloatRows, RecordSource, RgbdFrame
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.control.standstill import Separation
-    from splatctrl_cli.evaluate.clearance import ClearanceAgreement
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.simulate.truth import Truth
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReplayInputs:
-    """Everything a replay reads; states in the model's joint order."""
-
-    source: RecordSource
-    states: StateColumns
-    model: "RobotModel"
-    scene: KnownScene
-    truth: "Truth | None"
-    digests: dict[str, str]
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone, separations
+from splatctrl_cli.jobs.replay_compare import Comparison, compared, planned_ways_out
+from splatctrl_cli.jobs.replay_goal import goal_waypoints
+from splatctrl_cli.jobs.replay_record import ReplayRecord
+from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay_states import check_inside
+from splatctrl_cli.jobs.replay_store import Figures, StoredAudit, StoredLoop, StoredOpenLoop, StoredSteps
+from splatctrl_cli.jobs.replay_twists import twist_figures, twist_track
+from splatctrl_cli.records import Float64, FloatRows, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,19 +85,19 @@ class Replay:
         return () if trace is None else trace.steps
 
 
-def replayed(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
+def replayed(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
     """The replay that --mode asks for, with its events."""
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
-    mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[args.mode]
-    zone = read_zone(args)
-    replay = mode(args, inputs, config, console)
+    mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[request.mode]
+    zone = read_zone(request)
+    replay = mode(request, inputs, config, console)
     replay = replace(
         replay,
-        separations=separations(args, zone, inputs, replay, config),
+        separations=separations(request, zone, inputs, replay, config),
         period=config.control.period,
     )
-    return replace(replay, comparison=compared(args, read_baselines(args), inputs, replay, config, console))
+    return replace(replay, comparison=compared(request, read_baselines(request), inputs, replay, config, console))
 
 
 def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
@@ -148,23 +128,23 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
     return replace(replay, true_clearance=truth, agreement=agreement)
 
 
-def _audited(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
+def _audited(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
     """The audit of every logged state for which a scene was known."""
-    first, record = _first_known(inputs), _record(args, inputs, config)
+    first, record = _first_known(inputs), _record(request, inputs, config)
     for stamps, positions, _ in _blocks(record, inputs.states, first):
         record.explain(record.measured(stamps, positions))
     return _logged(inputs, config, record, first)
 
 
-def _asked(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
+def _asked(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
     """The audit, and the controller's command at every state of it."""
     scene, model, states = inputs.scene, inputs.model, inputs.states
-    first, record = _first_known(inputs), _record(args, inputs, config)
-    frame = args.frame or model.frame_names[-1]
-    twists = twist_track(args, model, _span(inputs), console)
+    first, record = _first_known(inputs), _record(request, inputs, config)
+    frame = request.frame or model.frame_names[-1]
+    twists = twist_track(request, model, _span(inputs), console)
     task = OpenLoopTask(frame=frame, twists=twists)
-    if any(given is not None for given in (args.goal, args.goal_joints, args.waypoints)):
-        goals = goal_waypoints(args, model, frame, states.position[-1])
+    if any(given is not None for given in (request.goal, request.goal_joints, request.waypoints)):
+        goals = goal_waypoints(request, model, frame, states.position[-1])
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
     console.log(f"replay: asking the controller at {len(states) - first} states")
     asked = StoredOpenLoop()
@@ -188,12 +168,12 @@ def _asked(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", con
     )
 
 
-def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", console: Console) -> Replay:
+def _driven(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
     """The closed loop, the audit of the states it went through, and how far they are from the log."""
-    scene, model, record = inputs.scene, inputs.model, _record(args, inputs, config)
-    motion = logged_motion(inputs)
-    twists = twist_track(args, model, _span(inputs), console)
-    task = _task(args, inputs, motion, twists, config.control.limit_tolerance)
+    scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
+    motion = inputs.motion()
+    twists = twist_track(request, model, _span(inputs), console)
+    task = _task(request, inputs, motion, twists, config.control.limit_tolerance)
     start_s = (task.stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
@@ -226,8 +206,8 @@ def _driven(args: argparse.Namespace, inputs: ReplayInputs, config: "Config", co
     )
 
 
-def _record(args: argparse.Namespace, inputs: ReplayInputs, config: "Config") -> ReplayRecord:
-    return ReplayRecord(inputs.model, inputs.scene, margin=config.control.margin, max_map_age=args.max_map_age)
+def _record(request: ReplayRequest, inputs: ReplayInputs, config: "Config") -> ReplayRecord:
+    return ReplayRecord(inputs.model, inputs.scene, margin=config.control.margin, max_map_age=request.max_map_age)
 
 
 def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[tuple[Stamps, Float64, Float64]]:
@@ -281,23 +261,17 @@ def _first_known(inputs: ReplayInputs) -> int:
     return first
 
 
-def logged_motion(inputs: ReplayInputs) -> LoggedMotion:
-    """Every logged state, whether a scene was known or not."""
-    states = inputs.states
-    return LoggedMotion(stamp_ns=states.stamp_ns, position=states.position, velocity=states.velocity)
-
-
 def _span(inputs: ReplayInputs) -> tuple[int, int]:
     return int(inputs.states.stamp_ns[0]), int(inputs.states.stamp_ns[-1])
 
 
 def _task(
-    args: argparse.Namespace, inputs: ReplayInputs, motion: LoggedMotion, twists: TwistTrack | None, tolerance: float
+    request: ReplayRequest, inputs: ReplayInputs, motion: LoggedMotion, twists: TwistTrack | None, tolerance: float
 ) -> ReplayTask:
     """The start (logged, and not before the scene is known) and the goal (given, or the logged end)."""
     stamps, positions = motion.stamp_ns, motion.position
-    earliest = stamps[0] if args.start_time is None else stamps[0] + round(args.start_time * 1e9)
-    if args.start_time is None and inputs.scene.first_ns is not None:
+    earliest = stamps[0] if request.start_time is None else stamps[0] + round(request.start_time * 1e9)
+    if request.start_time is None and inputs.scene.first_ns is not None:
         earliest = max(earliest, inputs.scene.first_ns)
     start = int(np.searchsorted(stamps, earliest))
     if start == len(stamps):
@@ -306,9 +280,9 @@ def _task(
             f"got {(earliest - stamps[0]) * 1e-9:.2f} s",
             remedy="give an earlier --start-time",
         )
-    frame = args.frame or inputs.model.frame_names[-1]
+    frame = request.frame or inputs.model.frame_names[-1]
     end = positions[-1] if twists is None else positions[start]
-    *via, goal = goal_waypoints(args, inputs.model, frame, end)
+    *via, goal = goal_waypoints(request, inputs.model, frame, end)
     for waypoint in (*via, goal):
         if waypoint.posture is not None:
             check_within_limits(inputs.model, waypoint.posture, tolerance, what="goal")
@@ -319,9 +293,9 @@ def _task(
         stamp_ns=int(stamps[start]),
         home=goal.posture,
         via=tuple(via),
-        follow=motion if args.follow else None,
+        follow=motion if request.follow else None,
         twists=twists,
         end_ns=motion.last_ns,
-        anchors=motion if args.re_anchor else None,
-        anchor_period=args.re_anchor or 0.0,
+        anchors=motion if request.re_anchor else None,
+        anchor_period=request.re_anchor or 0.0,
     )

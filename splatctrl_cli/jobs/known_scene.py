@@ -6,22 +6,27 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.audit import DistanceFunction, Observed, observed_lookup
+from splatctrl_cli.control.explain import Obstacle
+from splatctrl_cli.control.people import guarded
+from splatctrl_cli.control.rates import SceneStep
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.field.distance import SphereField, field_over
+from splatctrl_cli.field.grid import GridField, exact_channel
+from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats
+from splatctrl_cli.field.spheres import Spheres
+from splatctrl_cli.io.grid import read_npz
+from splatctrl_cli.io.output import sha256
+from splatctrl_cli.io.scene_folder import open_scene
+from splatctrl_cli.records import SWEPT, Box, DistanceField, DistanceGrid, Float64, Label, OccupancyGrid, SplatSet
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.control.audit import DistanceFunction, Observed
-    from splatctrl_cli.control.explain import Obstacle
-    from splatctrl_cli.control.rates import SceneStep
-    from splatctrl_cli.field.grid import GridField
-    from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, OccupancyGrid, SplatSet
-
-    Index = NDArray[np.int64]
+Index = NDArray[np.int64]
 
 Key = TypeVar("Key", bound=Hashable)
 HELD = 2  # scenes whose fields are kept: a rate of change needs two
@@ -74,7 +79,6 @@ class KnownScene:
 
     def step_at(self, stamp_ns: int) -> "SceneStep | None":
         """The two newest scenes at a stamp, None where there is only one."""
-        from splatctrl_cli.control.rates import SceneStep
 
         index = self._index_at(stamp_ns)
         if index < 1:
@@ -109,13 +113,6 @@ def fields_at(
 
 def from_grid(path: Path) -> KnownScene:
     """The scene of a baked grid: one field for all times. `path` is a field folder or a ``field.npz``."""
-    import numpy as np
-
-    from splatctrl_cli.control.audit import observed_lookup
-    from splatctrl_cli.field.grid import GridField, exact_channel
-    from splatctrl_cli.io.grid import read_npz
-    from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.records import Box
 
     file = path / "field.npz" if path.is_dir() else path
     grid = read_npz(file)
@@ -145,8 +142,6 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
 
     Known space is what a camera saw, and what the robot itself was in at some time of the log.
     """
-    from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.scene_folder import open_scene
 
     scene = open_scene(path)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
@@ -176,8 +171,6 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
 
 def known_space(occupancy: "OccupancyGrid") -> "Observed":
     """What a camera saw or the robot was in, of an occupancy grid."""
-    from splatctrl_cli.control.audit import observed_lookup
-    from splatctrl_cli.records import SWEPT
 
     known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
     return observed_lookup(known.astype("uint8"), occupancy.origin, occupancy.voxel)
@@ -187,13 +180,6 @@ def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFie
     """Exact and barrier field of the splats, the robot's own left out; in the latter people count as much nearer as
     `control.human_margin` asks.
     """
-    import numpy as np
-
-    from splatctrl_cli.control.people import guarded
-    from splatctrl_cli.field.distance import SphereField, field_over
-    from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats
-    from splatctrl_cli.field.spheres import Spheres
-    from splatctrl_cli.records import Label
 
     chosen = field_splats(splats)
     index = np.flatnonzero(np.isin(splats.labels, [int(label) for label in DEFAULT_LABELS]))
@@ -213,10 +199,6 @@ def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFie
 
 def _nearest_splats(splats: "SplatSet", index: "Index", points: "Float64") -> "tuple[Obstacle, ...]":
     """The splats that are nearest to points (Q, 3), by their index (Q,) in their file."""
-    import numpy as np
-
-    from splatctrl_cli.control.explain import Obstacle
-    from splatctrl_cli.records import Label
 
     offset = points - splats.centers[index].astype(np.float64)
     gap = np.linalg.norm(offset, axis=1)
@@ -235,9 +217,6 @@ def _nearest_splats(splats: "SplatSet", index: "Index", points: "Float64") -> "t
 
 def _nearest_cells(grid: "DistanceGrid", field: "GridField", points: "Float64") -> "tuple[Obstacle, ...]":
     """The cells that hold the nearest surface to points (Q, 3), as the gradient points to it."""
-    import numpy as np
-
-    from splatctrl_cli.control.explain import Obstacle
 
     distance, gradient = field.query(points)
     length = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)

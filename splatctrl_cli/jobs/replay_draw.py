@@ -4,10 +4,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splatctrl_cli.control.explain import INTERVENTIONS, Event
+from splatctrl_cli.evaluate.replay_pictures import (
+    clearance_picture,
+    commands_picture,
+    divergence_picture,
+    open_loop_picture,
+)
+from splatctrl_cli.records import Float64, FloatRows
+
 if TYPE_CHECKING:
-    from splatctrl_cli.cli.replay_modes import Replay
-    from splatctrl_cli.control.explain import Event
-    from splatctrl_cli.records import Float64, FloatRows
+    from splatctrl_cli.jobs.replay_modes import Replay
 
 TITLES = {
     "audit": "Clearance of the logged motion",
@@ -22,15 +31,6 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
 
     seconds: (T,) since the first state.
     """
-    import numpy as np
-
-    from splatctrl_cli.control.explain import INTERVENTIONS
-    from splatctrl_cli.evaluate.replay_pictures import (
-        clearance_picture,
-        commands_picture,
-        divergence_picture,
-        open_loop_picture,
-    )
 
     curves: dict[str, FloatRows] = {name: of.rows for name, of in replay.audit.clearance.items()}
     if replay.true_clearance is not None:

@@ -5,20 +5,25 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatctrl_cli.cli.common import Console
+import numpy as np
+from tqdm import tqdm
+
+from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.io.scene_writer import Checkpoint
-    from splatctrl_cli.records import Box, PointCloud, RecordSource
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.scene.audit import AuditRow
-    from splatctrl_cli.scene.fitter import SceneFitter
-    from splatctrl_cli.scene.posture import RobotPosture
-    from splatctrl_cli.scene.time_steps import TimeStep
+from splatctrl_cli.evaluate.recording import first_frame
+from splatctrl_cli.io.scene_folder import FORMAT
+from splatctrl_cli.io.scene_writer import Checkpoint, SceneWriter
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.records import Box, PointCloud, RecordSource
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.audit import AuditRow
+from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspace_of
+from splatctrl_cli.scene.consistency import agreements
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
 SAME_MOMENT_NS = 20_000_000  # frames of one time step are at most so far apart
@@ -54,8 +59,6 @@ class Reconstruction:
         allow_disagreement: bool = False,
         checkpoint: "Checkpoint | None" = None,
     ) -> None:
-        from splatctrl_cli.io.scene_folder import FORMAT
-        from splatctrl_cli.io.scene_writer import SceneWriter
 
         self.source = source
         self.robot = robot
@@ -81,7 +84,7 @@ class Reconstruction:
         if checkpoint is not None:
             self._restore(checkpoint)
 
-    def run(self, console: Console) -> None:
+    def run(self, console: Progress) -> None:
         """Step through what is left of the log."""
         self._step_through(console)
         self.check_found()
@@ -104,8 +107,7 @@ class Reconstruction:
                 remedy="give a --box that holds what the cameras saw; 'splatctrl info' says where they stand",
             )
 
-    def _step_through(self, console: Console) -> None:
-        from tqdm import tqdm
+    def _step_through(self, console: Progress) -> None:
 
         steps = tqdm(self.time_steps(), disable=True if console.is_quiet else None, unit=" steps")
         for index, step in enumerate(steps):
@@ -123,7 +125,7 @@ class Reconstruction:
                 console.log(f"time step {index}: {row.alive} splats, {quality}")
             self._save_if_due()
 
-    def take(self, step: "TimeStep", console: Console) -> "AuditRow | None":
+    def take(self, step: "TimeStep", console: Progress) -> "AuditRow | None":
         """Take in the next time step, with its snapshot where one is due; None for one that does not say yet where
         the workspace is.
         """
@@ -149,9 +151,8 @@ class Reconstruction:
             self.snapshot(step.stamp_ns)
         return row
 
-    def _check_cameras(self, step: "TimeStep", console: Console) -> None:
+    def _check_cameras(self, step: "TimeStep", console: Progress) -> None:
         """Measure once a pair how far cameras disagree on what both see. Raises InputError where that is too far."""
-        from splatctrl_cli.scene.consistency import agreements
 
         limits = self.config.occupancy
         if not self._has_new_pairs(step):
@@ -173,7 +174,6 @@ class Reconstruction:
             console.log(f"warning: {line}")
 
     def _keep_first_frames(self, step: "TimeStep") -> None:
-        from splatctrl_cli.evaluate.recording import first_frame
 
         for frame in step.frames:
             if frame.camera not in self.first_frames:
@@ -185,7 +185,7 @@ class Reconstruction:
         pairs = {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)}
         return not pairs <= self.disagreement.keys()
 
-    def _warn_of_small_budget(self, row: "AuditRow", console: Console) -> None:
+    def _warn_of_small_budget(self, row: "AuditRow", console: Progress) -> None:
         if row.unmet:
             budget = self.config.scene.max_splats
             console.log(
@@ -193,7 +193,7 @@ class Reconstruction:
                 f" slot; --max-splats {budget + row.unmet} would hold them"
             )
 
-    def _refine(self, fitter: "SceneFitter", console: Console) -> None:
+    def _refine(self, fitter: "SceneFitter", console: Progress) -> None:
         total = self.config.scene.refine_iterations
 
         def progress(done: int) -> None:
@@ -268,7 +268,6 @@ class Reconstruction:
         self._save_time = self._saved_at - start
 
     def _save(self, *, is_last: bool = False) -> None:
-        from splatctrl_cli.scene.checkpoint import fitter_state
 
         assert self.fitter is not None
         progress = {
@@ -282,8 +281,6 @@ class Reconstruction:
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
 
     def _restore(self, checkpoint: "Checkpoint") -> None:
-        from splatctrl_cli.scene.audit import AuditRow
-        from splatctrl_cli.scene.checkpoint import restore_fitter, workspace_of
 
         self.rows = [AuditRow(**{**row, "cameras": tuple(row["cameras"])}) for row in self.writer.audited()]
         self.num_read = checkpoint.progress["num_read"]
@@ -296,13 +293,11 @@ class Reconstruction:
 
     def time_steps(self) -> "Iterator[TimeStep]":
         """Those of the source, from its beginning."""
-        from splatctrl_cli.scene.time_steps import time_steps
 
         steps = time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)
         return steps if self.cloud is None else (step.without_depth() for step in steps)
 
     def _new_fitter(self, workspace: "Box") -> "SceneFitter":
-        from splatctrl_cli.scene.fitter import SceneFitter
 
         scene = self.config.scene if self.source.has_clock else replace(self.config.scene, fill=1.0)
         return SceneFitter(scene, self.config.occupancy, workspace, seed=self.seed, threads=self.threads)
@@ -312,8 +307,6 @@ class Reconstruction:
         return self.box is None and self.robot is None and self.cloud is None
 
     def _workspace(self, first: "TimeStep") -> "Box":
-        from splatctrl_cli.records import Box
-        from splatctrl_cli.scene.time_steps import cloud_box, depth_box
 
         if self.box is not None:
             return self.box
@@ -325,9 +318,6 @@ class Reconstruction:
         return depth_box(first.frames, self.config.occupancy.max_range)
 
     def _posture(self, step: "TimeStep") -> "RobotPosture | None":
-        import numpy as np
-
-        from splatctrl_cli.scene.posture import RobotPosture
 
         if self.robot is None or step.position is None:
             return None

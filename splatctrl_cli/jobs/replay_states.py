@@ -1,21 +1,20 @@
 """What ``splatctrl replay`` reads of a log: the robot's states, and whether they fit the robot and the cameras."""
 
-import argparse
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatctrl_cli.cli.source_options import source_options
+import numpy as np
+
 from splatctrl_cli.errors import InputError, NotEvaluableError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from splatctrl_cli.io.state_check import PoseAgreement
-    from splatctrl_cli.io.state_columns import StateColumns
-    from splatctrl_cli.io.state_motion import ImageMotion
-    from splatctrl_cli.io.state_offset import ClockOffset
-    from splatctrl_cli.records import Box, Float64, RecordSource
-    from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.io.state_check import PoseAgreement, check_angles, check_states, pose_agreement
+from splatctrl_cli.io.state_columns import StateCollector, StateColumns
+from splatctrl_cli.io.state_motion import ImageMotion
+from splatctrl_cli.io.state_offset import ClockOffset, RobotPoints, estimate_clock_offset, states_asked
+from splatctrl_cli.io.state_source import StateSource, open_states
+from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.records import Box, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
 
 MAX_NOTES = 10  # printed
 LOG_FIGURES = (
@@ -70,18 +69,13 @@ class LoggedStates:
         return [f"log: {line}" for line in (*notes[:MAX_NOTES], *more, *found)]
 
 
-def read_states(args: argparse.Namespace, model: "RobotModel") -> LoggedStates:
+def read_states(request: ReplayRequest, model: "RobotModel") -> LoggedStates:
     """The states of the robot's joints in a log. Raises InputError where there are none, or none that can be its."""
-    from splatctrl_cli.io.state_check import check_angles, check_states, pose_agreement
-    from splatctrl_cli.io.state_columns import StateCollector
-    from splatctrl_cli.io.state_motion import ImageMotion
-    from splatctrl_cli.io.state_source import StateSource, open_states
-    from splatctrl_cli.records import JointState, RgbdFrame
 
-    source = open_states(args.log, source_options(args), model.joint_names)
+    source = open_states(request.log, request.options, model.joint_names)
     if not source.joint_names:
         raise InputError(
-            f"{args.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
+            f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
         )
     order = model.joint_order(source.joint_names)
     collector, motion = StateCollector(len(source.joint_names)), ImageMotion()
@@ -100,7 +94,6 @@ def read_states(args: argparse.Namespace, model: "RobotModel") -> LoggedStates:
 
 def check_inside(model: "RobotModel", q: "Float64", box: "Box") -> None:
     """Raise NotEvaluableError for a posture (J,) of which no moving sphere is in the box of a baked field."""
-    import numpy as np
 
     centers = model.sphere_centers(q)[np.flatnonzero(model.moving_spheres)]
     beyond = np.maximum(box.lower - centers, centers - box.upper).max(axis=1)
@@ -116,7 +109,6 @@ def check_inside(model: "RobotModel", q: "Float64", box: "Box") -> None:
 
 def _clock(model: "RobotModel", states: "StateColumns", motion: "ImageMotion") -> "ClockOffset":
     """Of the states that it looks at."""
-    from splatctrl_cli.io.state_offset import RobotPoints, estimate_clock_offset, states_asked
 
     asked = states.select(states_asked(states.stamp_ns, motion))
     centers = model.sphere_centers_batch(asked.position[: len(asked)])

@@ -1,20 +1,20 @@
 """``--twist-topic``: the velocity that a log's own operator asked for, as what a replay's controller reaches for."""
 
-import argparse
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.audit import Stamps
+from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.cli.common import Console
-    from splatctrl_cli.config import ControlConfig
-    from splatctrl_cli.control.arm import ArmModel
-    from splatctrl_cli.control.audit import Stamps
-    from splatctrl_cli.control.step import ControlStep
-    from splatctrl_cli.control.twists import TwistTrack
-    from splatctrl_cli.records import FloatRows
-    from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.io.twists import read_twists
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.records import FloatRows
+from splatctrl_cli.robot.model import RobotModel
 
 WORLD = "world"
 FIGURES = (
@@ -23,40 +23,26 @@ FIGURES = (
 )
 
 
-def add_twists(parser: argparse.ArgumentParser, goal: argparse._ActionsContainer) -> None:
-    """``--twist-topic`` among the goals, and ``--twist-frame``."""
-    goal.add_argument(
-        "--twist-topic",
-        metavar="NAME",
-        help="reach for the twists of this topic of LOG (Twist, TwistStamped), or of a .toml's table: twists",
-    )
-    parser.add_argument(
-        "--twist-frame", metavar="LINK", help="whose axes they are in: world or a link (default: as the log says)"
-    )
-
-
-def check_twists(args: argparse.Namespace) -> None:
+def check_twists(request: ReplayRequest) -> None:
     """Raise UsageError for twists where no controller runs, or a frame without them."""
-    if args.twist_topic is not None and args.mode == "audit":
+    if request.twist_topic is not None and request.mode == "audit":
         raise UsageError("--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit asks nobody")
-    if args.twist_frame is not None and args.twist_topic is None:
+    if request.twist_frame is not None and request.twist_topic is None:
         raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
 
 
 def twist_track(
-    args: argparse.Namespace, model: "RobotModel", span_ns: tuple[int, int], console: "Console"
+    request: ReplayRequest, model: "RobotModel", span_ns: tuple[int, int], console: Progress
 ) -> "TwistTrack | None":
     """The twists that --twist-topic names, None without it. span_ns: first and last joint state.
 
     Raises InputError where they are in no frame that is known, or all at other times.
     """
-    from splatctrl_cli.control.twists import TwistTrack
-    from splatctrl_cli.io.twists import read_twists
 
-    if args.twist_topic is None:
+    if request.twist_topic is None:
         return None
-    logged = read_twists(args.log, args.twist_topic)
-    frame = logged.frame if args.twist_frame is None else args.twist_frame
+    logged = read_twists(request.log, request.twist_topic)
+    frame = logged.frame if request.twist_frame is None else request.twist_frame
     if frame != WORLD and frame not in model.frame_names:
         raise InputError(
             f"{logged.where}: expected twists in world or a link of the robot, got frame {frame!r}",
@@ -72,7 +58,7 @@ def twist_track(
     from_s, to_s = ((stamp - span_ns[0]) * 1e-9 for stamp in (first, last))
     console.log(f"replay: {len(logged.stamp_ns)} twists in {frame}, {from_s:.2f} to {to_s:.2f} s of the log")
     for note in logged.notes:
-        console.log(f"replay: {args.twist_topic}: {note}")
+        console.log(f"replay: {request.twist_topic}: {note}")
     return TwistTrack(stamp_ns=logged.stamp_ns, twist=logged.twist, axes=None if frame == WORLD else frame)
 
 
@@ -88,7 +74,6 @@ def twist_figures(
     """`FIGURES` of a controller's T steps: the share of states where a twist holds, the share of these where it was
     capped, and by how much [m/s, rad/s] the commanded twist misses it. Empty without twists.
     """
-    import numpy as np
 
     if track is None:
         return {}

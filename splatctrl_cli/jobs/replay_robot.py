@@ -1,16 +1,15 @@
 """The robot of a replay: its model, what its spheres leave uncovered, and which of its links may touch."""
 
-import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.robot_options import locked_joints
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.errors import InputError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.config import ControlConfig
-    from splatctrl_cli.robot.coverage import LinkCoverage
-    from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.robot.coverage import LinkCoverage, coverage_deficit
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import never_apart, without_disabled
+from splatctrl_cli.robot.srdf import read_srdf
 
 FR3_LIMITS = (
     "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to keep "
@@ -19,47 +18,27 @@ FR3_LIMITS = (
 COARSE = 0.02  # [m] of areas, which a replay does not report; the deficit is as exact as ever
 
 
-def add_robot_geometry(parser: argparse.ArgumentParser) -> None:
-    """``--packages`` and ``--srdf``."""
-    parser.add_argument(
-        "--packages",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="folder in which package:// paths of the URDF's meshes are found (repeatable; default: those above it)",
-    )
-    parser.add_argument(
-        "--srdf", type=Path, metavar="FILE", help="self-collision rows leave out what its disable_collisions name"
-    )
-
-
-def read_robot(args: argparse.Namespace, config: "ControlConfig") -> "RobotModel":
+def read_robot(request: ReplayRequest, config: "ControlConfig") -> "RobotModel":
     """The model of the arguments, its spheres measured against the URDF's collision geometry where that can be read.
 
     Raises InputError where `config.coverage` is "margin" and no distance bounds what is uncovered.
     """
-    from splatctrl_cli.geometry import transform_from
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.robot.self_collision import without_disabled
-    from splatctrl_cli.robot.srdf import read_srdf
 
-    T_world_base = None if args.base is None else transform_from(args.base[:3], args.base[3:])
-    model = RobotModel.from_urdf(args.urdf, args.spheres, T_world_base=T_world_base, locked=locked_joints(args.lock))
-    if args.srdf is not None:
-        disabled, _ = read_srdf(args.srdf, model.urdf)
+    T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
+    model = RobotModel.from_urdf(request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked)
+    if request.srdf is not None:
+        disabled, _ = read_srdf(request.srdf, model.urdf)
         model = model.with_self_pairs(without_disabled(model, disabled))
-    model = _measured(model, args.packages)
+    model = _measured(model, list(request.packages))
     if config.coverage == "margin":
         _check_bounded(model)
     return model
 
 
-def doubts_of(args: argparse.Namespace, model: "RobotModel", config: "ControlConfig") -> list[str]:
+def doubts_of(request: ReplayRequest, model: "RobotModel", config: "ControlConfig") -> list[str]:
     """What a person should know of the robot before trusting this replay; a sentence each."""
-    from splatctrl_cli.robot.self_collision import never_apart
 
-    if args.mode == "audit":
+    if request.mode == "audit":
         return list(model.doubts)
     found = never_apart(model, config.self_margin)
     is_fr3 = all(name.startswith("fr3_joint") for name in model.joint_names)
@@ -99,7 +78,6 @@ def coverage_words(model: "RobotModel", config: "ControlConfig") -> str:
 
 
 def _measured(model: "RobotModel", packages: list[Path]) -> "RobotModel":
-    from splatctrl_cli.robot.coverage import coverage_deficit
 
     try:
         return model.with_coverage(

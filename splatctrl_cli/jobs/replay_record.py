@@ -1,21 +1,17 @@
 """States of a replay as they come, block by block: measured, explained, and kept in files."""
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.cli.known_scene import KnownScene
-from splatctrl_cli.cli.replay_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, Stamps, audited
-from splatctrl_cli.control.explain import EventFold, EventKind, audit_signals, stale_signal, step_signals
+from splatctrl_cli.control.explain import EventFold, EventKind, Obstacle, audit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.jobs.known_scene import KnownScene
+from splatctrl_cli.jobs.replay_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64
-
-if TYPE_CHECKING:
-    from splatctrl_cli.control.explain import Obstacle
-    from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.model import RobotModel
 
 
 class ReplayRecord:

@@ -1,0 +1,87 @@
+"""What a replay is asked for, and what it reads of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from dataclasses import field as made_by
+from pathlib import Path
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.course import LoggedMotion
+from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.state_columns import StateColumns
+from splatctrl_cli.jobs.known_scene import KnownScene
+from splatctrl_cli.records import RecordSource
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.truth import Truth
+
+MODES = ("audit", "open-loop", "closed-loop")
+DEFAULT_POSE_JUMP = 1.0  # [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayRequest:
+    """One replay: the options of ``splatctrl replay``, by their names.
+
+    log: a log or capture with joint states, read as `options` say. One of `scene` (a reconstruction), `field` (a
+    baked grid) and `lockstep` (reconstruct the log on the way) says what is known of the scene. base: pose of the
+    URDF's root in world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves. Times in
+    seconds.
+    """
+
+    log: Path
+    urdf: Path
+    out: Path
+    config: Config = made_by(default_factory=Config)
+    options: SourceOptions = made_by(default_factory=SourceOptions)
+    scene: Path | None = None
+    field: Path | None = None
+    lockstep: bool = False
+    latency: float = 0.0
+    allow_disagreement: bool = False
+    max_pose_jump: float = DEFAULT_POSE_JUMP
+    spheres: Path | None = None
+    base: tuple[float, ...] | None = None
+    locked: Mapping[str, float] = made_by(default_factory=dict)
+    packages: tuple[Path, ...] = ()
+    srdf: Path | None = None
+    mode: str = "audit"
+    frame: str | None = None
+    goal: tuple[float, ...] | None = None
+    goal_joints: tuple[float, ...] | None = None
+    waypoints: Path | None = None
+    follow: bool = False
+    twist_topic: str | None = None
+    twist_frame: str | None = None
+    start_time: float | None = None
+    re_anchor: float | None = None
+    truth: Path | None = None
+    max_unknown: float = 0.05
+    max_map_age: float = 1.0
+    golden: Path | None = None
+    golden_tolerance: float = 1e-6
+    baseline: tuple[str, ...] = ()
+    zone: str = "0.5,0.6"
+    zone_box: str | None = None
+    human: tuple[str, ...] = ()
+    worst_frames: int = 3
+    require: tuple[str, ...] = ()
+    force: bool = False
+    seed: int = 0
+    threads: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayInputs:
+    """Everything a replay reads; states in the model's joint order."""
+
+    source: RecordSource
+    states: StateColumns
+    model: RobotModel
+    scene: KnownScene
+    truth: Truth | None
+    digests: dict[str, str]
+
+    def motion(self) -> LoggedMotion:
+        """Every logged state, whether a scene was known or not."""
+        states = self.states
+        return LoggedMotion(stamp_ns=states.stamp_ns, position=states.position, velocity=states.velocity)
