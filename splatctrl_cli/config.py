@@ -188,6 +188,16 @@ class PlannerConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class VerdictConfig:
+    """What a verdict asks of its evidence; not in the paper."""
+
+    confidence: float = 0.99  # of the bound on what the map missed
+    unjudged: float = 0.0  # share of the requested time that may be left unjudged
+    lead_in: float = 0.5  # [s] of states before the first map that are left out, and said
+    longest_interval: float = 0.1  # [s] between states over which the arm is taken to have moved straight
+
+
+@dataclass(frozen=True, kw_only=True)
 class Config:
     """The whole configuration, one table per section in TOML."""
 
@@ -197,6 +207,7 @@ class Config:
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     control: ControlConfig = dataclasses.field(default_factory=ControlConfig)
     planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+    verdict: VerdictConfig = dataclasses.field(default_factory=VerdictConfig)
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values, as written to ``run.json``."""

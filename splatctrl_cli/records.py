@@ -115,7 +115,8 @@ class LossReport:
     topic of a steady rate has gaps; invalid_depth: pixels whose depth is NaN, infinite or negative, which count as
     having none.
     differentiated_velocities: joint states with a velocity that is the change of the positions; unsorted_states,
-    duplicate_states: stamps that went back, or came again; state_gaps: times without joint states.
+    duplicate_states: stamps that went back, or came again; conflicting_states: of the latter those whose positions
+    differ from the one that was kept; state_gaps: times without joint states.
     """
 
     unpaired_color: int = 0
@@ -129,6 +130,7 @@ class LossReport:
     differentiated_velocities: int = 0
     unsorted_states: int = 0
     duplicate_states: int = 0
+    conflicting_states: int = 0
     state_gaps: int = 0
     notes: list[str] = field(default_factory=list)
 

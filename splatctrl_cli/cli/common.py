@@ -13,7 +13,9 @@ from splatctrl_cli.evaluate.gates import gate
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
+    from splatctrl_cli.evaluate.verdict import Verdict
 
+MAX_REASONS = 10  # printed; --json and summary.json have all
 MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
 Subparsers = Any  # argparse keeps its subparser type private
 
@@ -100,6 +102,20 @@ class Console:
         else:
             for line in lines:
                 print(line)
+
+    def concluded(self, verdict: "Verdict", result: Mapping[str, Any], lines: Iterable[str], code: int) -> None:
+        """A verdict, its reasons, then `result` or `lines`; the sentence goes to stderr too where `code` is not 0."""
+        if self.is_json:
+            self.result({"exit_code": code, "verdict": verdict.as_dict(), **result}, ())
+        else:
+            print(verdict.sentence)
+            for reason in verdict.decisive[1:MAX_REASONS]:
+                print(f"  {reason.outcome}: {reason}")
+            print()
+            self.result({}, lines)
+        if code:
+            gates = [str(reason) for reason in verdict.decisive[1:] if reason.criterion.startswith("--require")]
+            print("\n".join(f"splatctrl: {line}" for line in (verdict.sentence, *gates)), file=sys.stderr, flush=True)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:

@@ -1,7 +1,6 @@
 """``splatctrl replay``: the clearance of logged motion, what a controller says of it, or what it does instead."""
 
 import argparse
-from itertools import chain
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
@@ -60,11 +59,14 @@ def register(subparsers: Subparsers) -> None:
         type=seconds,
         default=1.0,
         metavar="S",
-        help="a scene older than this is an event (default: 1)",
+        help="a scene older than this is no evidence (default: 1)",
     )
     add_golden(parser)
     add_baseline(parser)
     add_worst_frames(parser)
+    parser.add_argument(
+        "--report-only", action="store_true", help="exit 0 whatever the verdict; a --require or --golden still counts"
+    )
     parser.add_argument("--steps", action="store_true", help="print a row per step as well")
     add_source(parser)
     add_output(parser, default="replay", what="folder to write")
@@ -75,11 +77,11 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.cli.replay_report import lines_of
-    from splatctrl_cli.jobs.replay import check_result, replay
+    from splatctrl_cli.jobs.replay import replay
 
     console, request = Console(args), replay_request(args)
     result = replay(request, console)
-    lines = lines_of(result.replay, result.metrics, with_steps=args.steps or args.verbose > 0)
-    console.result({"out": str(result.out), **result.metrics}, chain(lines, result.notes))
-    check_result(request, result)
-    return 3 if result.is_damaged else 0
+    code = result.exit_code(report_only=args.report_only)
+    lines = lines_of(result, is_long=args.verbose > 0, with_steps=args.steps)
+    console.concluded(result.verdict, {"out": str(result.out), **result.metrics}, lines, code)
+    return code

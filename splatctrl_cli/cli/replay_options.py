@@ -133,7 +133,12 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
         help="the logged pose of each time is the goal (the default of --mode open-loop)",
     )
     add_twists(parser, goal)
-    parser.add_argument("--start-time", type=float, metavar="S", help="start at this time of the log [s]")
+    parser.add_argument(
+        "--start-time",
+        type=_start,
+        metavar="S",
+        help="start at this time of the log [s], or first-map: where the scene is first known",
+    )
     parser.add_argument(
         "--re-anchor", type=seconds, metavar="S", help="put the arm back into the logged posture every S seconds"
     )
@@ -220,6 +225,16 @@ def pose(text: str) -> tuple[float, ...]:
         return checked_pose(numbers(text))
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _start(text: str) -> float | str:
+    """Seconds not below zero, or the time of the first map, for argparse."""
+    if text == "first-map":
+        return text
+    values = numbers(text)
+    if len(values) != 1 or values[0] < 0:
+        raise argparse.ArgumentTypeError(f"expected seconds not below 0, or first-map, got {text!r}")
+    return values[0]
 
 
 def seconds(text: str) -> float:

@@ -3,18 +3,27 @@
 from collections.abc import Iterator
 
 from splatctrl_cli.cli.common import long_table, table
+from splatctrl_cli.jobs.replay import ReplayResult
 from splatctrl_cli.jobs.replay_baseline import FIGURES
 from splatctrl_cli.jobs.replay_columns import chunks_of
 from splatctrl_cli.jobs.replay_compare import MOTION, PLAN, Comparison, figures_of
 from splatctrl_cli.jobs.replay_files import when_and_why
-from splatctrl_cli.jobs.replay_metrics import Metrics
 from splatctrl_cli.jobs.replay_modes import Replay
 
+HEADLINE = (
+    *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),
+    *("max_velocity_share", "unknown_share", "max_map_age_s", "goal_reached", "duration_s"),
+)
 
-def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> Iterator[str]:
-    """What goes to stdout: when and why, the metrics, and a row per step on request."""
+
+def lines_of(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator[str]:
+    """What goes to stdout after the verdict: when and why, the headline figures (all with `is_long`), what stands
+    beside, notes, and a row per step on request.
+    """
+    replay, metrics = result.replay, result.metrics
+    shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
     lines = when_and_why(replay)
-    lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in metrics.items()])]
+    lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in shown.items()])]
     if replay.separations:
         rows = [
             (figure, *(_shown(metrics[f"{motion}_{figure}"]) for motion in replay.separations)) for figure in FIGURES
@@ -25,6 +34,9 @@ def lines_of(replay: "Replay", metrics: "Metrics", *, with_steps: bool) -> Itera
         rows = [(violation.sphere, f"{violation.clearance:.4f}") for violation in replay.static_violations]
         lines += ["", "Spheres that no joint moves, within the margin:", *table(("sphere", "clearance"), rows)]
     yield from lines
+    yield from result.notes
+    if not is_long:
+        yield f"wrote {result.out}; -v prints every figure"
     if with_steps:
         yield ""
         yield from _step_lines(replay)

@@ -1,7 +1,7 @@
 """The clearance of logged joint states: what each field says of every state, and how much of it is known space."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,8 @@ class Clearance:
 class AuditTrace:
     """T states: stamp_ns (T,), position (T, J) [rad], clearance by field name, limit_margin (T,) [rad] to the nearest
     position limit (negative outside) at limit_joint (T,), self_clearance (T,) [m] (inf without pairs) at self_pair
-    (T,), unknown_share (T,) of sphere centres in never-seen space (NaN where nobody asked).
+    (T,), unknown_share (T,) of sphere centres in never-seen space (NaN where nobody asked); of_spheres: by field name
+    the clearance (T, M) [m] of every moving sphere, where it is kept.
     """
 
     stamp_ns: Stamps
@@ -52,6 +53,7 @@ class AuditTrace:
     self_clearance: Float64
     self_pair: NDArray[np.int64]
     unknown_share: Float64
+    of_spheres: Mapping[str, Float64] = field(default_factory=dict)
 
 
 def checked_states(model: ArmModel, states: Sequence[JointState]) -> tuple[Stamps, Float64]:
@@ -82,13 +84,16 @@ def checked_states(model: ArmModel, states: Sequence[JointState]) -> tuple[Stamp
     return stamps, positions
 
 
-def moving_clearance(model: ArmModel, centers: Float64, distance_to: DistanceFunction) -> Clearance:
-    """The smallest sphere clearance of every state, from the centres (T, S, 3) [m] of all spheres."""
+def moving_clearance(model: ArmModel, centers: Float64, distance_to: DistanceFunction) -> tuple[Clearance, Float64]:
+    """The smallest sphere clearance of every state, from the centres (T, S, 3) [m] of all spheres; and that of each
+    moving sphere (T, M) [m].
+    """
     moving = np.flatnonzero(model.moving_spheres)
     points = np.ascontiguousarray(centers[:, moving].reshape(-1, 3))
     distance = distance_to(points).reshape(len(centers), len(moving)) - model.sphere_set.radii[moving]
     nearest = np.argmin(distance, axis=1)
-    return Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=moving[nearest])
+    least = Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=moving[nearest])
+    return least, distance
 
 
 def audit(
@@ -112,11 +117,14 @@ def audited(
     Of states of the same scene, the audit of some is that part of the audit of all, to the bit.
     """
     parts: dict[str, list[Clearance]] = {}
+    spheres: dict[str, list[Float64]] = {}
     self_parts, unknown_parts = [], []
     for first, last in _runs(stamps, distances_at):
         centers = model.sphere_centers_batch(positions[first:last])
         for name, distance_to in distances_at(int(stamps[first])).items():
-            parts.setdefault(name, []).append(moving_clearance(model, centers, distance_to))
+            least, each = moving_clearance(model, centers, distance_to)
+            parts.setdefault(name, []).append(least)
+            spheres.setdefault(name, []).append(each)
         self_parts.append(_self_clearance(model, centers))
         unknown_parts.append(_unknown_share(model, centers, observed))
     limit = np.minimum(model.upper - positions, positions - model.lower)
@@ -129,6 +137,7 @@ def audited(
         self_clearance=_joined(self_parts).distance,
         self_pair=_joined(self_parts).sphere,
         unknown_share=np.concatenate(unknown_parts),
+        of_spheres={name: np.concatenate(several) for name, several in spheres.items()},
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.records import DistanceField, Float64
 
@@ -122,6 +123,16 @@ def static_violations(
         for s, d in zip(still, distance, strict=True)
         if d < least[s]
     )
+
+
+def static_clearance(model: ArmModel, distance_to: DistanceFunction, q: Float64) -> dict[str, float]:
+    """The clearance [m] of every sphere that no joint moves, by name."""
+    still = np.flatnonzero(~np.asarray(model.moving_spheres))
+    if not len(still):
+        return {}
+    names = sphere_names(model.sphere_set)
+    distance = distance_to(np.ascontiguousarray(model.sphere_centers(q)[still])) - model.sphere_set.radii[still]
+    return {names[s]: float(value) for s, value in zip(still, distance, strict=True)}
 
 
 def sphere_clearance(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.control.audit import AuditTrace, Stamps
 from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.motion_limits import Strain
 from splatctrl_cli.control.step import ControlStep, RowKind
 from splatctrl_cli.records import Bool, Float64
 
@@ -22,7 +23,12 @@ class EventKind(StrEnum):
     IN_COLLISION = "in-collision"  # least clearance [m]
     WITHOUT_DISTANCE = "without-distance"  # number of fields without one
     UNKNOWN_SPACE = "unknown-space"  # largest share of sphere centres
+    BETWEEN_STATES = "between-states"  # least bound [m] of the clearance since the state before
+    NOT_BOUNDED = "not-bounded"  # longest time [s] in which nobody knows where the arm was
+    SELF_COLLISION = "self-collision"  # least distance of two spheres of the arm [m]
     OUTSIDE_LIMITS = "outside-limits"  # least distance to the limit, negative [rad]
+    TOO_FAST = "too-fast"  # largest velocity, as a share of its limit
+    TOO_SUDDEN = "too-sudden"  # largest acceleration, as a share of its limit
     STALE_MAP = "stale-map"  # oldest scene [s]
     SCENE = "scene"  # largest multiplier of a row against the scene
     SELF = "self"  # the same of a self-collision row
@@ -46,7 +52,7 @@ INTERVENTIONS = frozenset(
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
     """What is nearest: its surface's distance [m] to a point and its place (3,) [m], world; a splat's index in the
-    file of its scene and its label, or a grid's cell.
+    file of its scene and its label, or a grid's cell, or the name of what it is.
     """
 
     distance: float
@@ -54,9 +60,12 @@ class Obstacle:
     splat: int | None = None
     label: str | None = None
     cell: tuple[int, int, int] | None = None
+    name: str = ""
 
     def __str__(self) -> str:
         where = ", ".join(f"{v:.3f}" for v in self.position)
+        if self.name:
+            return f"{self.name} at ({where})"
         what = f"cell {self.cell}" if self.splat is None else f"{self.label} splat {self.splat}"
         return f"{what} at ({where})"
 
@@ -229,14 +238,17 @@ def _begun(order: int, signal: Signal, first_ns: int) -> _Run:
     )
 
 
-def audit_signals(audit: AuditTrace, margin: float, spheres: Sequence[str], joints: Sequence[str]) -> list[Signal]:
-    """What the clearances, limits and known space of T states amount to."""
+def audit_signals(
+    audit: AuditTrace,
+    margin: float,
+    spheres: Sequence[str],
+    joints: Sequence[str],
+    self_pairs: Sequence[tuple[int, int]] = (),
+) -> list[Signal]:
+    """What the clearances, limits and known space of T states amount to; self_pairs (P, 2): of spheres."""
     signals = []
     for source, clearance in audit.clearance.items():
-        for kind, bound in ((EventKind.BELOW_MARGIN, margin), (EventKind.IN_COLLISION, 0.0)):
-            is_on = clearance.distance < bound
-            names = _names_of(spheres, clearance.sphere)
-            signals.append(_low(kind, is_on, clearance.distance, names, source))
+        signals += clearance_signals(source, clearance.distance, clearance.sphere, margin, spheres)
         is_blank = np.isnan(clearance.distance)
         names = _names_of(spheres, clearance.sphere)
         signals.append(
@@ -252,7 +264,40 @@ def audit_signals(audit: AuditTrace, margin: float, spheres: Sequence[str], join
     signals.append(Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown, names_at=_nobody))
     outside = audit.limit_margin
     signals.append(_low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, _names_of(joints, audit.limit_joint)))
+    touching, pairs = audit.self_clearance, [f"{spheres[a]} and {spheres[b]}" for a, b in self_pairs]
+    signals.append(_low(EventKind.SELF_COLLISION, touching < 0, touching, _names_of(pairs, audit.self_pair)))
     return signals
+
+
+def clearance_signals(
+    source: str, distance: Float64, sphere: NDArray[np.int64], margin: float, spheres: Sequence[str]
+) -> list[Signal]:
+    """Below the margin, and in contact, by the clearance (T,) [m] of the sphere (T,) that is nearest."""
+    names = _names_of(spheres, sphere)
+    return [
+        _low(kind, distance < bound, distance, names, source)
+        for kind, bound in ((EventKind.BELOW_MARGIN, margin), (EventKind.IN_COLLISION, 0.0))
+    ]
+
+
+def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
+    """Where a motion is faster, or changes more suddenly, than its joints may."""
+    return [
+        Signal(kind=kind, is_on=value > 1, value=value, names_at=_names_of(joints, joint))
+        for kind, value, joint in (
+            (EventKind.TOO_FAST, strain.velocity, strain.velocity_joint),
+            (EventKind.TOO_SUDDEN, strain.acceleration, strain.acceleration_joint),
+        )
+    ]
+
+
+def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[Signal]:
+    """Since the state before each of T: a clearance bound (T,) [m] below the margin, and time (T,) [s] unbounded."""
+    is_low = lower < margin
+    return [
+        _low(EventKind.BETWEEN_STATES, is_low, lower, _nobody),
+        Signal(kind=EventKind.NOT_BOUNDED, is_on=unbounded > 0, value=unbounded, names_at=_nobody),
+    ]
 
 
 def stale_signal(age_s: Float64, max_age_s: float) -> Signal:

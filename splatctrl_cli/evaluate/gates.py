@@ -6,7 +6,8 @@ import operator
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 
-from splatctrl_cli.errors import GateFailed, UsageError
+from splatctrl_cli.errors import GateFailed, NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason
 
 FirstTime = Callable[[str, Callable[[float], bool]], float | None]
 """Metric name, whether a value holds -> the first time [s] that does not."""
@@ -35,29 +36,48 @@ def check_gate_names(
             )
 
 
-def check_gates(
+def gate_reasons(
     requirements: Sequence[str],
     metrics: Mapping[str, float | None],
     *,
     first_time: "FirstTime | None" = None,
-) -> None:
-    """Raise GateFailed naming every requirement that does not hold; a metric that is None fails its gate.
+) -> list[Reason]:
+    """A reason for each requirement: passed, failed, or not evaluable where its metric has no finite value.
 
     first_time gives the first time [s] at which a metric's own states break a requirement, None where it has none.
     """
     check_gate_names(requirements, metrics)
-    failed = []
+    reasons = []
     for requirement in requirements:
         name, comparison, bound = parse_gate(requirement)
         value = metrics[name]
-        if value is None or not _COMPARISONS[comparison](value, bound):
-            when = None if first_time is None else first_time(name, _holding(comparison, bound))
-            failed.append(
-                f"{name} is {'unknown' if value is None else f'{value:.6g}'}, required {comparison} {bound:g}"
-                + ("" if when is None else f", first at {when:.3f} s")
+        is_known = value is not None and math.isfinite(value)
+        holds = value is not None and is_known and bool(_COMPARISONS[comparison](value, bound))
+        when = None if holds or first_time is None else first_time(name, _holding(comparison, bound))
+        shown = f"{value:.6g}" if is_known else "unknown"
+        reasons.append(
+            Reason(
+                criterion=f"--require {requirement.strip()}",
+                outcome=Outcome.PASSED if holds else Outcome.FAILED if is_known else Outcome.NOT_EVALUABLE,
+                sentence=f"{name} is {shown}, required {comparison} {bound:g}"
+                + ("" if when is None else f", first at {when:.3f} s"),
+                value=value,
+                threshold=bound,
+                label="gate failed",
             )
-    if failed:
-        raise GateFailed("gate failed: " + "; ".join(failed))
+        )
+    return reasons
+
+
+def check_gates(requirements: Sequence[str], metrics: Mapping[str, float | None]) -> None:
+    """Raise GateFailed naming every requirement that does not hold, else NotEvaluableError naming every one whose
+    metric has no finite value.
+    """
+    reasons = gate_reasons(requirements, metrics)
+    for outcome, error in ((Outcome.FAILED, GateFailed), (Outcome.NOT_EVALUABLE, NotEvaluableError)):
+        named = [reason.sentence for reason in reasons if reason.outcome is outcome]
+        if named:
+            raise error("gate failed: " + "; ".join(named))
 
 
 def _holding(comparison: str, bound: float) -> Callable[[float], bool]:

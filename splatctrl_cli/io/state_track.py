@@ -144,6 +144,7 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
         differs = np.abs(raw.position[part] - raw.position[part - 1]).max(axis=1) > CONFLICT
         num_other += int(differs.sum())
     loss.duplicate_states += num_again
+    loss.conflicting_states += num_other
     more = f", {num_other} of them with other positions" if num_other else ""
     loss.notes.append(f"{raw.where}: {num_again} states repeat a stamp{more}: the first of each is kept")
     return raw.select(~is_again)

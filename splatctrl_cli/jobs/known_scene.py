@@ -58,7 +58,8 @@ class KnownScene:
     cameras: the cameras that made it, None where that is not recorded. stamps_ns: of the scenes that are there one
     after the other (so far, where they are made on the way: `advance` to a stamp makes those known then), empty for
     one scene for all times; each is known `latency_ns` after its stamp. finish: to be called when the replay is done.
-    box: of the centres of a grid's cells, None for splats.
+    box: of the centres of a grid's cells, None for splats. moment_ns: the one time that a baked field is of, None
+    where it has none. has_people_margin: whether people are kept at another distance than things.
     """
 
     at: Callable[[int], KnownFields]
@@ -71,9 +72,15 @@ class KnownScene:
     advance: Callable[[int], None] = _nothing
     finish: Callable[[], None] = lambda: None
     box: "Box | None" = None
+    moment_ns: int | None = None
+    has_people_margin: bool = False
 
     def age_s(self, stamp_ns: int) -> float:
-        """How old [s] the scene in use at a stamp is; NaN where scenes have no times."""
+        """How old [s] the scene in use at a stamp is, of a field how far its moment is from it; NaN where there are
+        no times.
+        """
+        if self.moment_ns is not None:
+            return abs(stamp_ns - self.moment_ns) * 1e-9
         index = self._index_at(stamp_ns)
         return math.nan if index < 0 else (stamp_ns - self.stamps_ns[index]) * 1e-9
 
@@ -133,6 +140,7 @@ def from_grid(path: Path) -> KnownScene:
         first_ns=None,
         cameras=None,
         digests={file.name: sha256(file)},
+        moment_ns=moment if isinstance(moment := grid.header.get("stamp_ns"), int) else None,
         box=Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["observed"].shape) - 1)),
     )
 
@@ -166,6 +174,7 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         digests={"splats.ply": sha256(path / "splats.ply")},
         stamps_ns=tuple(stamps) if has_times else (),
         latency_ns=latency_ns,
+        has_people_margin=config.control.human_margin > config.control.margin,
     )
 
 

@@ -134,6 +134,7 @@ class Lockstep:
             digests={},
             stamps_ns=self._stamps_ns,
             latency_ns=self._latency_ns,
+            has_people_margin=self._config.control.human_margin > self._config.control.margin,
             advance=self._advance,
             finish=self._finish,
         )

@@ -225,6 +225,7 @@ class Reconstruction:
             "robot_splats": last.robot,
             "added": sum(row.added for row in self.rows),
             "relocated": sum(row.relocated for row in self.rows),
+            "robot_joints": None if self.robot is None else list(self.robot.joint_names),
             "unmet": sum(row.unmet for row in self.rows),
             "loss": last.loss,
             "psnr": last.psnr,

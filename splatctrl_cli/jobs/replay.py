@@ -3,24 +3,26 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.io.output import Stopwatch, output_path, sha256, write_json
+from splatctrl_cli.io.scene_folder import open_scene
+from splatctrl_cli.jobs.evidence import Mismatch, scene_mismatches
 from splatctrl_cli.jobs.lockstep import check_lockstep, opened_scene
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone
 from splatctrl_cli.jobs.replay_files import write_replay
 from splatctrl_cli.jobs.replay_goal import check_goal
-from splatctrl_cli.jobs.replay_golden import Golden, check_golden, read_golden
-from splatctrl_cli.jobs.replay_metrics import Metrics, first_time, metric_names, metrics_of
+from splatctrl_cli.jobs.replay_golden import read_golden
+from splatctrl_cli.jobs.replay_metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replay_modes import Replay, replayed, with_truth
 from splatctrl_cli.jobs.replay_request import MODES, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay_robot import coverage_words, doubts_of, read_robot
 from splatctrl_cli.jobs.replay_states import LoggedStates, read_states
 from splatctrl_cli.jobs.replay_twists import check_twists
+from splatctrl_cli.jobs.replay_verdict import ASKED, Judged, replay_verdict
 from splatctrl_cli.jobs.replay_worst import draw_worst_frames
+from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 
 
@@ -28,15 +30,22 @@ from splatctrl_cli.simulate.truth import load_truth
 class ReplayResult:
     """What a replay found, all of it written to `out`.
 
-    notes: sentences on the robot, the pictures and the log. is_damaged: part of the log was lost.
+    verdict: what it comes to; notes: sentences on the robot, the pictures and the log. is_damaged: part of the log
+    was lost.
     """
 
     out: Path
     replay: Replay
     metrics: Metrics
+    verdict: Verdict
     notes: tuple[str, ...]
     is_damaged: bool
-    golden: Golden | None
+
+    def exit_code(self, *, report_only: bool = False) -> int:
+        """1 or 5 as the verdict says, 3 for a damaged log, else 0; with `report_only` only what the request asked for
+        itself, gates and a golden run, turns it.
+        """
+        return self.verdict.exit_code_of(ASKED if report_only else None) or (3 if self.is_damaged else 0)
 
 
 def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
@@ -55,17 +64,20 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
             found = with_truth(inputs, found)
         inputs.scene.finish()
         metrics = metrics_of(found) | logged.metrics()
+        with stopwatch.stage("verdict"):
+            judged = Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
+            verdict = replay_verdict(judged, golden)
         with stopwatch.stage("worst_frames"):
             unseen = draw_worst_frames(folder, inputs, found, request.worst_frames)
         write_json(folder / "states.json", logged.as_dict())
-        write_replay(folder, found, metrics, config=config, inputs=inputs.digests, stopwatch=stopwatch)
+        write_replay(folder, found, metrics, verdict, config=config, inputs=inputs.digests, stopwatch=stopwatch)
     return ReplayResult(
         out=request.out,
         replay=found,
         metrics=metrics,
+        verdict=verdict,
         notes=(coverage_words(inputs.model, config.control), *unseen, *logged.lines()),
         is_damaged=bool(inputs.source.loss.damaged),
-        golden=golden,
     )
 
 
@@ -95,36 +107,20 @@ def _read(request: ReplayRequest, folder: Path, progress: Progress) -> tuple[Rep
     source = logged.source
     files = [path for path in (request.urdf, request.spheres, request.srdf, request.truth) if path is not None]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
-    inputs = ReplayInputs(source=source, states=logged.states, model=model, scene=scene, truth=truth, digests=digests)
+    inputs = ReplayInputs(
+        source=source,
+        states=logged.states,
+        model=model,
+        scene=scene,
+        truth=truth,
+        digests=digests,
+        mismatches=_mismatches(request, logged, model),
+    )
     return inputs, logged
 
 
-def check_result(request: ReplayRequest, result: ReplayResult) -> None:
-    """Raise what the result does not hold: known space, a golden run, gates."""
-    replay, metrics = result.replay, result.metrics
-    if metrics["num_without_distance"]:
-        raise NotEvaluableError(
-            f"replay: the path leaves known space: at {metrics['num_without_distance']:g} of "
-            f"{metrics['num_states']:g} states, first at "
-            f"{first_time(replay, 'num_without_distance', lambda count: count == 0):.3f} s, "
-            "a sphere is where the field has no distance",
-            remedy="the figures above leave those states out; bake with field.unknown = free or obstacle",
-        )
-    unknown = metrics["unknown_share"]
-    if unknown is not None and unknown > request.max_unknown:
-        raise NotEvaluableError(
-            f"replay: {100 * unknown:.1f} % of the sphere centres lie in space no camera ever saw, "
-            f"allowed {100 * request.max_unknown:g} %, first more than that at "
-            f"{_first_unknown(request, replay):.3f} s",
-            remedy="the figures above say nothing about that part; add a camera, or give a larger --max-unknown",
-        )
-    if result.golden is not None:
-        check_golden(result.golden, replay, request.golden_tolerance)
-    check_gates(request.require, metrics, first_time=lambda name, holds: first_time(replay, name, holds))
-
-
-def _first_unknown(request: ReplayRequest, replay: Replay) -> float:
-    """The first time [s] at which more of the sphere centres than is allowed lie in space never seen."""
-    stamps = replay.audit.stamp_ns
-    first = int(np.argmax(replay.audit.unknown_share > request.max_unknown))
-    return float(stamps[first] - stamps[0]) * 1e-9
+def _mismatches(request: ReplayRequest, logged: LoggedStates, model: RobotModel) -> tuple[Mismatch, ...]:
+    """What does not belong together; a log that is its own scene always does."""
+    if request.scene is None:
+        return ()
+    return tuple(scene_mismatches(open_scene(request.scene), logged.source, logged.states, model))

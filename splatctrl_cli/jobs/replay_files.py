@@ -10,6 +10,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.explain import INTERVENTIONS, Event, first_intervention
+from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.io.output import Stopwatch, write_json, write_run
 from splatctrl_cli.io.replay_output import write_steps
 from splatctrl_cli.jobs import replay_compare
@@ -21,17 +22,18 @@ from splatctrl_cli.jobs.replay_robot import coverage_words
 from splatctrl_cli.records import Float64
 
 UNITS = {
-    **dict.fromkeys(("below-margin", "in-collision", "hold", "cannot-act"), "m"),
-    **{"outside-limits": "rad", "stale-map": "s", "relaxed": "m/s"},
+    **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),
+    **{"outside-limits": "rad", "stale-map": "s", "not-bounded": "s", "relaxed": "m/s"},
 }
 
 
 def write_replay(
     folder: Path,
     replay: "Replay",
-    metrics: "Metrics",
+    metrics: Metrics,
+    verdict: Verdict,
     *,
-    config: "Config",
+    config: Config,
     inputs: Mapping[str, str],
     stopwatch: "Stopwatch",
 ) -> None:
@@ -40,15 +42,17 @@ def write_replay(
     write_json(folder / "events.json", events_document(replay))
     if replay.comparison.methods:
         write_json(folder / "methods.json", replay_compare.document_of(replay.comparison))
-    write_json(folder / "summary.json", summary_of(replay, metrics, coverage_words(replay.model, config.control)))
+    write_json(
+        folder / "summary.json", summary_of(replay, metrics, verdict, coverage_words(replay.model, config.control))
+    )
     with stopwatch.stage("picture"):
         draw_replay(folder, replay, seconds_of(replay))
         replay_compare.draw_methods(folder, replay.comparison, replay.period, replay.margin)
     write_run(folder, command="replay", config=config.as_dict(), inputs=inputs, metrics=metrics, stopwatch=stopwatch)
 
 
-def summary_of(replay: "Replay", metrics: "Metrics", coverage: str) -> dict[str, Any]:
-    """When and why, the metrics, and the words that go with them."""
+def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, coverage: str) -> dict[str, Any]:
+    """The verdict, when and why, the metrics, and the words that go with them."""
     words = {
         "mode": replay.mode,
         "outcome": str(replay.closed_loop.outcome) if replay.closed_loop else f"{replay.mode}: every state",
@@ -57,7 +61,12 @@ def summary_of(replay: "Replay", metrics: "Metrics", coverage: str) -> dict[str,
         "units": "m, rad, s",
         "min_clearance": "the smallest exact distance from a moving sphere's surface to the splats",
     }
-    return {"when_and_why": when_and_why(replay), "about": words, "metrics": metrics}
+    return {
+        "verdict": verdict.as_dict(),
+        "when_and_why": when_and_why(replay),
+        "about": words,
+        "metrics": metrics,
+    }
 
 
 def events_document(replay: "Replay") -> dict[str, Any]:

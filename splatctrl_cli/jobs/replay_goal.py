@@ -24,7 +24,7 @@ POSE_COLUMNS = tuple(POSE.split(","))
 def check_goal(request: ReplayRequest) -> None:
     """Raise UsageError for an option that the mode does not use."""
     asked, driven = ("open-loop", "closed-loop"), ("closed-loop",)
-    modes: dict[str, tuple[str, ...]] = {"start_time": driven, "re_anchor": driven}
+    modes: dict[str, tuple[str, ...]] = {"re_anchor": driven}
     modes |= dict.fromkeys(("goal", "goal_joints", "waypoints", "follow"), asked)
     for option, wanted in modes.items():
         given = getattr(request, option)

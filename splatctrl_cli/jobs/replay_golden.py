@@ -5,13 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.errors import GateFailed, InputError, UsageError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.jobs.replay_modes import Replay
 from splatctrl_cli.jobs.replay_request import ReplayRequest
-
-if TYPE_CHECKING:
-    from splatctrl_cli.jobs.replay_modes import Replay
 
 TOLERANCE = 1e-6  # [rad/s]: steps.csv keeps nine digits; another machine or solver needs more
 
@@ -55,7 +53,25 @@ def read_golden(request: ReplayRequest) -> Golden | None:
     return Golden(path=file, joints=joints, stamps_ns=stamps, velocity=velocity)
 
 
-def check_golden(golden: Golden, replay: "Replay", tolerance: float) -> None:
+def golden_reason(golden: Golden, replay: Replay, tolerance: float) -> Reason:
+    """`check_golden` as a criterion."""
+    try:
+        check_golden(golden, replay, tolerance)
+    except GateFailed as error:
+        return Reason(
+            criterion="golden",
+            outcome=Outcome.FAILED,
+            sentence=error.message,
+            remedy=error.remedy,
+            count=len(golden.velocity),
+            label="golden run differs",
+        )
+    return Reason(
+        criterion="golden", outcome=Outcome.PASSED, sentence=f"as {golden.path}", count=len(golden.velocity)
+    )
+
+
+def check_golden(golden: Golden, replay: Replay, tolerance: float) -> None:
     """Raise GateFailed naming the first step and joint that differ by more than `tolerance` [rad/s], else a number of
     steps that does; InputError where the joints are others.
     """
@@ -67,23 +83,20 @@ def check_golden(golden: Golden, replay: "Replay", tolerance: float) -> None:
     for index, step in enumerate(islice(replay.steps, len(golden.velocity))):
         when = f"step {index} at {float(stamps[index] - stamps[0]) * 1e-9:.3f} s"
         if int(stamps[index]) != golden.stamps_ns[index]:
-            raise GateFailed(f"golden: {when}: expected stamp {golden.stamps_ns[index]} ns, got {stamps[index]} ns")
+            raise GateFailed(f"{when}: expected stamp {golden.stamps_ns[index]} ns, got {stamps[index]} ns")
         expected = golden.velocity[index]
         if expected is None or step is None:
             if (expected is None) != (step is None):
-                raise GateFailed(f"golden: {when}: expected {_is_there(expected)}, got {_is_there(step)}")
+                raise GateFailed(f"{when}: expected {_is_there(expected)}, got {_is_there(step)}")
             continue
         for joint, at, value in zip(joints, order, step.velocity, strict=True):
             if not abs(value - expected[at]) <= tolerance:
                 raise GateFailed(
-                    f"golden: {when}: joint {joint}: expected {expected[at]:.9g} rad/s within {tolerance:g}, "
-                    f"got {value:.9g}",
+                    f"{when}: joint {joint}: expected {expected[at]:.9g} rad/s within {tolerance:g}, got {value:.9g}",
                     remedy="if the change is meant, keep this run as the golden one",
                 )
     if len(replay.steps) != len(golden.velocity):
-        raise GateFailed(
-            f"golden: expected {len(golden.velocity)} steps, got {len(replay.steps)}; those in common agree"
-        )
+        raise GateFailed(f"expected {len(golden.velocity)} steps, got {len(replay.steps)}; those in common agree")
 
 
 def _velocity(cells: Sequence[str]) -> tuple[float, ...] | None:

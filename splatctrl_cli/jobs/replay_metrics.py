@@ -29,6 +29,7 @@ _HEAD = (
 )
 _TAIL = (
     *("min_clearance_true", "num_below_margin", "num_in_collision", "min_self_clearance", "min_limit_margin"),
+    *("max_velocity_share", "max_acceleration_share", "min_clearance_surface", "min_clearance_between", "unjudged_s"),
     *("unknown_share", "num_without_distance", "num_static_violations", "max_map_age_s"),
 )
 _STEPS = (
@@ -87,6 +88,11 @@ def metrics_of(replay: "Replay") -> Metrics:
         "num_in_collision": int(np.sum(exact < 0)),
         "min_self_clearance": least(audit.self_clearance),
         "min_limit_margin": least(audit.limit_margin),
+        "max_velocity_share": _largest(replay.strain["velocity"]),
+        "max_acceleration_share": _largest(replay.strain["acceleration"]),
+        "min_clearance_surface": least(replay.between["surface"]),
+        "min_clearance_between": least(replay.between["lower"]),
+        "unjudged_s": float(replay.between["unbounded"].sum()) + replay.lead_in_s,
         "unknown_share": float(np.mean(audit.unknown_share)),
         "num_without_distance": int(np.sum(_is_blank(replay))),
         "num_static_violations": len(replay.static_violations),

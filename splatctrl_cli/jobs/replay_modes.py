@@ -6,10 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.checks import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.course import LoggedMotion
-from splatctrl_cli.control.explain import Event
+from splatctrl_cli.control.explain import Event, EventFold, EventKind, Obstacle, clearance_signals
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence
 from splatctrl_cli.control.rows import scene_margin
@@ -25,12 +26,13 @@ from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone, separa
 from splatctrl_cli.jobs.replay_compare import Comparison, compared, planned_ways_out
 from splatctrl_cli.jobs.replay_goal import goal_waypoints
 from splatctrl_cli.jobs.replay_record import ReplayRecord
-from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay_request import FIRST_MAP, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay_states import check_inside
 from splatctrl_cli.jobs.replay_store import Figures, StoredAudit, StoredLoop, StoredOpenLoop, StoredSteps
 from splatctrl_cli.jobs.replay_twists import twist_figures, twist_track
 from splatctrl_cli.records import Float64, FloatRows, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.truth import distance_to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,21 +48,26 @@ class Divergence:
 class Replay:
     """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
 
-    num_before_scene: logged states earlier than the first scene, left out; start_time_s: of the first state in the
-    log [s]; obstacles (T,): what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use;
-    kept_steps: of a controller; separations: with a standstill the distances from people, by name of the motion,
-    sampled at `period` [s]; comparison: every motion of --baseline and its figures.
+    num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
+    the first state in the log [s]; between, strain and statics: as `ReplayRecord` has them; obstacles (T,): what is
+    nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps: of a controller;
+    separations: with a standstill the distances from people, by name of the motion, sampled at `period` [s];
+    comparison: every motion of --baseline and its figures.
     """
 
     model: "RobotModel"
     margin: float
     audit: StoredAudit
     num_before_scene: int
+    lead_in_s: float
     median_radius: float
     static_violations: tuple[StaticViolation, ...]
     obstacles: Sequence[str]
     map_age_s: FloatRows
     start_time_s: float
+    between: Figures
+    strain: Figures
+    statics: "Mapping[str, tuple[float, float]]"
     open_loop: StoredOpenLoop | None = None
     closed_loop: ReplayTrace | None = None
     divergence: Divergence | None = None
@@ -107,17 +114,21 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
     model, trace = inputs.model, replay.audit
     moving = np.flatnonzero(model.moving_spheres)
     radii = model.sphere_set.radii[moving]
-    clearances, surfaces = RowFile(), RowFile((3,))
+    clearances, surfaces, nearest_spheres = RowFile(), RowFile((3,)), RowFile()
     for first, last in ranges(len(trace.stamp_ns)):
         clearance, surface = np.zeros(last - first), np.zeros((last - first, 3))
+        spheres = np.zeros(last - first)
         stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
         for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
             distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
             nearest = int(np.argmin(distance - radii))
             clearance[index], surface[index] = distance[nearest] - radii[nearest], points[nearest]
+            spheres[index] = moving[nearest]
         clearances.append(clearance)
+        nearest_spheres.append(spheres)
         surfaces.append(surface)
     truth, seen = Rows(clearances), np.zeros(len(clearances), dtype=np.bool_)
+    events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
     for record in inputs.source.records() if inputs.source.cameras else ():
         if isinstance(record, RgbdFrame) and (inputs.scene.cameras is None or record.camera in inputs.scene.cameras):
             mark_seen(seen, Rows(surfaces), trace.stamp_ns, record, has_clock=inputs.source.has_clock)
@@ -125,21 +136,42 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
         name: clearance_agreement(of.distance, np.asarray(truth), seen, replay.median_radius)
         for name, of in trace.clearance.items()
     }
-    return replace(replay, true_clearance=truth, agreement=agreement)
+    merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
+    return replace(replay, true_clearance=truth, agreement=agreement, events=merged)
+
+
+def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spheres: Rows) -> tuple[Event, ...]:
+    """Intervals (of T states) below the margin, and in contact, by the truth."""
+    model, truth, audit = inputs.model, inputs.truth, replay.audit
+    assert truth is not None
+    names = sphere_names(model.sphere_set)
+    nearest = np.asarray(spheres[: len(clearance)], np.int64)
+    fold = EventFold()
+
+    def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
+        stamp, center = int(audit.stamp_ns[at]), model.sphere_centers(audit.position[at])[[names.index(name)]]
+        distance, surface = truth.closest(center, stamp)
+        there = [p for p in truth.primitives if p.is_present(stamp)]
+        least = min(there, key=lambda p: float(distance_to([p], center, stamp)[0]))
+        x, y, z = (float(v) for v in surface[0])
+        return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
+
+    fold.add(audit.stamp_ns, clearance_signals("true", clearance, nearest, replay.margin, names), near)
+    return fold.events()
 
 
 def _audited(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
     """The audit of every logged state for which a scene was known."""
-    first, record = _first_known(inputs), _record(request, inputs, config)
-    for stamps, positions, _ in _blocks(record, inputs.states, first):
-        record.explain(record.measured(stamps, positions))
-    return _logged(inputs, config, record, first)
+    first, record = _first_judged(request, inputs), _record(request, inputs, config)
+    for stamps, positions, velocities in _blocks(record, inputs.states, first):
+        record.explain(record.measured(stamps, positions, velocities))
+    return _logged(request, inputs, config, record, first)
 
 
 def _asked(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
     """The audit, and the controller's command at every state of it."""
     scene, model, states = inputs.scene, inputs.model, inputs.states
-    first, record = _first_known(inputs), _record(request, inputs, config)
+    first, record = _first_judged(request, inputs), _record(request, inputs, config)
     frame = request.frame or model.frame_names[-1]
     twists = twist_track(request, model, _span(inputs), console)
     task = OpenLoopTask(frame=frame, twists=twists)
@@ -149,7 +181,7 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: "Config", conso
     console.log(f"replay: asking the controller at {len(states) - first} states")
     asked = StoredOpenLoop()
     for stamps, positions, velocities in _blocks(record, states, first):
-        part = record.measured(stamps, positions)
+        part = record.measured(stamps, positions, velocities)
         trace = open_loop(
             model,
             config.control,
@@ -164,7 +196,7 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: "Config", conso
     audit = record.audit
     figures = twist_figures(model, config.control, frame, twists, audit.stamp_ns, audit.position, asked.steps)
     return replace(
-        _logged(inputs, config, record, first), open_loop=asked, kept_steps=asked.kept, twist_figures=figures
+        _logged(request, inputs, config, record, first), open_loop=asked, kept_steps=asked.kept, twist_figures=figures
     )
 
 
@@ -190,11 +222,13 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: "Config", cons
     apart = Figures()
     for first, last in record.blocks(trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])
-        record.explain(record.measured(stamps, positions), trace.steps[first:last])
+        steps = trace.steps[first:last]
+        straight = np.zeros_like(positions)  # the driven arm moves straight from state to state
+        record.explain(record.measured(stamps, positions, straight), steps)
         joints, position, rotation = divergence(model, task.frame, stamps, positions, motion)
         apart.append(joints=joints, position=position, rotation=rotation)
     return replace(
-        _replay(inputs, config, record, trace.static_violations, num_before=0, radius_of=0),
+        _replay(request, inputs, config, record, trace.static_violations, radius_of=0),
         closed_loop=trace,
         kept_steps=loop.kept,
         divergence=Divergence(
@@ -207,7 +241,13 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: "Config", cons
 
 
 def _record(request: ReplayRequest, inputs: ReplayInputs, config: "Config") -> ReplayRecord:
-    return ReplayRecord(inputs.model, inputs.scene, margin=config.control.margin, max_map_age=request.max_map_age)
+    return ReplayRecord(
+        inputs.model,
+        inputs.scene,
+        config=config,
+        max_map_age=request.max_map_age,
+        is_continuous=request.re_anchor is None,
+    )
 
 
 def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[tuple[Stamps, Float64, Float64]]:
@@ -217,42 +257,68 @@ def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[
         yield states.stamp_ns[part], states.position[part], states.velocity[part]
 
 
-def _logged(inputs: ReplayInputs, config: "Config", record: ReplayRecord, first: int) -> Replay:
+def _logged(
+    request: ReplayRequest, inputs: ReplayInputs, config: "Config", record: ReplayRecord, first: int
+) -> Replay:
     """The replay of logged states from `first` on, whose static violations are those at the end."""
     states, model = inputs.states, inputs.model
     last = inputs.scene.at(int(states.stamp_ns[-1]))
     statics = static_violations(model, last.barrier, states.position[-1], scene_margin(model, config.control))
-    return _replay(inputs, config, record, statics, num_before=first, radius_of=-1)
+    return _replay(request, inputs, config, record, statics, radius_of=-1)
 
 
 def _replay(
+    request: ReplayRequest,
     inputs: ReplayInputs,
     config: "Config",
     record: ReplayRecord,
     statics: tuple[StaticViolation, ...],
     *,
-    num_before: int,
     radius_of: int,
 ) -> Replay:
     stamps = record.audit.stamp_ns
+    requested, logged = _requested_ns(request, inputs), inputs.states.stamp_ns
+    before = logged[(logged >= requested) & (logged < stamps[0])]
     return Replay(
         model=inputs.model,
         margin=config.control.margin,
         audit=record.audit,
-        num_before_scene=num_before,
+        num_before_scene=len(before),
+        lead_in_s=float(int(stamps[0]) - int(before[0])) * 1e-9 if len(before) else 0.0,
         median_radius=inputs.scene.at(int(stamps[radius_of])).median_radius,
         static_violations=statics,
         obstacles=record.obstacles,
         map_age_s=record.ages.rows("map_age_s"),
         start_time_s=float(int(stamps[0]) - int(inputs.states.stamp_ns[0])) * 1e-9,
+        between=record.between,
+        strain=record.strain,
+        statics=record.statics,
         events=record.events.events(),
     )
 
 
-def _first_known(inputs: ReplayInputs) -> int:
-    """The first logged state for which a scene is known."""
+def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
+    """The stamp from which on the request wants the log replayed. Raises InputError for one after its end."""
     scene, stamps = inputs.scene, inputs.states.stamp_ns
-    first = 0 if scene.first_ns is None else int(np.searchsorted(stamps, scene.first_ns))
+    if request.start_time is None:
+        return int(stamps[0])
+    if request.start_time == FIRST_MAP:
+        return max(int(stamps[0]), int(stamps[0]) if scene.first_ns is None else scene.first_ns)
+    start = int(stamps[0]) + round(float(request.start_time) * 1e9)
+    if start > stamps[-1]:
+        raise InputError(
+            f"{inputs.source.name}: expected a start within {(stamps[-1] - stamps[0]) * 1e-9:.2f} s of joint states, "
+            f"got {(start - stamps[0]) * 1e-9:.2f} s",
+            remedy="give an earlier --start-time",
+        )
+    return start
+
+
+def _first_judged(request: ReplayRequest, inputs: ReplayInputs) -> int:
+    """The first requested state for which a scene is known."""
+    scene, stamps = inputs.scene, inputs.states.stamp_ns
+    earliest = _requested_ns(request, inputs)
+    first = int(np.searchsorted(stamps, earliest if scene.first_ns is None else max(earliest, scene.first_ns)))
     if first == len(stamps):
         raise NotEvaluableError(
             f"{inputs.source.name}: all {len(stamps)} joint states are earlier than the first known scene",
@@ -270,16 +336,7 @@ def _task(
 ) -> ReplayTask:
     """The start (logged, and not before the scene is known) and the goal (given, or the logged end)."""
     stamps, positions = motion.stamp_ns, motion.position
-    earliest = stamps[0] if request.start_time is None else stamps[0] + round(request.start_time * 1e9)
-    if request.start_time is None and inputs.scene.first_ns is not None:
-        earliest = max(earliest, inputs.scene.first_ns)
-    start = int(np.searchsorted(stamps, earliest))
-    if start == len(stamps):
-        raise InputError(
-            f"{inputs.source.name}: expected a start within {(stamps[-1] - stamps[0]) * 1e-9:.2f} s of joint states, "
-            f"got {(earliest - stamps[0]) * 1e-9:.2f} s",
-            remedy="give an earlier --start-time",
-        )
+    start = _first_judged(request, inputs)
     frame = request.frame or inputs.model.frame_names[-1]
     end = positions[-1] if twists is None else positions[start]
     *via, goal = goal_waypoints(request, inputs.model, frame, end)

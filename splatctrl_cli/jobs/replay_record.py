@@ -4,27 +4,68 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, Stamps, audited
-from splatctrl_cli.control.explain import EventFold, EventKind, Obstacle, audit_signals, stale_signal, step_signals
+from splatctrl_cli.control.checks import static_clearance
+from splatctrl_cli.control.explain import (
+    EventFold,
+    EventKind,
+    Obstacle,
+    audit_signals,
+    interval_signals,
+    limit_signals,
+    stale_signal,
+    step_signals,
+)
+from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
+from splatctrl_cli.control.motion_limits import MotionLimits
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.jobs.known_scene import KnownScene
+from splatctrl_cli.jobs.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replay_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
+
+SLIGHT = 1e-4  # [m] under a margin that solver and rounding may leave
 
 
 class ReplayRecord:
     """The audit of states (T,) in the scenes as they were known, what is nearest to the nearest sphere of each, in
     words, the age (T,) [s] of each state's scene, and what happened.
+
+    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), the time [s] that
+    nobody can bound (`unbounded`), and the clearance [m] of the body at the state (`surface`). strain: its velocity
+    and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in the first
+    scene and the least in any.
     """
 
-    def __init__(self, model: "RobotModel", scene: KnownScene, *, margin: float, max_map_age: float) -> None:
+    def __init__(
+        self,
+        model: RobotModel,
+        scene: KnownScene,
+        *,
+        config: Config,
+        max_map_age: float,
+        is_continuous: bool = True,
+    ) -> None:
+        """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states."""
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
+        self.between, self.strain = Figures(), Figures()
+        self.statics: dict[str, tuple[float, float]] = {}
         self.events = EventFold()
-        self._model, self._scene, self._margin, self._max_map_age = model, scene, margin, max_map_age
+        self._model, self._scene, self._max_map_age = model, scene, max_map_age
+        self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self._spheres = sphere_names(model.sphere_set)
         self._number = {name: number for number, name in enumerate(self._spheres)}
+        self._pairs = [(int(a), int(b)) for a, b in model.self_pairs()]
+        self._reach, self._is_continuous = Reach.of(model), is_continuous
+        limit = np.asarray(config.control.max_acceleration, np.float64)
+        self._limits = MotionLimits(
+            np.asarray(model.velocity_limit),
+            np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
+        )
+        self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
+        self._last_scene: KnownFields | None = None
 
     def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
         """Ranges of at most BLOCK consecutive states of stamps (T,) that see the same scene."""
@@ -37,7 +78,7 @@ class ReplayRecord:
             yield first, last
             first = last
 
-    def measured(self, stamps: Stamps, positions: Float64) -> AuditTrace:
+    def measured(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
         """The audit of the next block of states (T, J), which see one scene."""
         scene = self._scene
         part = audited(
@@ -46,17 +87,24 @@ class ReplayRecord:
         self.audit.add(part)
         self.obstacles.extend(["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)])
         self.ages.append(map_age_s=np.array([scene.age_s(stamp) for stamp in stamps.tolist()]))
+        self._bound(part, velocities)
+        strain = self._limits.add(stamps, positions if self._is_continuous else np.zeros_like(positions))
+        self.strain.append(velocity=strain.velocity, acceleration=strain.acceleration)
+        self._strain = strain
+        self._look_at_statics(part)
         return part
 
     def explain(self, part: AuditTrace, steps: Sequence[ControlStep | None] = ()) -> None:
         """Find what happened in the block that was measured last, with what a controller did there."""
-        signals = audit_signals(part, self._margin, self._spheres, self._model.joint_names)
+        signals = audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs)
+        signals += limit_signals(self._strain, self._model.joint_names)
+        signals += interval_signals(self._lower, self._unbounded, self._margin - SLIGHT)
         age_s = np.array([self._scene.age_s(stamp) for stamp in part.stamp_ns.tolist()])
         signals.append(stale_signal(age_s, self._max_map_age))
         if steps:
             signals += step_signals(steps)
 
-        def near(kind: EventKind, name: str, at: int) -> "Obstacle | None":
+        def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
             if name not in self._number or kind is EventKind.WITHOUT_DISTANCE:
                 return None
             center = self._model.sphere_centers(part.position[at])[[self._number[name]]]
@@ -64,7 +112,52 @@ class ReplayRecord:
 
         self.events.add(part.stamp_ns, signals, near)
 
-    def _nearest(self, part: AuditTrace) -> "list[Obstacle | None]":
+    def _bound(self, part: AuditTrace, velocities: Float64) -> None:
+        """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
+        known = self._scene.at(int(part.stamp_ns[0])).distances
+        name = "certified" if "certified" in known else "exact"
+        deficit = self._reach.radii - self._model.sphere_set.radii[self._reach.moving]
+        stamps, positions, at_states = part.stamp_ns, part.position, part.of_spheres[name] - deficit
+        if self._before is not None:
+            stamp, q, velocity = self._before
+            earlier = clearances(self._model, self._reach, q[None], known[name])
+            stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
+            velocities = np.concatenate([velocity[None], velocities])
+            at_states = np.concatenate([earlier, at_states])
+        between = between_states(
+            self._model,
+            self._reach,
+            stamps,
+            positions,
+            velocities,
+            at_states,
+            known[name],
+            margin=self._margin - SLIGHT,
+            longest=self._longest,
+        )
+        self._keep_bounds(between, stamps, at_states, is_first=self._before is None)
+        self._before = int(stamps[-1]), positions[-1], velocities[-1]
+
+    def _keep_bounds(self, between: Between, stamps: Stamps, at_states: Float64, *, is_first: bool) -> None:
+        unbounded = np.where(between.is_bounded | (not self._is_continuous), 0.0, np.diff(stamps) * 1e-9)
+        lower = np.where(between.is_bounded & self._is_continuous, between.lower, np.nan)
+        surface = at_states.min(axis=1) if is_first else at_states[1:].min(axis=1)
+        if is_first:
+            lower, unbounded = np.concatenate([[np.nan], lower]), np.concatenate([[0.0], unbounded])
+        self._lower, self._unbounded = lower, unbounded
+        self.between.append(lower=lower, unbounded=unbounded, surface=surface)
+
+    def _look_at_statics(self, part: AuditTrace) -> None:
+        """The clearance of spheres that no joint moves, once a scene."""
+        known = self._scene.at(int(part.stamp_ns[0]))
+        if known is self._last_scene:
+            return
+        self._last_scene = known
+        for name, value in static_clearance(self._model, known.distances["exact"], part.position[0]).items():
+            first, least = self.statics.get(name, (value, value))
+            self.statics[name] = (first, min(least, value))
+
+    def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
         """What is nearest to the nearest sphere, by the controller's field; None without a distance."""
         nearest = part.clearance["barrier"]
         found: list[Obstacle | None] = [None] * len(part.stamp_ns)

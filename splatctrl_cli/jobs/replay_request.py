@@ -9,6 +9,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.state_columns import StateColumns
+from splatctrl_cli.jobs.evidence import Mismatch
 from splatctrl_cli.jobs.known_scene import KnownScene
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.model import RobotModel
@@ -16,6 +17,7 @@ from splatctrl_cli.simulate.truth import Truth
 
 MODES = ("audit", "open-loop", "closed-loop")
 DEFAULT_POSE_JUMP = 1.0  # [m]
+FIRST_MAP = "first-map"  # a start time: that of the first map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +27,7 @@ class ReplayRequest:
     log: a log or capture with joint states, read as `options` say. One of `scene` (a reconstruction), `field` (a
     baked grid) and `lockstep` (reconstruct the log on the way) says what is known of the scene. base: pose of the
     URDF's root in world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves. Times in
-    seconds.
+    seconds; start_time may be FIRST_MAP. report_only: the verdict alone does not set the exit code.
     """
 
     log: Path
@@ -52,7 +54,7 @@ class ReplayRequest:
     follow: bool = False
     twist_topic: str | None = None
     twist_frame: str | None = None
-    start_time: float | None = None
+    start_time: float | str | None = None
     re_anchor: float | None = None
     truth: Path | None = None
     max_unknown: float = 0.05
@@ -65,6 +67,7 @@ class ReplayRequest:
     human: tuple[str, ...] = ()
     worst_frames: int = 3
     require: tuple[str, ...] = ()
+    report_only: bool = False
     force: bool = False
     seed: int = 0
     threads: int = 0
@@ -72,7 +75,7 @@ class ReplayRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayInputs:
-    """Everything a replay reads; states in the model's joint order."""
+    """Everything a replay reads; states in the model's joint order. mismatches: of what does not belong together."""
 
     source: RecordSource
     states: StateColumns
@@ -80,6 +83,7 @@ class ReplayInputs:
     scene: KnownScene
     truth: Truth | None
     digests: dict[str, str]
+    mismatches: tuple[Mismatch, ...] = ()
 
     def motion(self) -> LoggedMotion:
         """Every logged state, whether a scene was known or not."""

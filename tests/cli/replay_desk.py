@@ -87,9 +87,14 @@ class Desk:
     source: FakeSource
     robot: list[str]
 
-    def replay(self, *arguments: str, out: str = "out") -> int:
-        log = str(self.folder / "fake.mcap")
-        return main(["replay", log, *self.robot, "-o", str(self.folder / out), *arguments])
+    def replay(self, *arguments: str, out: str = "out", is_judged: bool = False) -> int:
+        """The exit code; without `is_judged` the verdict does not turn it."""
+        log, judged = str(self.folder / "fake.mcap"), [] if is_judged else ["--report-only"]
+        return main(["replay", log, *self.robot, "-o", str(self.folder / out), *judged, *arguments])
+
+    def verdict(self, out: str = "out") -> dict[str, Any]:
+        verdict: dict[str, Any] = json.loads((self.folder / out / "summary.json").read_text())["verdict"]
+        return verdict
 
     def metrics(self, out: str = "out") -> dict[str, Any]:
         metrics: dict[str, Any] = json.loads((self.folder / out / "summary.json").read_text())["metrics"]

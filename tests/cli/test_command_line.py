@@ -234,7 +234,7 @@ def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: 
 def test_force_replaces_what_the_demo_wrote(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(demo, "_run", lambda command, console, folder, out: None)
+    monkeypatch.setattr(demo, "_run", lambda command, expected, console, folder, out: None)
     monkeypatch.setattr(demo, "_pictures", lambda data, out, threads: {})
     out = tmp_path / "out"
     assert main(["demo", "-o", str(out), "-q"]) == 0

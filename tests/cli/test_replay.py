@@ -83,8 +83,8 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
     config = FieldConfig(voxel=0.04, unknown="nan")
     (desk.folder / "field").mkdir()
     write_npz(desk.folder / "field" / "field.npz", bake(splats_of(BALL), box, config, occupancy=seen, threads=1))
-    assert desk.replay("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1") == 5
-    assert "the path leaves known space: at 11 of 11 states, first at 0.000 s" in capsys.readouterr().err
+    assert desk.replay("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1", is_judged=True) == 5
+    assert "the path leaves known space: at 11 of 11 states a sphere is" in capsys.readouterr().err
     assert desk.metrics()["num_without_distance"] == 11
     assert {row["clearance_barrier"] for row in desk.rows()} == {""}
     driven = ("--field", str(desk.folder / "field"), "-q", "--max-unknown", "1", "--mode", "closed-loop")
@@ -94,7 +94,7 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
 
 def test_unknown_space_is_said_after_the_outputs_are_written(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), is_seen=False)
-    assert desk.replay("--scene", str(scene), "-q", "--require", "min_clearance>=9") == 5
+    assert desk.replay("--scene", str(scene), "-q", is_judged=True) == 5
     assert "100.0 % of the sphere centres lie in space no camera ever saw" in capsys.readouterr().err
     assert desk.metrics()["unknown_share"] == 1.0
     assert desk.replay("--scene", str(scene), "-q", "--max-unknown", "1", out="again") == 0
@@ -134,7 +134,7 @@ def test_the_truth_is_reported_beside_the_scene(
     out = desk.folder / "out"
     truth = ["--truth", str(tabletop / "truth.json")]
     log = str(tabletop / "log.mcap")
-    assert main(["replay", log, *desk.robot, "--scene", str(scene), "-o", str(out), "-q", *truth]) == 0
+    assert main(["replay", log, *desk.robot, "--scene", str(scene), "-o", str(out), "-q", *truth]) == 5
     metrics = desk.metrics()
     recorded = json.loads((tabletop / "truth.json").read_text())["clearance"]["min"]
     assert metrics["min_clearance_true"] == pytest.approx(recorded, abs=1e-5)
@@ -155,7 +155,8 @@ def test_the_truth_is_reported_beside_the_scene(
         (["--lock", "nose=0"], 4, "no joint 'nose' to lock"),
         (["--truth", "nowhere.json"], 4, "nowhere.json"),
         (["--require", "clearence>=1"], 2, "unknown metric"),
-        (["--start-time", "0"], 2, "--start-time: expected --mode closed-loop, got audit"),
+        (["--start-time", "nan"], 2, "expected finite numbers"),
+        (["--start-time", "60"], 4, "give an earlier --start-time"),
         (["--mode", "open-loop", "--re-anchor", "1"], 2, "--re-anchor: expected --mode closed-loop, got open-loop"),
         (["--goal", "0,0,1,0,0,0,1"], 2, "--goal: expected --mode open-loop or closed-loop, got audit"),
         (["--follow"], 2, "--follow: expected --mode open-loop or closed-loop, got audit"),

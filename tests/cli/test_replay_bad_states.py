@@ -31,7 +31,7 @@ def test_stamps_that_go_back_repeat_and_pause_are_said(desk: Desk, capsys: pytes
     q = START + 0.01 * np.arange(30)[:, None]
     stamps = [START_NS + i * STEP_NS + (i > 20) * 10**9 for i in range(30)]
     stamps[5], stamps[6], stamps[12] = stamps[6], stamps[5], stamps[11]
-    assert replayed(desk, q, stamps) == 0
+    assert replayed(desk, q, stamps) == 5
     said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("log: /joint_states:")]
     assert any("stamps go back at 1 of 30 states: sorted" in line for line in said)
     assert any(
@@ -45,7 +45,7 @@ def test_stamps_that_go_back_repeat_and_pause_are_said(desk: Desk, capsys: pytes
 def test_a_posture_outside_the_limits_is_an_event_with_its_joint(desk: Desk) -> None:
     q = np.repeat(START[None], 10, axis=0)
     q[4:7, 3] = 0.5  # its limit is below 0
-    assert replayed(desk, q, [START_NS + i * STEP_NS for i in range(10)], "-q") == 0
+    assert replayed(desk, q, [START_NS + i * STEP_NS for i in range(10)], "-q") == 1
     events = json.loads((desk.folder / "out" / "events.json").read_text())["events"]
     (outside,) = [event for event in events if event["kind"] == "outside-limits"]
     assert (outside["worst_name"], outside["num_states"]) == ("joint4", 3) and outside["worst"] < -0.5

@@ -30,7 +30,7 @@ def scene(desk: Desk) -> str:
 
 def replayed(desk: Desk, scene: str, log: Path, *more: str) -> int:
     arguments = ["replay", str(log), *desk.robot, "--scene", scene, "-o", str(desk.folder / "out"), *more]
-    return main([*arguments, "--max-unknown", "1"])
+    return main([*arguments, "--max-unknown", "1", "--report-only"])
 
 
 def states_of_run(desk: Desk) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def test_gates_hold_a_set_to_its_figures(capsys: pytest.CaptureFixture[str], urd
     code, _, err = run(capsys, *check, "uncovered_share<=0.2")
     assert (code, err) == (1, "splatctrl: gate failed: uncovered_share is 1, required <= 0.2\n")
     code, _, err = run(capsys, *check, "max_deficit<=0.2")
-    assert (code, err) == (1, "splatctrl: gate failed: max_deficit is unknown, required <= 0.2\n")
+    assert (code, err) == (5, "splatctrl: gate failed: max_deficit is unknown, required <= 0.2\n")
     code, _, err = run(capsys, *check, "deficit<=0.2")
     assert (code, "did you mean max_deficit?" in err) == (2, True)
 

@@ -219,7 +219,7 @@ def test_an_output_that_exists_is_refused_before_anything_is_rendered(
 
 
 def test_a_gate_that_fails_leaves_the_scores_and_exits_1(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(scored, "-o", scored / "score", "--require", "psnr_seen>=20", "--require", "psnr_all>=90") == 1
+    assert run(scored, "-o", scored / "score", "--require", "psnr_seen>=20", "--require", "psnr_all>=90") == 5
     assert "psnr_all is" in capsys.readouterr().err
     assert (scored / "score" / "score.json").is_file()
 
@@ -232,7 +232,7 @@ def test_a_gate_on_an_unknown_metric_is_refused_before_anything_is_rendered(
 
 
 def test_a_view_whose_psnr_is_infinite_lets_no_gate_pass(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(scored, "--json", "--require", "psnr_all>=1") == 1
+    assert run(scored, "--json", "--require", "psnr_all>=1") == 5
     done = capsys.readouterr()
     assert json.loads(done.out)["views"][2]["psnr_all"] is None, "a black view of nothing, rendered black"
     assert "psnr_all is unknown" in done.err

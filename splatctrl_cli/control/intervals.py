@@ -1,0 +1,137 @@
+"""How near an arm comes to the scene between two logged states: a bound from both ends, refined where it is too low.
+
+Over an interval in which sphere s travels at most L_s, its distance to the scene is nowhere below
+``(d_0s + d_1s - L_s) / 2``, d_0s and d_1s being those at the two ends, because the exact distance is 1-Lipschitz. L_s
+follows from the joints' motion and the spheres' lever arms (`robot.levers`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.control.clearance import PlanningArm
+from splatctrl_cli.records import Bool, Float64
+
+MAX_HALVINGS = 10
+RESOLUTION = 5e-4  # [m] of travel: shorter pieces are not halved any more
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """What moves of an arm, and how far: moving (M,) sphere indices, radii (M,) [m] with what the spheres leave of
+    the surface uncovered, levers (M, J) [m per rad or m], velocity_limit (J,) [1/s].
+    """
+
+    moving: "np.ndarray[tuple[int], np.dtype[np.intp]]"
+    radii: Float64
+    levers: Float64
+    velocity_limit: Float64
+
+    @classmethod
+    def of(cls, model: PlanningArm) -> "Reach":
+        """The reach of a model's moving spheres."""
+        moving = np.flatnonzero(model.moving_spheres)
+        deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)[moving]), 0.0)
+        return cls(
+            moving=moving,
+            radii=np.asarray(model.sphere_set.radii, np.float64)[moving] + deficit,
+            levers=model.lever_arms()[moving],
+            velocity_limit=np.asarray(model.velocity_limit, np.float64),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Between:
+    """Of T - 1 intervals: lower (T - 1,) [m], a bound of the clearance within, ends included; is_bounded (T - 1,),
+    False where the states say too little of what the arm did in between.
+    """
+
+    lower: Float64
+    is_bounded: Bool
+
+
+def between_states(
+    model: PlanningArm,
+    reach: Reach,
+    stamps: "np.ndarray[tuple[int], np.dtype[np.int64]]",
+    positions: Float64,
+    velocities: Float64,
+    at_states: Float64,
+    distance_to: DistanceFunction,
+    *,
+    margin: float,
+    longest: float,
+) -> Between:
+    """Bounds for the intervals between states (T, J) at stamps (T,) [ns] in one scene.
+
+    at_states (T, M) [m]: the clearance of every moving sphere's surface at the states, by `clearances`.
+
+    Up to `longest` [s] the arm is taken to have moved in a straight line of joint space, plus what its velocities
+    (T, J) say beyond that. Over a longer interval it may have gone anywhere that its velocity limits allow: it is
+    bounded only where that does not reach the margin [m].
+    """
+    seconds = np.diff(stamps) * 1e-9
+    motion = np.abs(np.diff(positions, axis=0))
+    speed = 0.5 * (np.abs(velocities[1:]) + np.abs(velocities[:-1])) * seconds[:, None]
+    straight = motion @ reach.levers.T
+    beyond = np.maximum(np.where(np.isfinite(speed), speed, 0.0) - motion, 0.0) @ reach.levers.T
+    first, last = at_states[:-1], at_states[1:]
+    is_long = seconds > longest + 1e-6
+    anywhere = seconds[:, None] * reach.velocity_limit @ reach.levers.T
+    travel = np.where(is_long[:, None], np.maximum(anywhere, straight), straight)
+    lower = 0.5 * (first + last - travel - beyond)
+    ends = np.minimum(first.min(axis=1), last.min(axis=1))
+    is_open = ~is_long & (lower.min(axis=1) < margin) & (ends >= margin)
+    least = np.minimum(lower.min(axis=1), ends)
+    chosen = np.flatnonzero(is_open)
+    if len(chosen):
+        refined = _refined(
+            model, reach, positions[chosen], positions[chosen + 1], first[chosen], last[chosen], distance_to, margin
+        )
+        least[chosen] = np.minimum(refined - 0.5 * beyond[chosen].max(axis=1), ends[chosen])
+    short = ~is_long & ~is_open & (ends < margin)
+    least[short] = ends[short]  # the ends are below already; how far it is below in between does not turn it
+    is_bounded = np.isfinite(least) & (~is_long | (least >= margin) | (ends < margin))
+    return Between(lower=least, is_bounded=is_bounded)
+
+
+def _refined(
+    model: PlanningArm,
+    reach: Reach,
+    q_first: Float64,
+    q_last: Float64,
+    first: Float64,
+    last: Float64,
+    distance_to: DistanceFunction,
+    margin: float,
+) -> Float64:
+    """Least clearance bound (K,) of K straight motions: halved until every piece is above the margin, or short."""
+    least = np.full(len(q_first), np.inf)
+    owner = np.arange(len(q_first))
+    for level in range(MAX_HALVINGS + 1):
+        travel = np.abs(q_last - q_first) @ reach.levers.T
+        bound = (0.5 * (first + last - travel)).min(axis=1)
+        is_done = (bound >= margin) | (travel.max(axis=1) < RESOLUTION) | (level == MAX_HALVINGS)
+        np.minimum.at(least, owner[is_done], bound[is_done])
+        open_ = np.flatnonzero(~is_done)
+        if not len(open_):
+            break
+        middle = 0.5 * (q_first[open_] + q_last[open_])
+        at_middle = clearances(model, reach, middle, distance_to)
+        reached = at_middle.min(axis=1) < margin  # a sample below the margin settles its interval
+        np.minimum.at(least, owner[open_[reached]], at_middle[reached].min(axis=1))
+        settled = np.isin(owner[open_], owner[open_[reached]])
+        keep = open_[~settled]
+        middle, at_middle = middle[~settled], at_middle[~settled]
+        q_first, q_last = np.concatenate([q_first[keep], middle]), np.concatenate([middle, q_last[keep]])
+        first, last = np.concatenate([first[keep], at_middle]), np.concatenate([at_middle, last[keep]])
+        owner = np.concatenate([owner[keep], owner[keep]])
+    return least
+
+
+def clearances(model: PlanningArm, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
+    """(T, M) [m] of every moving sphere's surface at postures (T, J)."""
+    centers = model.sphere_centers_batch(positions)[:, reach.moving]
+    distance = distance_to(np.ascontiguousarray(centers.reshape(-1, 3)))
+    return np.asarray(distance.reshape(len(positions), -1) - reach.radii)

@@ -1,0 +1,144 @@
+"""What a judging command concludes: one outcome, and each criterion that it rests on."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+
+class Outcome(StrEnum):
+    """What evidence says of a claim."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    NOT_EVALUABLE = "not evaluable"
+
+
+EXIT_CODES = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.NOT_EVALUABLE: 5}
+_WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a definite failure outranks missing evidence
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """What one criterion found.
+
+    value and threshold in `unit`, None where there is none; time_s: when [s], counted as in the output's files;
+    place (3,): where [m], world; who: the link, sphere, joint or camera; cause: what is there; remedy: what a person
+    can do. count: how many states, views or points the value rests on. label: what the outcome is called where this
+    decides it, such as "contact".
+    """
+
+    criterion: str
+    outcome: Outcome
+    sentence: str
+    value: float | None = None
+    threshold: float | None = None
+    unit: str = ""
+    time_s: float | None = None
+    place: tuple[float, float, float] | None = None
+    who: str = ""
+    cause: str = ""
+    remedy: str = ""
+    count: int | None = None
+    label: str = ""
+
+    def __str__(self) -> str:
+        """The sentence with when, who, what, where and the remedy."""
+        when = "" if self.time_s is None else f" at {self.time_s:.2f} s"
+        near = f", {self.cause}" if self.cause else ""
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"{self.criterion}: {self.sentence}{when}{near}{remedy}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """The outcome of a command and its reasons: those that decided it first.
+
+    label: the outcome in the command's own word, such as "safe"; scope: what was judged; notes: what a person should
+    know and that decides nothing.
+    """
+
+    command: str
+    outcome: Outcome
+    label: str
+    scope: str
+    reasons: tuple[Reason, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """0 passed, 1 failed, 5 not evaluable."""
+        return EXIT_CODES[self.outcome]
+
+    def exit_code_of(self, criteria: tuple[str, ...] | None) -> int:
+        """`exit_code` of the reasons alone whose criterion begins with one of `criteria` (None: of all)."""
+        if criteria is None:
+            return self.exit_code
+        asked = [reason.outcome for reason in self.reasons if reason.criterion.startswith(criteria)]
+        return EXIT_CODES[min(asked, key=_WORST_FIRST.index, default=Outcome.PASSED)]
+
+    @property
+    def decisive(self) -> tuple[Reason, ...]:
+        """The reasons that are not passed, those of the outcome first."""
+        return tuple(reason for reason in self.reasons if reason.outcome is not Outcome.PASSED)
+
+    @property
+    def sentence(self) -> str:
+        """The verdict as one sentence."""
+        scope = f" ({self.scope})" if self.scope else ""
+        if not self.decisive:
+            return f"{self.command}: {self.label.upper()}{scope}" + "".join(f"; {note}" for note in self.notes)
+        more = len(self.decisive) - 1
+        others = f"; and {more} more reason{'s' if more > 1 else ''}" if more else ""
+        return f"{self.command}: {self.label.upper()}{scope}: {self.decisive[0]}{others}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; numbers that are not finite are None."""
+        return {
+            "outcome": str(self.outcome),
+            "label": self.label,
+            "sentence": self.sentence,
+            "scope": self.scope,
+            "exit_code": self.exit_code,
+            "reasons": [_plain(reason) for reason in self.reasons],
+            "notes": list(self.notes),
+        }
+
+
+def verdict_of(
+    command: str,
+    reasons: Iterable[Reason],
+    *,
+    scope: str = "",
+    passed: str = "passed",
+    notes: Iterable[str] = (),
+) -> Verdict:
+    """The verdict that reasons make: failed where any failed, else not evaluable where any is, else passed.
+
+    Without a single reason nothing was judged, which is not evaluable. passed: the label of a verdict that passed.
+    The label of a failure is the first given by `Reason.label` in the order of the reasons.
+    """
+    given = list(reasons)
+    if not given:
+        nothing = Reason(criterion="evidence", outcome=Outcome.NOT_EVALUABLE, sentence="nothing was judged")
+        given = [nothing]
+    ordered = sorted(given, key=lambda reason: _WORST_FIRST.index(reason.outcome))
+    outcome = ordered[0].outcome
+    label = {Outcome.PASSED: passed, Outcome.FAILED: ordered[0].label or "failed"}.get(outcome, str(outcome))
+    return Verdict(
+        command=command,
+        outcome=outcome,
+        label=label,
+        scope=scope,
+        reasons=tuple(ordered),
+        notes=tuple(notes),
+    )
+
+
+def _plain(reason: Reason) -> dict[str, Any]:
+    plain = asdict(reason) | {"outcome": str(reason.outcome)}
+    for name in ("value", "threshold", "time_s"):
+        value = plain[name]
+        plain[name] = value if value is not None and math.isfinite(value) else None
+    return plain
