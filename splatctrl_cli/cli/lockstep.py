@@ -14,8 +14,8 @@ from splatctrl_cli.cli.known_scene import (
     known_space,
     splat_fields,
 )
+from splatctrl_cli.cli.numbers import MAX_SECONDS, real
 from splatctrl_cli.cli.reconstruct import DEFAULT_POSE_JUMP, add_disagreement, check_pose_jumps
-from splatctrl_cli.cli.replay_goal import numbers
 from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -38,20 +38,12 @@ def add_lockstep(parser: argparse.ArgumentParser, scene: argparse._ActionsContai
     )
     parser.add_argument(
         "--latency",
-        type=_latency,
+        type=real(0, MAX_SECONDS, "s"),
         default=0.0,
         metavar="S",
         help="a map is known this long after its frames' stamp (--scene, --lockstep; default: 0)",
     )
     add_disagreement(parser.add_argument_group("with --lockstep"))
-
-
-def _latency(text: str) -> float:
-    """Seconds, not below zero, for argparse."""
-    (value, *more) = numbers(text)
-    if more or value < 0:
-        raise argparse.ArgumentTypeError(f"expected seconds not below 0, got {text!r}")
-    return value
 
 
 def check_lockstep(args: argparse.Namespace) -> None:

@@ -17,8 +17,9 @@ from splatctrl_cli.cli.common import (
     configured,
 )
 from splatctrl_cli.cli.lockstep import add_lockstep, check_lockstep
+from splatctrl_cli.cli.numbers import MAX_SECONDS, real
 from splatctrl_cli.cli.replay_baseline import add_baseline, read_baselines, read_zone
-from splatctrl_cli.cli.replay_goal import POSE, add_goal, check_goal, pose, seconds
+from splatctrl_cli.cli.replay_goal import POSE, add_goal, check_goal, pose
 from splatctrl_cli.cli.replay_golden import Golden, add_golden, check_golden, read_golden
 from splatctrl_cli.cli.replay_robot import add_robot_geometry, coverage_words, doubts_of, read_robot
 from splatctrl_cli.cli.replay_twists import check_twists
@@ -68,11 +69,15 @@ def register(subparsers: Subparsers) -> None:
     add_goal(parser)
     parser.add_argument("--truth", type=Path, metavar="FILE", help="truth.json of a simulated log")
     parser.add_argument(
-        "--max-unknown", type=float, default=0.05, metavar="SHARE", help="never-seen share allowed (default: 0.05)"
+        "--max-unknown",
+        type=real(0, 1),
+        default=0.05,
+        metavar="SHARE",
+        help="never-seen share allowed (default: 0.05)",
     )
     parser.add_argument(
         "--max-map-age",
-        type=seconds,
+        type=real(1e-3, MAX_SECONDS, "s"),
         default=1.0,
         metavar="S",
         help="a scene older than this is an event (default: 1)",

@@ -7,7 +7,9 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatctrl_cli.cli.numbers import MAX_SECONDS, real, several
 from splatctrl_cli.cli.replay_twists import add_twists
+from splatctrl_cli.config.declared import shown
 from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -36,9 +38,17 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
         help="the logged pose of each time is the goal (the default of --mode open-loop)",
     )
     add_twists(parser, goal)
-    parser.add_argument("--start-time", type=float, metavar="S", help="start at this time of the log [s]")
     parser.add_argument(
-        "--re-anchor", type=seconds, metavar="S", help="put the arm back into the logged posture every S seconds"
+        "--start-time",
+        type=real(-MAX_SECONDS, MAX_SECONDS, "s"),
+        metavar="S",
+        help="start at this time of the log [s]",
+    )
+    parser.add_argument(
+        "--re-anchor",
+        type=real(1e-3, MAX_SECONDS, "s"),
+        metavar="S",
+        help="put the arm back into the logged posture every S seconds",
     )
 
 
@@ -146,12 +156,9 @@ def _toml_rows(path: Path, text: str) -> list[tuple[str, list[float]]]:
 
 def numbers(text: str) -> tuple[float, ...]:
     """Finite numbers joined by commas, for argparse."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected numbers joined by commas, got {text!r}") from None
-    if not all(math.isfinite(value) for value in values):
-        raise argparse.ArgumentTypeError(f"expected finite numbers, got {text!r}")
+    values = several(text)
+    if not values:
+        raise argparse.ArgumentTypeError(f"expected finite numbers joined by commas, up to 1e6, got {shown(text)}")
     return values
 
 
@@ -164,11 +171,3 @@ def pose(text: str) -> tuple[float, ...]:
     if abs(length - 1.0) > 0.01:
         raise argparse.ArgumentTypeError(f"expected a unit quaternion qx,qy,qz,qw, got one of length {length:.3f}")
     return values
-
-
-def seconds(text: str) -> float:
-    """Seconds above zero, for argparse."""
-    values = numbers(text)
-    if len(values) != 1 or values[0] <= 0:
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
-    return values[0]

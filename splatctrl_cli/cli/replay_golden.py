@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatctrl_cli.cli.numbers import real
 from splatctrl_cli.errors import GateFailed, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def add_golden(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--golden-tolerance",
-        type=float,
+        type=real(0, 100, "rad/s"),
         default=TOLERANCE,
         metavar="RAD/S",
         help=f"by more than this, per joint (default: {TOLERANCE:g})",
@@ -53,8 +54,6 @@ def read_golden(args: argparse.Namespace) -> Golden | None:
         return None
     if args.mode == "audit":
         raise UsageError("--golden: an audit commands nothing", remedy="give --mode open-loop or closed-loop")
-    if not args.golden_tolerance >= 0:
-        raise UsageError(f"--golden-tolerance: expected 0 rad/s or more, got {args.golden_tolerance:g}")
     path: Path = args.golden
     file = path / "steps.csv" if path.is_dir() else path.with_name("steps.csv") if path.suffix == ".json" else path
     try:

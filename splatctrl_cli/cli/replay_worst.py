@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatctrl_cli.cli.numbers import whole
+
 if TYPE_CHECKING:
     from splatctrl_cli.cli.replay_modes import Replay, ReplayInputs
     from splatctrl_cli.evaluate.worst_frames import Moment, Sight
@@ -17,18 +19,11 @@ def add_worst_frames(parser: argparse.ArgumentParser) -> None:
     """``--worst-frames``."""
     parser.add_argument(
         "--worst-frames",
-        type=_count,
+        type=whole(0, 1000),
         default=3,
         metavar="N",
         help="write worst_1.png ...: camera images of the N events of least clearance (default: 3)",
     )
-
-
-def _count(text: str) -> int:
-    """A whole number from 0, for argparse."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0, got {text!r}")
-    return int(text)
 
 
 def draw_worst_frames(folder: Path, inputs: "ReplayInputs", replay: "Replay", num: int) -> list[str]:

@@ -141,8 +141,16 @@ def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_join
         (("--mode", "closed-loop", "--golden", "nowhere.csv"), 4, "nowhere.csv: cannot be read"),
         (("--mode", "open-loop", "--golden", "x", "--golden-tolerance", "-1"), 2, "--golden-tolerance"),
         (("--mode", "closed-loop", "--waypoints", "nowhere.toml"), 4, "nowhere.toml: cannot be read"),
-        (("--mode", "closed-loop", "--re-anchor", "0"), 2, "expected seconds above 0"),
-        (("--max-map-age", "nan"), 2, "expected finite numbers"),
+        (
+            ("--mode", "closed-loop", "--re-anchor", "0"),
+            2,
+            "argument --re-anchor: expected 0.001 to 100000000 s, got '0'",
+        ),
+        (("--max-map-age", "nan"), 2, "argument --max-map-age: expected 0.001 to 100000000 s, got 'nan'"),
+        (("--max-unknown", "nan"), 2, "argument --max-unknown: expected 0 to 1, got 'nan'"),
+        (("--max-unknown", "inf"), 2, "argument --max-unknown: expected 0 to 1, got 'inf'"),
+        (("--mode", "closed-loop", "--goal=nan,0,0,0,0,0,1"), 2, "expected finite numbers joined by commas"),
+        (("--set", "control.margin=-0.05"), 2, "control.margin: expected 0 to 1 m, got -0.05"),
         (("--require", "intervention_share<=0"), 2, "a figure of --mode"),
     ],
 )
