@@ -31,7 +31,8 @@ class Within:
     def holds(self, value: Any) -> bool:
         """Whether a number, or each number of a tuple, lies in the range; NaN never does."""
         numbers = value if isinstance(value, tuple) else (value,)
-        return (self.or_zero and value == 0) or all(self.low <= number <= self.high for number in numbers)
+        is_within = numbers != () and all(self.low <= number <= self.high for number in numbers)
+        return is_within or (self.or_zero and value == 0)
 
 
 @dataclass(frozen=True)
