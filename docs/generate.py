@@ -46,8 +46,8 @@ def cli_page() -> str:
         "Results go to stdout, as a table or with `--json` as one JSON object; progress and log lines go to stderr.",
         "An error is one line on stderr with its remedy. Options cannot be abbreviated. Relative paths start at the",
         "folder you are in; missing folders above an output are made. An output that is a link is written where the",
-        "link leads to. An output that another run is writing is refused (exit 2); a killed run leaves no lock. Where",
-        "stdout is closed, a command that had something to print ends with 6, its files whole.",
+        "link leads to. An output that another run is writing is refused (exit 2); a killed run leaves no lock. With",
+        "stdout closed, a command that had something to print ends with 6, its files whole.",
         "",
         EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
     ]
