@@ -5,6 +5,7 @@ in time). A crash, a hang, another exit code, a value taken out of its range or 
 """
 
 import argparse
+import importlib
 import math
 import os
 import signal
@@ -26,6 +27,16 @@ NUMBERS = ("nan", "inf", "-inf", "0", "0.0", "-0.0", "1e308", "-1e308", "1e-320"
 WORDS = ("bogus", "''", "nan", "0", "true", "[]")
 HARMLESS = (0, 1, 5)
 TIME_LIMIT = 60.0  # [s] of a command that takes about two
+WARM = (
+    "numpy",
+    "scipy.spatial",
+    "cv2",
+    "pinocchio",
+    "clarabel",
+    "matplotlib.figure",
+    "rosbags.typesys",
+    "mcap.reader",
+)
 FAST = (
     "scene.first_iterations=4",
     "scene.iterations_per_step=1",
@@ -173,10 +184,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="keys that begin so, like control. (default: all)")
     args = parser.parse_args(argv)
     wanted = [case for case in cases() if f"{case.section}.{case.key}".startswith(args.only)]
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    for name in WARM:  # so that no fork has to
+        importlib.import_module(name)
     with tempfile.TemporaryDirectory() as name:
         desk = Desk(Path(name))
-        outcomes = []
+        outcomes: list[Outcome] = []
         for case in wanted:
+            if not outcomes or outcomes[-1].case.key != case.key:
+                print(f"{len(outcomes)} of {len(wanted)}: {case.section}.{case.key}", file=sys.stderr, flush=True)
             outcomes.append(desk.ask(case))
             if outcomes[-1].fault:
                 print(

@@ -318,11 +318,7 @@ def test_the_standstill_waits_where_the_controller_goes_on(
         ((), 2, "--baseline: expected --mode closed-loop"),
         (("--mode", "closed-loop", "--zone", "1"), 2, "--zone 1: expected STOP,RESUME"),
         (("--mode", "closed-loop", "--zone", "2,1"), 2, "zone: expected 0 < stop <= resume"),
-        (
-            ("--mode", "closed-loop", "--zone", "0.5,inf"),
-            2,
-            "zone: expected 0 < stop <= resume <= 100, got 0.5 and inf m",
-        ),
+        (("--mode", "closed-loop", "--zone", "0.5,inf"), 2, "expected 0 < stop <= resume <= 100, got 0.5 and inf m"),
         (("--mode", "closed-loop", "--zone-box", "0,0,0,1,1,0"), 2, "expected finite x0,y0,z0,x1,y1,z1"),
         (("--mode", "closed-loop", "--human", "visitor"), 2, "--human: expected --truth"),
         (("--mode", "closed-loop"), 5, "expected splats labelled human, got none"),
