@@ -1,19 +1,19 @@
-"""Writes docs/cli.md from the parser and docs/config.md from config.py. Run by `make docs`; a test holds both to it.
+"""Writes docs/cli.md from the parser and docs/config.md from what the configuration declares, for `make docs`.
 
 The pages are made from the parser itself and not from its printed help, whose wrapping depends on the terminal and on
 the version of Python.
 """
 
 import argparse
-import ast
-import io
-import tokenize
+import inspect
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from splatctrl_cli import config
 from splatctrl_cli.cli.main import EXIT_CODES, build_parser
+from splatctrl_cli.config.declared import OneOf, Section
+from splatctrl_cli.config.load import type_name
 
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
@@ -45,7 +45,9 @@ def cli_page() -> str:
         "",
         "Results go to stdout, as a table or with `--json` as one JSON object; progress and log lines go to stderr.",
         "An error is one line on stderr with its remedy. Options cannot be abbreviated. Relative paths start at the",
-        "folder you are in; missing folders above an output are made.",
+        "folder you are in; missing folders above an output are made. An output that is a link is written where the",
+        "link leads to. An output that another run is writing is refused (exit 2); a killed run leaves no lock. With",
+        "stdout closed, a command that had something to print ends with 6, its files whole.",
         "",
         EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
     ]
@@ -100,14 +102,15 @@ def _invocation(action: argparse.Action) -> str:
 
 
 def config_page() -> str:
-    """One table per section of the configuration: key, default, and the comment beside it."""
-    comments, docstrings = _config_source()
+    """One table per section of the configuration: key, default, type, range with unit, and reason, as declared."""
     lines = [
         NOTICE,
         "# Configuration",
         "",
         "Give a TOML file with `--config FILE.toml`, single values with `--set section.key=value` (these win). An",
-        "unknown key is an error that names the nearest good one. What a run used stands in its `run.json`.",
+        "unknown key is an error that names the nearest good one. A value of another type, out of its range, not",
+        "finite, or in contradiction to another one is refused (exit 2) before any work. What a run used stands in",
+        "its `run.json`.",
         "",
         "```toml",
         "[scene]",
@@ -119,33 +122,24 @@ def config_page() -> str:
         "",
         "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it.",
     ]
+    header = ("key", "default", "type", "range", "meaning, and reason for the range")
     for section in fields(config.Config):
-        values: Any = getattr(config.Config(), section.name)
-        kind = type(values).__name__
-        rows = [
-            (f"`{key.name}`", f"`{_toml(getattr(values, key.name))}`", comments[kind, key.name])
-            for key in fields(values)
-        ]
-        lines += ["", f"## [{section.name}]", "", docstrings[kind], "", *_table(("key", "default", "meaning"), rows)]
+        kind: Any = type(getattr(config.Config(), section.name))
+        rows = [_setting_row(kind, key) for key in kind.declared]
+        lines += ["", f"## [{section.name}]", "", inspect.cleandoc(kind.__doc__), "", *_table(header, rows)]
     return "\n".join(lines) + "\n"
 
 
-def _config_source() -> tuple[dict[tuple[str, str], str], dict[str, str]]:
-    """Comments by (class, key) and docstrings by class, from the text of config.py."""
-    source = Path(config.__file__).read_text(encoding="utf-8")
-    by_line = {
-        token.start[0]: token.string.lstrip("# ")
-        for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT
-    }
-    classes = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
-    comments = {
-        (node.name, item.target.id): by_line.get(item.lineno, "")
-        for node in classes
-        for item in node.body
-        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
-    }
-    return comments, {node.name: ast.get_docstring(node) or "" for node in classes}
+def _setting_row(section: type[Section], key: str) -> tuple[str, ...]:
+    declared, hint = section.declared[key], get_type_hints(section)[key]
+    quoted = isinstance(declared, OneOf) and " or ".join(f'`"{word}"`' for word in declared.words)
+    return (
+        f"`{key}`",
+        f"`{_toml(getattr(section, key))}`",
+        type_name(hint),
+        quoted or declared.expected,
+        declared.reason,
+    )
 
 
 def _toml(value: object) -> str:

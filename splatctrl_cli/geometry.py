@@ -20,8 +20,13 @@ def transform_points(T: Float64, points: NDArray[np.floating]) -> Float64:
 
 
 def rotation_from_quat(quat_xyzw: ArrayLike) -> Float64:
-    """Rotation (3, 3) of a quaternion (x, y, z, w) of any length but zero."""
-    x, y, z, w = np.asarray(quat_xyzw, dtype=np.float64) / np.linalg.norm(quat_xyzw)
+    """Rotation (3, 3) of a finite quaternion (x, y, z, w) of any length but zero.
+
+    It is scaled by a power of two first, which rounds nothing: the squares of a tiny one would underflow.
+    """
+    quat = np.asarray(quat_xyzw, dtype=np.float64)
+    quat = np.ldexp(quat, -np.frexp(np.abs(quat).max())[1])
+    x, y, z, w = quat / np.linalg.norm(quat)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

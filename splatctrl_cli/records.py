@@ -40,6 +40,7 @@ class Label(IntEnum):
     HUMAN = 0b10
 
 
+MAX_PLACE = 1e6  # [m] of a workspace's corner from the world's origin
 SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
 
 
@@ -249,13 +250,15 @@ class Box:
 
     @classmethod
     def from_text(cls, text: str) -> "Box":
-        """The box of ``x0,y0,z0,x1,y1,z1``. Raises UsageError unless finite, lower below upper."""
+        """The box of ``x0,y0,z0,x1,y1,z1``. Raises UsageError unless within 1000 km, lower below upper."""
         try:
             values = np.array([float(part) for part in text.split(",")])
         except ValueError:
             values = np.empty(0)
-        if values.shape != (6,) or not np.isfinite(values).all() or not np.all(values[:3] < values[3:]):
-            raise UsageError(f"--box {text}: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1, y0 < y1, z0 < z1")
+        if values.shape != (6,) or not (np.abs(values) <= MAX_PLACE).all() or not np.all(values[:3] < values[3:]):
+            raise UsageError(
+                f"--box {text}: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1, y0 < y1, z0 < z1, within 1e6"
+            )
         return cls(lower=values[:3], upper=values[3:])
 
     def contains(self, points_world: NDArray[np.floating]) -> Bool:

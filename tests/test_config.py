@@ -1,6 +1,6 @@
 """What a configuration may say, and what it is told when it may not."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -42,28 +42,28 @@ def test_what_is_written_reads_back(tmp_path: Path) -> None:
         ("scene.zzz=9", "unknown key scene.zzz; known here: max_splats"),
         ("scene=9", "expected section.key=value; write it like --set scene.max_splats=3000"),
         ("scene.max_splats", "expected section.key=value"),
-        ("scene.max_splats=2.5", "expected int, got 2.5"),
-        ("scene.max_splats=true", "expected int, got True"),
-        ("scene.fill=many", "expected float, got 'many'"),
-        ("scene.fill=nan", "expected a finite number, got nan"),
-        ("scene.max_splats=-5", "scene.max_splats: expected above 0, got -5"),
-        ("scene.snapshot_every=0", "scene.snapshot_every: expected above 0, got 0"),
-        ("scene.initial_opacity=2", "scene.initial_opacity: expected between 0 and 1, got 2"),
-        ("scene.min_radius=0.5", "scene.min_radius: expected at most scene.max_radius = 0.02, got 0.5"),
-        ("scene.fill=1.5", "scene.fill: expected at most 1, got 1.5"),
-        ("scene.noise=-1", "scene.noise: expected 0 or more, got -1"),
-        ("scene.window=-1", "scene.window: expected 0 or more, got -1"),
-        ("scene.lambda_depth=-0.1", "scene.lambda_depth: expected 0 or more, got -0.1"),
-        ("scene.lr_center=-1", "scene.lr_center: expected 0 or more, got -1"),
-        ("scene.max_depth_error=0.01", "scene.min_depth_error: expected at most scene.max_depth_error = 0.01"),
-        ("occupancy.log_odds_miss=0", "occupancy.log_odds_miss: expected below 0, got 0"),
-        ("occupancy.log_odds_hit=-1", "occupancy.log_odds_hit: expected above 0, got -1"),
+        ("scene.max_splats=2.5", "expected int, 1 to 10000000, got 2.5"),
+        ("scene.max_splats=true", "expected int, 1 to 10000000, got True"),
+        ("scene.fill=many", "expected float, 0.001 to 1, got 'many'"),
+        ("scene.fill=nan", "scene.fill: expected 0.001 to 1, got nan"),
+        ("scene.max_splats=-5", "scene.max_splats: expected 1 to 10000000, got -5"),
+        ("scene.snapshot_every=0", "scene.snapshot_every: expected 1 to 1000000, got 0"),
+        ("scene.initial_opacity=2", "scene.initial_opacity: expected 0.001 to 0.99, got 2"),
+        ("scene.min_radius=0.5", "scene.min_radius: expected at most scene.max_radius = 0.02 m, got 0.5"),
+        ("scene.fill=1.5", "scene.fill: expected 0.001 to 1, got 1.5"),
+        ("scene.noise=-1", "scene.noise: expected 0 to 1000000000, got -1.0"),
+        ("scene.window=-1", "scene.window: expected 0 to 1000, got -1"),
+        ("scene.lambda_depth=-0.1", "scene.lambda_depth: expected 0 to 1000, got -0.1"),
+        ("scene.lr_center=-1", "scene.lr_center: expected 0 to 1 m, got -1.0"),
+        ("scene.max_depth_error=0.01", "scene.min_depth_error: expected at most scene.max_depth_error = 0.01 m"),
+        ("occupancy.log_odds_miss=0", "occupancy.log_odds_miss: expected -10 to -0.01, got 0.0"),
+        ("occupancy.log_odds_hit=-1", "occupancy.log_odds_hit: expected 0.01 to 10, got -1.0"),
         ("occupancy.log_odds_limit=0.8", "occupancy.log_odds_limit: expected above 0.847, the log-odds of"),
-        ("occupancy.min_range=-1", "occupancy.min_range: expected 0 or more, got -1"),
-        ("occupancy.max_range=0.2", "occupancy.max_range: expected above occupancy.min_range = 0.2, got 0.2"),
-        ("field.voxel=0", "field.voxel: expected above 0, got 0"),
-        ("field.length_scale=-1", "field.length_scale: expected above 0, got -1; see docs/config.md"),
-        ("field.noise=-1e-6", "field.noise: expected 0 or more, got -1e-06"),
+        ("occupancy.min_range=-1", "occupancy.min_range: expected 0 to 10 m, got -1.0"),
+        ("occupancy.max_range=0.2", "occupancy.max_range: expected above occupancy.min_range = 0.2 m, got 0.2"),
+        ("field.voxel=0", "field.voxel: expected 1e-06 to 10 m, got 0.0"),
+        ("field.length_scale=-1", "field.length_scale: expected 1e-10 to 1000 m, got -1.0; see docs/config.md"),
+        ("field.noise=-1e-6", "field.noise: expected 0 to 1, got -1e-06"),
         (
             "occupancy.free_below=0.9",
             "occupancy.free_below: expected at most occupancy.occupied_above = 0.7, got 0.9",
@@ -92,6 +92,75 @@ def test_files_that_are_missing_or_no_toml_are_named(tmp_path: Path) -> None:
     (tmp_path / "flat.toml").write_text("scene = 3\n")
     with pytest.raises(UsageError, match="scene: expected a table, got 3"):
         load_config(tmp_path / "flat.toml", [])
+
+
+@pytest.mark.parametrize(
+    ("assignments", "words"),
+    [
+        (["scene.min_radius=0.03"], "scene.min_radius: expected at most scene.max_radius = 0.02 m, got 0.03"),
+        (["occupancy.voxel=0.01"], "occupancy.voxel: expected at least scene.max_radius = 0.02 m, got 0.01"),
+        (
+            ["control.barrier_gain=101"],
+            "control.barrier_gain: expected at most 1 / control.period = 100 1/s, got 101.0",
+        ),
+        (
+            ["control.period=0.05", "control.pose_gain=21", "planner.follow_gain=1", "control.barrier_gain=1"],
+            "pose_gain",
+        ),
+        (
+            ["control.posture_gain=200"],
+            "control.posture_gain: expected at most 1 / control.period = 100 1/s, got 200.0",
+        ),
+        (
+            ["planner.follow_gain=200"],
+            "planner.follow_gain: expected at most 1 / control.period = 100 1/s, got 200.0",
+        ),
+        (["control.self_slack_cost=10"], "control.self_slack_cost: expected at least control.slack_cost = 1000"),
+        (
+            ["control.period=0.1", "control.max_time=0.05", "planner.follow_gain=1"],
+            "control.max_time: expected at least",
+        ),
+        (["planner.shortest=2"], "planner.shortest: expected at most planner.reach = 1.5 rad, got 2.0"),
+    ],
+)
+def test_values_that_contradict_each_other_are_named(assignments: list[str], words: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        load_config(None, assignments)
+    assert words in str(refused.value)
+
+
+def test_values_may_pass_each_other_on_the_way(tmp_path: Path) -> None:
+    path = tmp_path / "wide.toml"
+    path.write_text("[scene]\nmin_radius = 0.03\n")
+    config = load_config(path, ["scene.max_radius=0.05", "occupancy.voxel=0.05"])
+    assert (config.scene.min_radius, config.scene.max_radius) == (0.03, 0.05)
+
+
+@pytest.mark.parametrize(
+    "text", ["nan", "inf", "-inf", "1e308", "-1e308", "-0.05", "'0.05'", "[0.1]", "0x" + "f" * 5000]
+)
+def test_a_file_and_an_assignment_are_refused_alike(tmp_path: Path, text: str) -> None:
+    (tmp_path / "bad.toml").write_text(f"[control]\nmargin = {text}\n")
+    for path, assignments in ((tmp_path / "bad.toml", []), (None, [f"control.margin={text}"])):
+        with pytest.raises(UsageError, match=r"control\.margin: expected (float, )?0 to 1 m, got "):
+            load_config(path, assignments)
+
+
+def test_a_section_is_checked_however_it_is_made() -> None:
+    with pytest.raises(UsageError, match=r"control.max_linear_speed: expected 0.0001 to 20 m/s, got -1"):
+        replace(Config().control, max_linear_speed=-1.0)
+    with pytest.raises(UsageError, match=r"occupancy.rule: expected observed or literal, got 'bogus'"):
+        replace(Config().occupancy, rule="bogus")
+
+
+def test_every_key_is_declared_with_a_reason_and_a_range_around_its_default() -> None:
+    for section in fields(Config):
+        values = getattr(Config(), section.name)
+        assert values.section == section.name
+        for key, declared in values.declared.items():
+            assert declared.reason, key
+            assert declared.holds(getattr(values, key)), key
+            assert not any(declared.holds(bad) for bad in (float("nan"), float("inf"), 1e308, -1e308)), key
 
 
 def test_every_number_is_of_one_plain_type() -> None:

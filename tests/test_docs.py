@@ -21,7 +21,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_
 CODE = re.compile(r"`([^`\n]+)`")
 PLACE = re.compile(r"([\w/]+\.(?:py|h|cpp))(?:: (.+))?")
 EXAMPLE = ROOT / "docs" / "replay_example.md"
-SETTING = re.compile(r"((?:scene|gaussians|occupancy|field|control)\.\w+)(?: = (.+))?")
+SETTING = re.compile(r"((?:scene|gaussians|occupancy|human|field|control|planner|verdict)\.\w+)(?: = (.+))?")
 
 
 def generated() -> dict[str, str]:

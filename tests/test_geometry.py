@@ -31,6 +31,14 @@ def test_rotations_agree_with_scipy_both_ways(index: int) -> None:
     assert np.allclose(rotation_from_quat(quat), R, atol=1e-12)
 
 
+@pytest.mark.parametrize("length", [5e-324, 1e-320, 2e-160, 1e-154, 1e-30, 3.0, 1e160, 1e308])
+def test_a_quaternion_of_any_length_is_a_rotation(length: float) -> None:
+    whole = rotation_from_quat([length, 0, -length, 0])
+    assert np.allclose(whole, rotation_from_quat([1, 0, -1, 0]), atol=1e-15)
+    R = rotation_from_quat([0.3 * length, 0.0, 0.4 * length, length])
+    assert np.allclose(R.T @ R, np.eye(3), atol=1e-15) and np.linalg.det(R) == pytest.approx(1.0)
+
+
 def test_inverse_undoes() -> None:
     T = transform_from([0.1, -2.0, 3.0], [0.1, 0.2, -0.3, 0.9])
     points = RNG.normal(size=(7, 3))

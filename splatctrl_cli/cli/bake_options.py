@@ -7,17 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import add_config, add_gates, add_output
+from splatctrl_cli.cli.numbers import MAX_SECONDS, real, setting, words
+from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.config import Config, FieldConfig
+    from splatctrl_cli.config import Config
     from splatctrl_cli.records import Box, Label, SplatSet
 
 # As the rooms have them, which --help does not wait for; a test holds these to those.
-DISTANCES = ("safe", "safe_gpdf", "hard", "se", "gpdf")
-WEIGHTS = ("rowsum", "voxel", "cg")
-UNKNOWN = ("free", "obstacle", "nan")
-PROBABILITIES = ("calibrated", "paper")
 CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label", "hard", "se", "gpdf")
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
 FORMATS = ("npz", "vti", "nrrd", "vdb", "curobo", "moveit", "ply", "obj", "stl")
@@ -28,7 +26,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Every option of the subcommand but those that all commands have."""
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a folder that reconstruct wrote, or a splats.ply")
     add_output(parser, default="field", what="folder to write: the grid, field.json, report/, run.json")
-    parser.add_argument("--at", type=float, metavar="SECONDS", help="the scene as known that long after its start")
+    parser.add_argument(
+        "--at",
+        type=real(-MAX_SECONDS, MAX_SECONDS, "s"),
+        metavar="SECONDS",
+        help="the scene as known that long after its start",
+    )
     parser.add_argument(
         "--include",
         default="human",
@@ -49,7 +52,7 @@ def _add_grid(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--urdf", type=Path, help="cover the reach of this robot around its base, without --box")
     parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its spheres (default: the URDF's own)")
-    parser.add_argument("--voxel", type=float, metavar="M", help="cell size (field.voxel)")
+    parser.add_argument("--voxel", type=setting(FieldConfig, "voxel"), metavar="M", help="cell size (field.voxel)")
     parser.add_argument(
         "--channels",
         metavar="NAME,...",
@@ -63,17 +66,26 @@ def _add_grid(parser: argparse.ArgumentParser) -> None:
 def _add_field(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--distance",
-        choices=DISTANCES,
+        choices=words(FieldConfig, "distance"),
         help="what sdf is: min(se, hard), min(gpdf, hard), the exact distance, either kernel field (field.distance)",
     )
     parser.add_argument(
-        "--weights", choices=WEIGHTS, help="of the kernel field: row sums, voxels, the full GP (field.weights)"
+        "--weights",
+        choices=words(FieldConfig, "weights"),
+        help="of the kernel field: row sums, voxels, the full GP (field.weights)",
     )
-    parser.add_argument("--length-scale", type=float, metavar="M", help="l of the kernel (field.length_scale)")
-    parser.add_argument("--unknown", choices=UNKNOWN, help="what never-seen space counts as (field.unknown)")
+    parser.add_argument(
+        "--length-scale",
+        type=setting(FieldConfig, "length_scale"),
+        metavar="M",
+        help="l of the kernel (field.length_scale)",
+    )
+    parser.add_argument(
+        "--unknown", choices=words(FieldConfig, "unknown"), help="what never-seen space counts as (field.unknown)"
+    )
     parser.add_argument(
         "--probability",
-        choices=PROBABILITIES,
+        choices=words(FieldConfig, "probability"),
         help="bake the channel probability, of collision, in this form (field.probability)",
     )
 

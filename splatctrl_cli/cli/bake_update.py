@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.field.layout import GridLayout
     from splatctrl_cli.records import Box, DistanceGrid
 
-NOT_COMPARED = ("voxel", "padding")  # voxel is compared with the grid's
+NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
+from splatctrl_cli.cli.numbers import several
 from splatctrl_cli.cli.robot_options import add_lock, locked_joints
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
@@ -104,11 +105,8 @@ def _robot(args: argparse.Namespace) -> "RobotModel | None":
     return RobotModel.from_urdf(args.urdf, args.spheres, T_world_base=T_world_base, locked=locked_joints(args.lock))
 
 
-def _seven(text: str) -> list[float]:
-    try:
-        values = [float(value) for value in text.split(",")]
-    except ValueError:
-        values = []
+def _seven(text: str) -> tuple[float, ...]:
+    values = several(text)
     if len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
         raise UsageError(f"--base {text}: expected X,Y,Z,QX,QY,QZ,QW with a unit quaternion")
     return values

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.cli.numbers import MAX_SEED, whole
 from splatctrl_cli.evaluate.gates import gate
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from splatctrl_cli.evaluate.verdict import Verdict
 
 MAX_REASONS = 10  # printed; --json and summary.json have all
-MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
 Subparsers = Any  # argparse keeps its subparser type private
 
 
@@ -46,14 +45,17 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="one setting (repeatable)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
+    parser.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)")
     add_threads(parser)
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
     """``--threads``."""
     parser.add_argument(
-        "--threads", type=int, default=0, help="threads, at most 16 or one per core (default: one per core)"
+        "--threads",
+        type=whole(0, 1024),
+        default=0,
+        help="threads, at most 16 or one per core (default: one per core)",
     )
 
 
@@ -70,13 +72,9 @@ def add_gates(parser: argparse.ArgumentParser) -> None:
 
 
 def configured(args: argparse.Namespace) -> "Config":
-    """The configuration that --config and --set give. Raises UsageError for it, or a seed or threads out of range."""
+    """The configuration that --config and --set give."""
     from splatctrl_cli.config import load_config
 
-    if args.threads < 0:
-        raise UsageError(f"--threads: expected 0 or more, got {args.threads}")
-    if not 0 <= args.seed <= MAX_SEED:
-        raise UsageError(f"--seed: expected 0 to {MAX_SEED}, got {args.seed}")
     return load_config(args.config, args.set)
 
 

@@ -5,6 +5,7 @@ Nothing heavy is imported here or at the top of a subcommand's file: ``splatctrl
 
 import argparse
 import importlib
+import io
 import os
 import sys
 import traceback
@@ -50,7 +51,18 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
+    """Run the command line and return its exit code; 6 where stdout was closed and there was something to print."""
+    lost = _stand_in_for_closed_streams()
+    code = _run(argv)
+    if lost.is_written and code not in {70, 130}:
+        print(
+            "splatctrl: stdout: closed, so the result was not printed; files are as they should be", file=sys.stderr
+        )
+        return 6
+    return code
+
+
+def _run(argv: Sequence[str] | None) -> int:
     verbose = 0
     refuse_endless_files()
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
@@ -59,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         words = sys.argv[1:] if argv is None else argv
         args = build_parser(words).parse_args(words)
         verbose = args.verbose
-        _keep_inputs(args)
+        _check_output(args)
         code: int = args.run(args)
         sys.stdout.flush()
         return code
@@ -85,6 +97,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(error, f"internal error: {type(error).__name__}: {error}; please report it", 70, verbose)
 
 
+class _Lost(io.TextIOBase):
+    """Stands where a stream was closed before the program began (``>&-``), and knows whether it was written to."""
+
+    is_written = False
+
+    def write(self, text: str) -> int:
+        """Take the text to nowhere."""
+        self.is_written = True
+        return len(text)
+
+
+def _stand_in_for_closed_streams() -> _Lost:
+    """Replace stdout or stderr where it is closed, and keep its number from the next file that is opened.
+
+    Returns what stands for stdout; nothing is ever written to it where stdout is open.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+    lost = _Lost()
+    sys.stdout = sys.stdout or lost
+    sys.stderr = sys.stderr or _Lost()
+    return lost
+
+
 def _fail_to_read_or_write(error: OSError, verbose: int) -> int:
     from splatctrl_cli.io.output import is_write_failure
 
@@ -95,18 +134,22 @@ def _fail_to_read_or_write(error: OSError, verbose: int) -> int:
     return _fail(error, line, 4, verbose)
 
 
-def _keep_inputs(args: argparse.Namespace) -> None:
-    """Refuse an output that is an input, or a folder that holds one: --force would replace it."""
+def _check_output(args: argparse.Namespace) -> None:
+    """Refuse an output that cannot be written, or that is or holds an input, itself or its partial."""
     out = getattr(args, "out", None)
     if out is None:
         return
+    from splatctrl_cli.io.output import PARTIAL, check_can_be_written
+
+    check_can_be_written(out)
     target = Path(os.path.realpath(out))  # resolve() raises RuntimeError for a link to itself
-    for name, given in vars(args).items():
-        if name == "out" or not isinstance(given, Path):
-            continue
-        source = Path(os.path.realpath(given))
-        if source == target or target in source.parents:
-            raise UsageError(f"{out}: would replace the input {given}", remedy="give another --out")
+    targets = {target, target.with_name(target.name + PARTIAL)} if target.name else {target}
+    values = [value for name, value in vars(args).items() if name != "out"]
+    for given in [each for value in values for each in (value if isinstance(value, list) else [value])]:
+        if isinstance(given, Path):
+            source = Path(os.path.realpath(given))
+            if targets & {source, *source.parents}:
+                raise UsageError(f"{out}: would replace the input {given}", remedy="give another --out")
 
 
 def _fail(error: BaseException, line: str, code: int, verbose: int) -> int:

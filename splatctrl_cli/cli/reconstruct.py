@@ -14,8 +14,10 @@ from splatctrl_cli.cli.common import (
     configured,
     table,
 )
+from splatctrl_cli.cli.numbers import MAX_LENGTH, real, setting
 from splatctrl_cli.cli.score_reference import add_scan, open_dtu, open_held_out, refuse_scan_options
 from splatctrl_cli.cli.source_options import add_source, source_options
+from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
@@ -54,7 +56,9 @@ def register(subparsers: Subparsers) -> None:
         help="a fixed budget of isotropic splats, or 3D Gaussian splatting: a baseline for views of a scene that "
         "stands still, which grows as it likes and has no distances (default: budget)",
     )
-    parser.add_argument("--max-splats", type=int, metavar="N", help="budget of splats (default: 5000)")
+    parser.add_argument(
+        "--max-splats", type=setting(SceneConfig, "max_splats"), metavar="N", help="budget of splats (default: 5000)"
+    )
     parser.add_argument("--urdf", type=Path, metavar="FILE", help="the robot: labels its splats, sets the workspace")
     parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its collision spheres")
     parser.add_argument(
@@ -79,7 +83,7 @@ def add_disagreement(parser: argparse._ActionsContainer) -> None:
     """``--max-pose-jump`` and ``--allow-disagreement``: what a log is let off with."""
     parser.add_argument(
         "--max-pose-jump",
-        type=float,
+        type=real(1e-3, MAX_LENGTH, "m"),
         default=DEFAULT_POSE_JUMP,
         metavar="M",
         help="how far a camera may move between frames less than a second apart, in metres (default: 1)",
@@ -156,8 +160,6 @@ def _config(args: argparse.Namespace) -> "Config":
     config = configured(args)
     if args.max_splats is None:
         return config
-    if args.max_splats < 1:
-        raise UsageError(f"--max-splats: expected at least 1, got {args.max_splats}")
     return replace(config, scene=replace(config.scene, max_splats=args.max_splats))
 
 

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
+from splatctrl_cli.cli.numbers import MAX_SECONDS, real
 from splatctrl_cli.cli.replay_options import (
     MODES,
     POSE,
@@ -15,7 +16,6 @@ from splatctrl_cli.cli.replay_options import (
     add_worst_frames,
     pose,
     replay_request,
-    seconds,
 )
 from splatctrl_cli.cli.source_options import add_source
 
@@ -52,11 +52,15 @@ def register(subparsers: Subparsers) -> None:
     add_goal(parser)
     parser.add_argument("--truth", type=Path, metavar="FILE", help="truth.json of a simulated log")
     parser.add_argument(
-        "--max-unknown", type=float, default=0.05, metavar="SHARE", help="never-seen share allowed (default: 0.05)"
+        "--max-unknown",
+        type=real(0, 1),
+        default=0.05,
+        metavar="SHARE",
+        help="never-seen share allowed (default: 0.05)",
     )
     parser.add_argument(
         "--max-map-age",
-        type=seconds,
+        type=real(1e-3, MAX_SECONDS, "s"),
         default=1.0,
         metavar="S",
         help="a scene older than this is no evidence (default: 1)",

@@ -1,14 +1,15 @@
 """The options of ``splatctrl replay``, and the request that they make."""
 
 import argparse
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import configured
+from splatctrl_cli.cli.numbers import MAX_SECONDS, real, several, whole
 from splatctrl_cli.cli.reconstruct import add_disagreement
 from splatctrl_cli.cli.robot_options import locked_joints
 from splatctrl_cli.cli.source_options import source_options
+from splatctrl_cli.config.declared import shown
 
 if TYPE_CHECKING:
     from splatctrl_cli.jobs.replay_request import ReplayRequest
@@ -63,20 +64,12 @@ def add_lockstep(parser: argparse.ArgumentParser, scene: argparse._ActionsContai
     )
     parser.add_argument(
         "--latency",
-        type=_latency,
+        type=real(0, MAX_SECONDS, "s"),
         default=0.0,
         metavar="S",
         help="a map is known this long after its frames' stamp (--scene, --lockstep; default: 0)",
     )
     add_disagreement(parser.add_argument_group("with --lockstep"))
-
-
-def _latency(text: str) -> float:
-    """Seconds, not below zero, for argparse."""
-    (value, *more) = numbers(text)
-    if more or value < 0:
-        raise argparse.ArgumentTypeError(f"expected seconds not below 0, got {text!r}")
-    return value
 
 
 def add_baseline(parser: argparse.ArgumentParser) -> None:
@@ -140,7 +133,10 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
         help="start at this time of the log [s], or first-map: where the scene is first known",
     )
     parser.add_argument(
-        "--re-anchor", type=seconds, metavar="S", help="put the arm back into the logged posture every S seconds"
+        "--re-anchor",
+        type=real(1e-3, MAX_SECONDS, "s"),
+        metavar="S",
+        help="put the arm back into the logged posture every S seconds",
     )
 
 
@@ -154,7 +150,7 @@ def add_golden(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--golden-tolerance",
-        type=float,
+        type=real(0, 100, "rad/s"),
         default=GOLDEN_TOLERANCE,
         metavar="RAD/S",
         help=f"by more than this, per joint (default: {GOLDEN_TOLERANCE:g})",
@@ -177,18 +173,11 @@ def add_worst_frames(parser: argparse.ArgumentParser) -> None:
     """``--worst-frames``."""
     parser.add_argument(
         "--worst-frames",
-        type=_count,
+        type=whole(0, 1000),
         default=3,
         metavar="N",
         help="write worst_1.png ...: camera images of the N events of least clearance (default: 3)",
     )
-
-
-def _count(text: str) -> int:
-    """A whole number from 0, for argparse."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0, got {text!r}")
-    return int(text)
 
 
 def add_robot_geometry(parser: argparse.ArgumentParser) -> None:
@@ -208,13 +197,15 @@ def add_robot_geometry(parser: argparse.ArgumentParser) -> None:
 
 def numbers(text: str) -> tuple[float, ...]:
     """Finite numbers joined by commas, for argparse."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected numbers joined by commas, got {text!r}") from None
-    if not all(math.isfinite(value) for value in values):
-        raise argparse.ArgumentTypeError(f"expected finite numbers, got {text!r}")
+    values = several(text)
+    if not values:
+        raise argparse.ArgumentTypeError(f"expected finite numbers joined by commas, up to 1e6, got {shown(text)}")
     return values
+
+
+def _start(text: str) -> float | str:
+    """Seconds not below zero, or the time of the first map, for argparse."""
+    return text if text == "first-map" else real(0, MAX_SECONDS, "s or first-map")(text)
 
 
 def pose(text: str) -> tuple[float, ...]:
@@ -225,21 +216,3 @@ def pose(text: str) -> tuple[float, ...]:
         return checked_pose(numbers(text))
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _start(text: str) -> float | str:
-    """Seconds not below zero, or the time of the first map, for argparse."""
-    if text == "first-map":
-        return text
-    values = numbers(text)
-    if len(values) != 1 or values[0] < 0:
-        raise argparse.ArgumentTypeError(f"expected seconds not below 0, or first-map, got {text!r}")
-    return values[0]
-
-
-def seconds(text: str) -> float:
-    """Seconds above zero, for argparse."""
-    values = numbers(text)
-    if len(values) != 1 or values[0] <= 0:
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
-    return values[0]

@@ -4,9 +4,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import MAX_SEED, Console, Subparsers, add_command, add_gates, add_output
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_gates, add_output
+from splatctrl_cli.cli.numbers import MAX_SEED, real, whole
 from splatctrl_cli.cli.robot_options import add_lock, add_robot, locked_joints
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
 if TYPE_CHECKING:
@@ -40,21 +41,24 @@ def _register_spheres(actions: Subparsers) -> None:
     number = parser.add_mutually_exclusive_group()
     number.add_argument(
         "--max-spheres",
-        type=int,
+        type=whole(1, 100_000),
         metavar="N",
         help=f"spheres over all links, sticking out as little as that allows (default: {DEFAULT_SPHERES})",
     )
     number.add_argument(
-        "--max-protrusion", type=float, metavar="M", help="or: the fewest found that stick out no more [m]"
+        "--max-protrusion",
+        type=real(1e-6, 10, "m"),
+        metavar="M",
+        help="or: the fewest found that stick out no more [m]",
     )
     parser.add_argument(
         "--max-deficit",
-        type=float,
+        type=real(0, 10, "m"),
         default=0.0,
         metavar="M",
         help="how far surface points may stay outside all spheres [m] (default: 0, all are covered)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the greedy covers (default: 0)")
+    parser.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of the greedy covers (default: 0)")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the spheres over the collision shapes")
     add_gates(parser)
 
@@ -76,12 +80,16 @@ def _register_pairs(actions: Subparsers) -> None:
     add_lock(parser)
     parser.add_argument("--srdf", type=Path, metavar="FILE", help="leave out what its disable_collisions name")
     parser.add_argument(
-        "--postures", type=int, default=2000, metavar="N", help="without --srdf: postures sampled (default: 2000)"
+        "--postures",
+        type=whole(1, 10_000_000),
+        default=2000,
+        metavar="N",
+        help="without --srdf: postures sampled (default: 2000)",
     )
     parser.add_argument(
         "--drop-never", action="store_true", help="leave out what never comes near in the sample (a guess, no proof)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the postures (default: 0)")
+    parser.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of the postures (default: 0)")
 
 
 def _register_info(actions: Subparsers) -> None:
@@ -102,7 +110,6 @@ def run_spheres(args: argparse.Namespace) -> int:
 
     console = Console(args)
     check_gate_names(args.require, METRICS)
-    _check_seed(args.seed)
     num_spheres = DEFAULT_SPHERES if args.max_spheres is None and args.max_protrusion is None else args.max_spheres
     options = FitOptions(
         max_spheres=num_spheres, max_protrusion=args.max_protrusion, max_deficit=args.max_deficit, seed=args.seed
@@ -168,9 +175,6 @@ def run_pairs(args: argparse.Namespace) -> int:
     from splatctrl_cli.robot.srdf import read_srdf
 
     console = Console(args)
-    _check_seed(args.seed)
-    if args.postures < 1:
-        raise UsageError(f"--postures: expected 1 or more, got {args.postures}")
     model = RobotModel.from_urdf(args.urdf, args.spheres, locked=locked_joints(args.lock))
     disabled, foreign = ((), ()) if args.srdf is None else read_srdf(args.srdf, model.urdf)
     found = self_collision_pairs(
@@ -223,11 +227,6 @@ def _no_spheres() -> "SphereSet":
     from splatctrl_cli.records import SphereSet
 
     return SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
-
-
-def _check_seed(seed: int) -> None:
-    if not 0 <= seed <= MAX_SEED:
-        raise UsageError(f"--seed: expected 0 to {MAX_SEED}, got {seed}")
 
 
 def _comments(urdf: Path, report: "CoverageReport") -> list[str]:

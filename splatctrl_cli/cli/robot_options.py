@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from splatctrl_cli.cli.numbers import several
 from splatctrl_cli.errors import UsageError
 
 
@@ -39,8 +40,8 @@ def locked_joints(assignments: list[str]) -> dict[str, float]:
     locked = {}
     for assignment in assignments:
         name, _, text = assignment.partition("=")
-        try:
-            locked[name] = float(text)
-        except ValueError:
-            raise UsageError(f"--lock {assignment}: expected JOINT=VALUE, got {text!r} for the value") from None
+        value = several(text)
+        if len(value) != 1:
+            raise UsageError(f"--lock {assignment}: expected JOINT=VALUE, got {text!r} for the value")
+        locked[name] = value[0]
     return locked

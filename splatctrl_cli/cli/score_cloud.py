@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatctrl_cli.cli.numbers import real
 from splatctrl_cli.cli.score_views import rendered
 from splatctrl_cli.errors import UsageError
 
@@ -62,14 +63,21 @@ def add_cloud(parser: argparse.ArgumentParser) -> None:
         help="DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where its own evaluation does",
     )
     group.add_argument(
-        "--cloud-unit", type=float, metavar="M", help="metres per unit (default: 0.001 with --dtu, else 1)"
+        "--cloud-unit",
+        type=real(1e-9, 1e3, "m"),
+        metavar="M",
+        help="metres per unit (default: 0.001 with --dtu, else 1)",
     )
     group.add_argument(
-        "--cloud-max", type=float, default=0.02, metavar="M", help="farther points count in a share, not in a mean"
+        "--cloud-max",
+        type=real(1e-6, 1e3, "m"),
+        default=0.02,
+        metavar="M",
+        help="farther points count in a share, not in a mean",
     )
     group.add_argument(
         "--cloud-spacing",
-        type=float,
+        type=real(1e-6, 1e3, "m"),
         default=0.0002,
         metavar="M",
         help="both sides are thinned to points this far apart (default: 0.0002)",
@@ -77,7 +85,7 @@ def add_cloud(parser: argparse.ArgumentParser) -> None:
 
 
 def cloud_settings(args: argparse.Namespace) -> CloudSettings | None:
-    """None where no cloud is given. Raises UsageError for a length that is not above 0."""
+    """None where no cloud is given. Raises UsageError for options that mean nothing here."""
     if args.cloud is None:
         for name in ("unit", "masks"):
             if getattr(args, f"cloud_{name}") is not None:
@@ -87,9 +95,6 @@ def cloud_settings(args: argparse.Namespace) -> CloudSettings | None:
         what = "--cloud-masks" if args.cloud_masks is not None else f"--cloud {args.cloud}"
         raise UsageError(f"{what}: a folder of scans, only with --dtu", remedy="give the file of this recording")
     unit = args.cloud_unit if args.cloud_unit is not None else (0.001 if args.dtu is not None else 1.0)
-    for name, value in (("unit", unit), ("max", args.cloud_max), ("spacing", args.cloud_spacing)):
-        if not 0 < value < float("inf"):
-            raise UsageError(f"--cloud-{name}: expected a length above 0, got {value:g}")
     return CloudSettings(
         path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing, masks=args.cloud_masks
     )

@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, configured, table
+from splatctrl_cli.cli.numbers import setting, whole
 from splatctrl_cli.cli.score_cloud import cloud_settings
 from splatctrl_cli.cli.score_fit_picture import draw_methods
 from splatctrl_cli.cli.score_reference import is_folder_of_views, words
 from splatctrl_cli.cli.score_report import COLUMNS, cell, protocol_lines
 from splatctrl_cli.cli.score_scans import masks_of_scan
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.map import MOST_ITERATIONS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
@@ -77,10 +80,16 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
         f" methods, then score them (default protocol of scans: {PROTOCOL})",
     )
     group.add_argument(
-        "--fit-iterations", type=int, metavar="N", help="of each method (default: those of the configuration, 2300)"
+        "--fit-iterations",
+        type=whole(1, MOST_ITERATIONS),
+        metavar="N",
+        help="of each method (default: those of the configuration, 2300)",
     )
     group.add_argument(
-        "--fit-splats", type=int, metavar="N", help="the budget, and Gaussians to begin with (default: 10000)"
+        "--fit-splats",
+        type=setting(SceneConfig, "max_splats"),
+        metavar="N",
+        help="the budget, and Gaussians to begin with (default: 10000)",
     )
 
 

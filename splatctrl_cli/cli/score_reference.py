@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console
+from splatctrl_cli.cli.numbers import whole
 from splatctrl_cli.cli.source_options import source_options
 from splatctrl_cli.errors import InputError, UsageError
 
@@ -57,7 +58,7 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--downscale",
-        type=int,
+        type=whole(1, 64),
         metavar="N",
         help="make images of --dtu N times smaller (default: down to the size of the protocol, if a whole factor)",
     )

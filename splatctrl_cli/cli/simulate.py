@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
+from splatctrl_cli.cli.numbers import MAX_SEED, real, whole
 
 if TYPE_CHECKING:
     from splatctrl_cli.simulate.recording import Recording, RecordingOptions
@@ -17,13 +18,24 @@ def register(subparsers: Subparsers) -> None:
         subparsers, "simulate", run, summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth"
     )
     add_output(parser, default="simulated", what="folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the noise and of --human-arm (default: 0)")
     parser.add_argument(
-        "--duration", type=float, metavar="S", help="length in seconds (default: 7, with --human-arm 24)"
+        "--seed", type=whole(0, MAX_SEED), default=0, help="seed of the noise and of --human-arm (default: 0)"
     )
-    parser.add_argument("--fps", type=float, default=5.0, metavar="HZ", help="frames a second (default: 5)")
-    parser.add_argument("--width", type=int, default=320, metavar="PX", help="image width (default: 320)")
-    parser.add_argument("--height", type=int, default=240, metavar="PX", help="image height (default: 240)")
+    parser.add_argument(
+        "--duration",
+        type=real(0.5, 600, "s"),
+        metavar="S",
+        help="length in seconds (default: 7, with --human-arm 24)",
+    )
+    parser.add_argument(
+        "--fps", type=real(0.1, 60, "Hz"), default=5.0, metavar="HZ", help="frames a second (default: 5)"
+    )
+    parser.add_argument(
+        "--width", type=whole(16, 4096, "px"), default=320, metavar="PX", help="image width (default: 320)"
+    )
+    parser.add_argument(
+        "--height", type=whole(16, 4096, "px"), default=240, metavar="PX", help="image height (default: 240)"
+    )
     parser.add_argument(
         "--noise", choices=("none", "realsense"), default="realsense", help="depth noise (default: realsense)"
     )

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatctrl_cli.cli.numbers import real, several
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -45,9 +46,15 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         help="mono8 masks of a camera's colour images, not 0 where they show a person (repeatable)",
     )
     group.add_argument("--world-frame", metavar="FRAME", help="tf frame of poses (default: root of the tf tree)")
-    group.add_argument("--depth-scale", type=float, metavar="M", help="metres per count of depth (default: 0.001)")
     group.add_argument(
-        "--pairing-tolerance", type=float, default=0.02, metavar="S", help="colour to depth, seconds (default: 0.02)"
+        "--depth-scale", type=real(1e-9, 1e3, "m"), metavar="M", help="metres per count of depth (default: 0.001)"
+    )
+    group.add_argument(
+        "--pairing-tolerance",
+        type=real(0, 3600, "s"),
+        default=0.02,
+        metavar="S",
+        help="colour to depth, seconds (default: 0.02)",
     )
     group.add_argument(
         "--stamps",
@@ -69,10 +76,6 @@ def source_options(args: argparse.Namespace) -> "SourceOptions":
     """What `add_source` parsed. Raises UsageError for a value of the wrong form."""
     from splatctrl_cli.io.options import SourceOptions
 
-    if args.depth_scale is not None and not args.depth_scale > 0:
-        raise UsageError(f"--depth-scale {args.depth_scale}: expected a positive number")
-    if not args.pairing_tolerance >= 0:
-        raise UsageError(f"--pairing-tolerance {args.pairing_tolerance}: expected seconds")
     return SourceOptions(
         world_frame=args.world_frame,
         cameras=_names(args.cameras),
@@ -128,10 +131,7 @@ def _pose(text: str) -> tuple[str, tuple[float, ...]]:
     name, _, rest = text.partition("=")
     if name and rest == "identity":
         return name, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    try:
-        values = tuple(float(value) for value in rest.split(","))
-    except ValueError:
-        values = ()
+    values = several(rest)
     if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
         raise UsageError(
             f"--camera-pose {text}: expected NAME=X,Y,Z,QX,QY,QZ,QW with a unit quaternion, or NAME=identity"
@@ -155,10 +155,7 @@ def _pose_topic(text: str) -> tuple[str, "PoseTopic"]:
 
 def _lens(text: str) -> tuple[str, tuple[float, ...]]:
     name, _, rest = text.partition("=")
-    try:
-        values = tuple(float(value) for value in rest.split(","))
-    except ValueError:
-        values = ()
+    values = several(rest)
     if not name or len(values) != 4 or not min(values[:2]) > 0:
         raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels")
     return name, values

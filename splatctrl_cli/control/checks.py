@@ -7,7 +7,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.records import DistanceField, Float64
 
 
@@ -17,21 +17,6 @@ class StaticViolation:
 
     sphere: str
     clearance: float
-
-
-def check_config(config: ControlConfig) -> None:
-    """Raise UsageError for a period, gain or weight that no controller can run with."""
-    if not config.period > 0:
-        raise UsageError(f"control.period: expected above 0 s, got {config.period:g}")
-    if not 0 < config.barrier_gain * config.period <= 1:
-        raise UsageError(
-            f"control.barrier_gain: expected gain * period in (0, 1], got {config.barrier_gain * config.period:g}",
-            remedy="lower control.barrier_gain or control.period",
-        )
-    weights = ("weight_linear", "weight_angular", "weight_kinematics", "weight_slack", "posture_weight")
-    for name in (*weights, "slack_cost", "self_slack_cost"):
-        if not getattr(config, name) > 0:
-            raise UsageError(f"control.{name}: expected above 0, got {getattr(config, name):g}")
 
 
 def check_model(model: ArmModel) -> None:

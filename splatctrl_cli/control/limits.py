@@ -119,8 +119,4 @@ def _acceleration(value: float | tuple[float, ...], joints: Sequence[str]) -> Fl
         )
     if np.all(each == 0):
         return None
-    if not np.all(each > 0):
-        raise UsageError(
-            f"control.max_acceleration: expected above 0 for every joint, or 0 for no limit, got {min(each):g}"
-        )
     return np.broadcast_to(each, (len(joints),)).copy()

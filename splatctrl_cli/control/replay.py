@@ -12,7 +12,6 @@ from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.checks import (
     StaticViolation,
-    check_config,
     check_free,
     check_goal,
     check_within_limits,
@@ -177,7 +176,6 @@ def closed_loop(
     record: where the steps are kept, None for memory. Raises InputError for a start outside the limits or a goal out
     of reach, NotEvaluableError for a start in collision or outside the field.
     """
-    check_config(config)
     q = checked_posture(model, task.start, what="start")
     check_within_limits(model, q, config.limit_tolerance)
     for waypoint in (*task.via, Waypoint(T_world_goal=task.T_world_goal)):

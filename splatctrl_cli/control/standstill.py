@@ -16,6 +16,7 @@ from splatctrl_cli.records import Bool, Box, Float64
 DistanceToPeople = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""
 
+MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
 RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
 EIGHTHS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
@@ -38,8 +39,10 @@ class Zone:
     resume: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.stop <= self.resume:
-            raise UsageError(f"zone: expected 0 < stop <= resume, got {self.stop:g} and {self.resume:g} m")
+        if not 0 < self.stop <= self.resume <= MAX_RESUME:
+            raise UsageError(
+                f"zone: expected 0 < stop <= resume <= {MAX_RESUME:g}, got {self.stop:g} and {self.resume:g} m"
+            )
 
     def is_entered(
         self, model: ArmModel, q: Float64, stamp_ns: int, people: DistanceToPeople, *, is_held: bool

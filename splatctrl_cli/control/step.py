@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import tasks
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.checks import check_config, check_coverage, check_model, checked_posture
+from splatctrl_cli.control.checks import check_coverage, check_model, checked_posture
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.presets import PAPER, PrintedTask, solve_printed
@@ -109,9 +109,8 @@ class QpIkController:
     ) -> None:
         """home (J,) [rad] is leant to where the task leaves the arm free (default: the middle of the limits).
 
-        Raises UsageError for numbers, InputError for a robot, that no controller can run with.
+        Raises InputError for a robot that no controller can run with.
         """
-        check_config(config)
         check_model(model)
         check_coverage(model, config)
         self._model, self._config, self._frame = model, config, frame

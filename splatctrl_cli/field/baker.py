@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.distance import GpdfField, SeField, SphereField, checked_distance
+from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
 from splatctrl_cli.field.layout import HALF_DIAGONAL, GridLayout
 from splatctrl_cli.field.observed import observed_planes
 from splatctrl_cli.field.probability import make_probability
@@ -65,7 +65,7 @@ class Baker:
         self.labels = splats.labels
         self.spheres = Spheres.of(splats.centers, splats.radii, layout.box)
         self.exact = SphereField.over(self.spheres, threads=threads)
-        self.kernel_name = KERNEL_OF[checked_distance(config.distance)]
+        self.kernel_name = KERNEL_OF[config.distance]
         names = {self.kernel_name, *channels}
         self.se = SeField.over(self.spheres, config, threads=threads) if "se" in names else None
         self.gpdf = GpdfField.over(self.spheres, config, threads=threads) if "gpdf" in names else None

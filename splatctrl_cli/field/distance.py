@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.kernel import Matern12, SquaredExponential, checked_length, checked_truncation
+from splatctrl_cli.field.kernel import Matern12, SquaredExponential
 from splatctrl_cli.field.spheres import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.weights import weights_named
 from splatctrl_cli.kernels import field as native
@@ -103,9 +102,9 @@ class GpdfField(LogSumExpField):
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
         self.spheres = spheres
-        self.kernel = Matern12(checked_length(config.length_scale))
+        self.kernel = Matern12(config.length_scale)
         self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
-        tolerance = checked_truncation(config.truncation) * (1.0 if self.weights.sign is None else SIGNED_CARE)
+        tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
         self.share = self.kernel.share(tolerance)
         offsets = spheres.radii + self.kernel.length * self.weights.log_size
         # Float32 keeps what is left of the offsets to the micrometre: the largest goes in at the end, in float64.
@@ -160,9 +159,9 @@ class SeField(LogSumExpField):
 
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None:
         self.spheres = spheres
-        self.kernel = SquaredExponential(checked_length(config.length_scale))
+        self.kernel = SquaredExponential(config.length_scale)
         self.weights = weights_named(config.weights, spheres, self.kernel, config.noise, threads)
-        self.tolerance = checked_truncation(config.truncation) * (1.0 if self.weights.sign is None else SIGNED_CARE)
+        self.tolerance = config.truncation * (1.0 if self.weights.sign is None else SIGNED_CARE)
         self.unit = 2.0 * self.kernel.length**2
         log_size = self.weights.log_size
         self._common = self.unit * float(log_size.max())
@@ -288,16 +287,9 @@ DISTANCES: Mapping[str, _Make] = {
 }
 
 
-def checked_distance(name: str) -> str:
-    """The name of a distance. Raises UsageError for one that is not there."""
-    if name not in DISTANCES:
-        raise UsageError(f"field.distance: expected one of {', '.join(DISTANCES)}, got {name}")
-    return name
-
-
 def field_over(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> DistanceField:
     """The field that ``config.distance`` names, over spheres that are already clustered."""
-    return DISTANCES[checked_distance(config.distance)](spheres, config, threads)
+    return DISTANCES[config.distance](spheres, config, threads)
 
 
 def make_field(centers: ArrayLike, radii: ArrayLike, config: FieldConfig, *, threads: int = 1) -> DistanceField:

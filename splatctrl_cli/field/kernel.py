@@ -5,7 +5,6 @@ from typing import Protocol
 
 import numpy as np
 
-from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clusters import ClusteredPoints
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float64
@@ -60,20 +59,6 @@ class SquaredExponential:
     def log_row_sums(self, points: ClusteredPoints, *, threads: int = 0) -> Float64:
         """``log sum_j exp(-|p_i - p_j|^2 / (2 l^2))`` (N,)."""
         return _log_row_sums(points, self.length, is_matern=False, threads=threads)
-
-
-def checked_length(length: float) -> float:
-    """The length scale [m]. Raises UsageError unless it is from 1e-12 m to 1e6 m."""
-    if not 1e-12 <= length <= 1e6:
-        raise UsageError(f"field.length_scale: expected a length above 0 m, got {length}", remedy="0.02 is usual")
-    return float(length)
-
-
-def checked_truncation(truncation: float) -> float:
-    """The tolerance [m]. Raises UsageError unless it is above 0 m and at most 1 cm."""
-    if not 0 < truncation <= 0.01:
-        raise UsageError(f"field.truncation: expected a distance above 0 m, at most 0.01 m, got {truncation}")
-    return float(truncation)
 
 
 def _log_row_sums(points: ClusteredPoints, length: float, *, is_matern: bool, threads: int) -> Float64:

@@ -145,17 +145,13 @@ def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
 
 _Make = Callable[[Spheres, FieldConfig, int], CollisionProbability]
 PROBABILITIES: Mapping[str, _Make] = {
-    "calibrated": lambda spheres, config, threads: CalibratedProbability(
-        sigma=checked_error(config.error), mean=config.error_mean
-    ),
+    "calibrated": lambda spheres, config, threads: CalibratedProbability(sigma=config.error, mean=config.error_mean),
     "paper": lambda spheres, config, threads: PaperProbability(spheres, config, threads=threads),
 }
 
 
 def make_probability(spheres: Spheres, config: FieldConfig, *, threads: int = 1) -> CollisionProbability:
-    """The probability that ``config.probability`` names. Raises UsageError for a name that is not there."""
-    if config.probability not in PROBABILITIES:
-        raise UsageError(f"field.probability: expected one of {', '.join(PROBABILITIES)}, got {config.probability}")
+    """The probability that ``config.probability`` names."""
     return PROBABILITIES[config.probability](spheres, config, threads)
 
 
@@ -163,10 +159,3 @@ def probabilities(spheres: Spheres, config: FieldConfig, *, threads: int = 1) ->
     """Every form that these weights have, by name: the paper's variance is not that of the full process (cg)."""
     names = [name for name in PROBABILITIES if name != "paper" or config.weights != "cg"]
     return {name: PROBABILITIES[name](spheres, config, threads) for name in names}
-
-
-def checked_error(error: float) -> float:
-    """sigma [m]. Raises UsageError unless it is above zero."""
-    if not 0 < error < np.inf:
-        raise UsageError(f"field.error: expected a distance above 0 m, got {error}")
-    return float(error)

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.config.declared import check
+from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.field.layout import HALF_DIAGONAL
 from splatctrl_cli.records import Bool, DistanceGrid, Float32, VoxelState
 
-POLICIES = ("free", "obstacle", "nan")
 BLANKED = ("sdf", "gradient", "probability")  # by nan
 ROUNDING = 1e-6  # [m] and of a distance: what float32 may raise it by
 BOUND = (
@@ -32,8 +33,8 @@ def apply_unknown(grid: DistanceGrid, policy: str) -> DistanceGrid:
     Raises UsageError for another policy, InputError for a grid without `observed`, NotEvaluableError where nothing
     was ever seen.
     """
-    if policy not in POLICIES:
-        raise UsageError(f"field.unknown: expected one of {', '.join(POLICIES)}, got {policy}")
+    declared = FieldConfig.declared["unknown"]
+    check(declared.holds(policy), "field.unknown", declared.expected, policy)
     header = {**grid.header, "unknown": policy}
     if policy == "free":
         return replace(grid, header=header)

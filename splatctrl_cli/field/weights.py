@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.conjugate import solve_process
 from splatctrl_cli.field.kernel import Kernel, Matern12
 from splatctrl_cli.field.spheres import Spheres
@@ -66,9 +65,7 @@ METHODS: Mapping[str, Method] = {"rowsum": row_sum_weights, "voxel": voxel_weigh
 
 
 def weights_named(name: str, spheres: Spheres, kernel: Kernel, noise: float, threads: int) -> Weights:
-    """The weights that the configuration names. Raises UsageError for a name that is not there."""
-    if name not in METHODS:
-        raise UsageError(f"field.weights: expected one of {', '.join(METHODS)}, got {name}")
+    """The weights that the configuration names."""
     return METHODS[name](spheres, kernel, noise, threads)
 
 

@@ -5,22 +5,22 @@ import hashlib
 import json
 import os
 import platform
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError, WriteError
+from splatctrl_cli.io.output_lock import held, remove
 
 MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
 PARTIAL = ".partial"  # ends the name of an output that is not whole
 PACKAGES = ("numpy", "scipy", "torch", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
-_WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG})
+_WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
 
 
 def is_write_failure(error: OSError, output: Path | None = None) -> bool:
@@ -41,53 +41,76 @@ def output_path(
     A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``. `checkpoint` names the file in that
     folder from which a run can go on: where it is there, a failure to write leaves the folder, too. With `resume`
     such a folder is yielded as it is, and no failure removes it.
-    Raises UsageError when `path` has no name of its own, exists without `force`, is not of the kind to write, or
-    is a folder that no command wrote, and when its parent cannot be written; WriteError where `is_write_failure`
-    (a full disk); every other error as it is.
+    Where `path` is a link, all of this happens to what it leads to, and the link stays.
+    Raises UsageError when `path` has no name of its own, exists without `force`, is not of the kind to write, is
+    a folder that no command wrote, or is being written by another run, and when its parent cannot be written;
+    WriteError where `is_write_failure` (a full disk); every other error as it is.
     """
     try:
+        path = followed(path)
         _check_replaceable(path, is_folder=is_folder)
-        is_there = path.exists()
+        _check_not_there(path, force=force)
+        partial = partial_path(path)
+        partial.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}", remedy="give another --out") from None
-    if is_there and not force:
-        raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
-    partial = partial_path(path)
+        raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
 
     def can_go_on() -> bool:
         return checkpoint is not None and (partial / checkpoint).is_file()
 
-    is_resumed = resume and can_go_on()
-    try:
-        if not is_resumed:
-            _remove(partial)
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        if is_folder:
-            partial.mkdir(exist_ok=is_resumed)
-        else:
-            partial.touch()
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
-    try:
-        yield partial
-        _replace(partial, path)
-    except Exception as error:
-        failed_to_write = isinstance(error, OSError) and is_write_failure(error, partial)
-        is_kept = can_go_on() and (failed_to_write or is_resumed)
-        if not is_kept:
-            _remove(partial)
-        if isinstance(error, OSError) and failed_to_write:
-            remedy = f"make room and go on from {partial} with --resume" if is_kept else "make room"
-            raise WriteError(
-                f"{error.filename or path}: writing failed: {error.strerror or error}",
-                remedy=f"{remedy}, or give another --out",
-            ) from error
-        raise
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held(partial, is_folder=is_folder))
+            is_resumed = resume and can_go_on()
+            if not is_resumed:
+                _empty(partial)
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
+        try:
+            _check_not_there(path, force=force)  # another run may have ended since
+            yield partial
+            _replace(partial, path)
+        except Exception as error:
+            failed_to_write = isinstance(error, OSError) and is_write_failure(error, partial)
+            is_kept = can_go_on() and (failed_to_write or is_resumed)
+            if not is_kept:
+                remove(partial)
+            if isinstance(error, OSError) and failed_to_write:
+                remedy = f"make room and go on from {partial} with --resume" if is_kept else "make room"
+                raise WriteError(
+                    f"{error.filename or path}: writing failed: {error.strerror or error}",
+                    remedy=f"{remedy}, or give another --out",
+                ) from error
+            raise
+
+
+def followed(path: Path) -> Path:
+    """Where an output is written: a link stays, and what it leads to is replaced. Raises UsageError for a loop."""
+    if not path.is_symlink():
+        return path
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise UsageError(f"{path}: is a link to itself", remedy="give another --out")
+    return target
 
 
 def partial_path(path: Path) -> Path:
-    """``NAME.partial``, under which an output is written."""
-    return path.with_name(path.name + PARTIAL)
+    """``NAME.partial``, under which an output is written: beside what a link leads to."""
+    target = followed(path)
+    return target.with_name(target.name + PARTIAL)
+
+
+def check_can_be_written(path: Path) -> None:
+    """Raise UsageError for an output that no command can write, before any work: its nearest folder says so."""
+    try:
+        target = followed(path).absolute()
+        above = next(folder for folder in target.parents if folder.exists())
+        is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
+        reason = "" if is_good else f"{above} is {'read-only' if above.is_dir() else 'no folder'}"
+    except OSError as error:
+        reason = str(error.strerror)
+    if reason:
+        raise UsageError(f"{path}: cannot be written: {reason}", remedy="give another --out")
 
 
 def write_durably(path: Path, write: Callable[[Path], object]) -> None:
@@ -123,23 +146,34 @@ def _check_replaceable(path: Path, *, is_folder: bool) -> None:
     if path.is_dir() and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS):
         raise UsageError(f"{path}: was not written by splatctrl (no run.json)", remedy="give another --out")
 
+    if path.is_dir() and os.path.ismount(path):
+        raise UsageError(f"{path}: is where a disk is mounted", remedy="give a folder in it")
+    if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+        raise UsageError(f"{path}: cannot be replaced: it is read-only", remedy="give another --out")
+
+
+def _check_not_there(path: Path, *, force: bool) -> None:
+    if not force and path.exists():
+        raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
+
+
+def _empty(partial: Path) -> None:
+    if partial.is_dir():
+        for entry in partial.iterdir():
+            remove(entry)
+    else:
+        os.truncate(partial, 0)
+
 
 def _replace(partial: Path, path: Path) -> None:
     old = path.with_name(path.name + ".partial.old")  # no name that a person gives to a copy
     if path.is_dir() and not path.is_symlink():
-        _remove(old)
+        remove(old)
         path.rename(old)
         partial.rename(path)
     else:
         partial.replace(path)
-    _remove(old)  # also that of a run which was killed right above
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+    remove(old)  # also that of a run which was killed right above
 
 
 class Stopwatch:

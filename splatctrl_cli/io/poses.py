@@ -89,7 +89,7 @@ def read_tum(path: Path) -> dict[str, Float64]:
     poses: dict[str, Float64] = {}
     for where, words, values in read_rows(path):
         is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_ENTRY).all())
-        if not is_pose or np.linalg.norm(values[4:]) == 0:
+        if not is_pose or not any(values[4:]):
             raise InputError(
                 f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",
                 remedy=_CORRECT,

@@ -34,8 +34,6 @@ def read_golden(request: ReplayRequest) -> Golden | None:
         return None
     if request.mode == "audit":
         raise UsageError("--golden: an audit commands nothing", remedy="give --mode open-loop or closed-loop")
-    if not request.golden_tolerance >= 0:
-        raise UsageError(f"--golden-tolerance: expected 0 rad/s or more, got {request.golden_tolerance:g}")
     path: Path = request.golden
     file = path / "steps.csv" if path.is_dir() else path.with_name("steps.csv") if path.suffix == ".json" else path
     try:

@@ -5,8 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.config import OccupancyConfig, SceneConfig, check_voxel
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.raster import (
     ImageLoss,
@@ -55,11 +54,7 @@ class SceneFitter:
     def __init__(
         self, config: SceneConfig, occupancy: OccupancyConfig, workspace: Box, *, seed: int = 0, threads: int = 0
     ) -> None:
-        if occupancy.voxel < config.max_radius:
-            raise UsageError(
-                f"occupancy.voxel: {occupancy.voxel} m is smaller than scene.max_radius, {config.max_radius} m",
-                remedy="III-C asks for voxels at least as large as the largest radius",
-            )
+        check_voxel(config, occupancy)
         self.config = config
         self.workspace = workspace
         self.seed = seed

@@ -182,10 +182,18 @@ def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_p
     assert_refused(
         here.splatctrl(*arguments, "--config", tmp_path), 4, "cannot be read: Is a directory; check the path"
     )
-    assert_refused(here.splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, got 'many'")
-    assert_refused(here.splatctrl(*arguments, "--set", "scene.max_splats=-5"), 2, "expected above 0, got -5")
-    assert_refused(here.splatctrl(*arguments, "--seed=-1"), 2, "--seed: expected 0 to 2147483647, got -1")
-    assert_refused(here.splatctrl(*arguments, "--seed", 2**32), 2, "--seed: expected 0 to 2147483647, got 4294967296")
+    assert_refused(
+        here.splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, 1 to 10000000, got 'many'"
+    )
+    assert_refused(
+        here.splatctrl(*arguments, "--set", "scene.max_splats=-5"),
+        2,
+        "scene.max_splats: expected 1 to 10000000, got -5",
+    )
+    assert_refused(
+        here.splatctrl(*arguments, "--seed=-1"), 2, "argument --seed: expected a whole number, 0 to 2147483647"
+    )
+    assert_refused(here.splatctrl(*arguments, "--seed", 2**32), 2, "2147483647, got '4294967296'")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
 
 

@@ -155,7 +155,7 @@ def test_the_fields_of_two_scenes_are_kept_and_no_more(tmp_path: Path, monkeypat
         (["--lockstep"], 4, "expected cameras, got joint states alone"),
         (["--field", "x", "--latency", "0.1"], 2, "one scene for all times"),
         (["--scene", "x", "--allow-disagreement"], 2, "expected --lockstep"),
-        (["--lockstep", "--latency=-1"], 2, "not below 0"),
+        (["--lockstep", "--latency=-1"], 2, "argument --latency: expected 0 to 100000000 s, got '-1'"),
         (["--lockstep", "--scene", "x"], 2, "not allowed with"),
     ],
 )

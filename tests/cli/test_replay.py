@@ -178,7 +178,7 @@ def test_bad_input_is_one_line_with_its_code(
         ([], "one of the arguments --field --scene --lockstep is required"),
         (["--scene", "x", "--goal", "1,2,3"], "expected 7 numbers"),
         (["--scene", "x", "--goal", "0,0,1,0,0,0,2"], "unit quaternion"),
-        (["--scene", "x", "--goal-joints", "a,b"], "expected numbers"),
+        (["--scene", "x", "--goal-joints", "a,b"], "expected finite numbers"),
         (["--scene", "x", "--base", "nan,0,0,0,0,0,1"], "finite"),
     ],
 )

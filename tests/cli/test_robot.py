@@ -116,14 +116,18 @@ def test_pairs_are_listed_with_the_reason_of_those_left_out(
         (("spheres", "--urdf", "URDF", "--max-spheres", "1"), 2, "1 spheres for 2 links"),
         (("spheres", "--urdf", "URDF", "--max-protrusion", "1e-4"), 2, "largest protrusion: expected at least"),
         (("spheres", "--urdf", "URDF", "--max-spheres", "9", "--max-protrusion", "1"), 2, "not allowed with"),
-        (("spheres", "--urdf", "URDF", "--max-deficit=-1"), 2, "expected 0 m or more, got -1"),
-        (("spheres", "--urdf", "URDF", "--seed=-1"), 2, "--seed: expected 0 to"),
+        (
+            ("spheres", "--urdf", "URDF", "--max-deficit=-1"),
+            2,
+            "argument --max-deficit: expected 0 to 10 m, got '-1'",
+        ),
+        (("spheres", "--urdf", "URDF", "--seed=-1"), 2, "--seed: expected a whole number, 0 to"),
         (("check", "--urdf", "URDF"), 4, "expected collision geometry of spheres only, got 1 other shapes"),
         (("check", "--urdf", "URDF", "--spheres", "none.yaml"), 4, "none.yaml: cannot be read"),
         (("info", "--urdf", "URDF", "--lock", "elbow=0"), 4, "no joint 'elbow' to lock; movable joints there: hinge"),
         (("info", "--urdf", "URDF", "--lock", "hinge"), 2, "expected JOINT=VALUE"),
         (("info", "--urdf", "URDF", "--lock", "hinge=0"), 4, "every joint is locked"),
-        (("pairs", "--urdf", "URDF", "--postures", "0"), 2, "--postures: expected 1 or more, got 0"),
+        (("pairs", "--urdf", "URDF", "--postures", "0"), 2, "--postures: expected a whole number, 1 to"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(

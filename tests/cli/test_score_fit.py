@@ -88,7 +88,7 @@ def test_the_mean_is_over_the_scans(
     [
         (["scene"], 2, "--fit: makes the scenes itself, got scene"),
         (["--holdout", "2"], 2, "--fit: goes by a protocol; give --protocol holdout:2"),
-        (["--fit-splats", "0"], 2, "--fit-splats: expected at least 1, got 0"),
+        (["--fit-splats", "0"], 2, "--fit-splats: expected a whole number, 1 to 10000000"),
         (["--scan", "scan1,scan9"], 4, "no scan 'scan9'; scans: scan1"),
         (["--require", "psnr_best>=1"], 2, "unknown metric"),
         (["--cloud", "."], 4, "expected the points of scan1, scan1.ply or stl001_total.ply, got neither"),

@@ -10,8 +10,11 @@ from splatctrl_cli.cli import bake_options
 from splatctrl_cli.cli.bake_report import SUMMARY_METRICS
 from splatctrl_cli.cli.field_truth import FIELDS
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.cli.numbers import words
+from splatctrl_cli.config import ControlConfig, FieldConfig
+from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import metric_names
-from splatctrl_cli.field import baker, distance, probability, unknown, weights
+from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.grid import exact_channel
 from splatctrl_cli.io import grid_formats
 from splatctrl_cli.io.grid import read_npz
@@ -104,14 +107,17 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
         (["--update", "nowhere"], 4, "--update nowhere: no such folder"),
         (["--include", "cat"], 2, "--include cat: expected some of: robot, human"),
         (["--voxel", "0.00001"], 2, "GiB of memory"),
-        (["--voxel", "nan"], 2, "voxel: expected a size above 0"),
-        (["--length-scale", "-1"], 2, "length_scale: expected a length above 0"),
+        (["--voxel", "nan"], 2, "argument --voxel: expected 1e-06 to 10 m, got 'nan'"),
+        (["--length-scale", "-1"], 2, "argument --length-scale: expected 1e-10 to 1000 m, got '-1'"),
+        (["--voxel", "1e20"], 2, "argument --voxel: expected 1e-06 to 10 m, got '1e20'"),
+        (["--box=1e300,0,0,2e300,1,1"], 2, "z0 < z1, within 1e6"),
+        (["--at", "inf"], 2, "argument --at: expected -100000000 to 100000000 s, got 'inf'"),
         (["--at", "3"], 2, "is one splat set"),
         (["--truth", "truth.json"], 2, "expected both or neither"),
         (
             ["--set", "field.distance=tsdf"],
             2,
-            "field.distance: expected one of safe, safe_gpdf, hard, se, gpdf, got tsdf",
+            "field.distance: expected safe, safe_gpdf, hard, se or gpdf, got 'tsdf'",
         ),
     ],
 )
@@ -228,10 +234,10 @@ def test_a_time_before_the_scene_was_known_is_refused(tmp_path: Path, scene: Pat
 
 
 def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
-    assert tuple(distance.DISTANCES) == bake_options.DISTANCES
-    assert tuple(weights.METHODS) == bake_options.WEIGHTS
-    assert tuple(probability.PROBABILITIES) == bake_options.PROBABILITIES
-    assert unknown.POLICIES == bake_options.UNKNOWN
+    assert tuple(distance.DISTANCES) == words(FieldConfig, "distance")
+    assert tuple(weights.METHODS) == words(FieldConfig, "weights")
+    assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
+    assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
     assert tuple(baker.CHANNELS) == bake_options.CHANNELS
     assert baker.DEFAULT_CHANNELS == bake_options.DEFAULT_CHANNELS
     assert tuple(grid_formats.FORMATS) == bake_options.FORMATS

@@ -136,7 +136,10 @@ def test_an_existing_output_is_kept_without_force(recorded: Path) -> None:
 def test_a_bad_option_leaves_nothing_behind(tmp_path: Path) -> None:
     result = here.splatctrl("simulate", "-o", tmp_path / "out", "--duration", "0.1")
     assert result.returncode == 2
-    assert result.stderr == "splatctrl: --duration: expected 0.5 to 600 s, got 0.1\n"
+    said = (
+        "splatctrl: simulate: argument --duration: expected 0.5 to 600 s, got '0.1'; see splatctrl simulate --help\n"
+    )
+    assert result.stderr == said
     assert list(tmp_path.iterdir()) == []
 
 

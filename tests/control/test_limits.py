@@ -103,10 +103,16 @@ def test_accelerations_come_for_all_joints_or_one_by_one(tmp_path: pytest.TempPa
     assert config.max_acceleration == (1.0, 2.0)
     np.testing.assert_array_equal(JointLimits.of(PlanarArm(), config).acceleration, [1.0, 2.0])
     assert limits(0.0).acceleration is None
-    for value, words in ((-1.0, "above 0"), ((1.0, 0.0), "above 0"), ((1.0, 2.0, 3.0), "one for each joint, got 3")):
+    for value, words in (
+        (-1.0, "0 or 0.01 to 1000 rad/s"),
+        ((1.0, 0.0), "0 or 0.01 to 1000 rad/s"),
+        ((1.0, 2.0, 3.0), "one for each joint, got 3"),
+    ):
         with pytest.raises(UsageError, match=words):
             limits(value)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match=r"max_acceleration\[1\]: expected float, got 'x'"):
+    with pytest.raises(
+        UsageError, match=r"expected float or list of float, 0 or 0.01 to 1000 rad/s\^2, got \[1, 'x'\]"
+    ):
         load_config(None, ["control.max_acceleration=[1, 'x']"])
 
 

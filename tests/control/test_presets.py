@@ -39,7 +39,7 @@ def test_both_forms_agree_where_no_external_row_is_active() -> None:
     random, arm = np.random.default_rng(2), PlanarArm()
     for _ in range(25):
         q, goal = (random.uniform(-2.5, 2.5, 2) for _ in range(2))
-        printed, reduced = both(far_away(), q, goal, self_margin=-1.0)
+        printed, reduced = both(far_away(), q, goal, self_margin=0.0)
         np.testing.assert_allclose(printed.velocity, reduced.velocity, atol=1e-6)
         assert printed.rung is reduced.rung is Rung.SOLVED and len(printed.velocity) == len(arm.joint_names)
 
@@ -76,7 +76,7 @@ def test_more_weight_on_the_printed_slack_comes_near_the_exact_one() -> None:
 
 def test_a_program_without_a_solution_stands_still_because_the_paper_has_no_second_rung() -> None:
     q = np.array([0.0, 2.55])
-    printed, reduced = both(far_away(), q, np.array([0.0, 2.6]), self_margin=3.0)
+    printed, reduced = both(far_away(), q, np.array([0.0, 2.6]), self_margin=0.5)
     assert printed.rung is Rung.HOLD and not printed.velocity.any() and printed.num_refused == 1
     assert reduced.rung is Rung.RELAXED
 

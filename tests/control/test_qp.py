@@ -135,8 +135,8 @@ def test_a_program_without_a_point_is_not_solved(name: str) -> None:
 
 
 def test_a_solver_that_is_not_there_is_named() -> None:
-    with pytest.raises(UsageError, match=r"control\.solver: expected one of clarabel, daqp, got osqp"):
-        solver_named("osqp")
+    with pytest.raises(UsageError, match=r"control\.solver: expected clarabel or daqp, got 'osqp'"):
+        ControlConfig(solver="osqp")
 
 
 def test_the_program_without_slacks_gives_the_same_step_where_it_is_used() -> None:

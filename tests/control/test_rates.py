@@ -54,8 +54,10 @@ def test_a_scene_that_comes_nearer_is_met_with_more_distance_where_its_rate_is_k
         k = index(stamp_ns)
         return None if k == 0 else SceneStep(newer=fields[k], older=fields[k - 1], seconds=seconds)
 
-    config = replace(ControlConfig(), distance_rate=name, max_time=0.8, goal_position=-1.0)  # it stays
-    task = ReplayTask(start=start, T_world_goal=arm.frame_pose(start, "tip"), frame="tip")
+    config = replace(ControlConfig(), distance_rate=name, max_time=0.8, goal_position=0.002)
+    out_of_plane = arm.frame_pose(start, "tip")
+    out_of_plane[2, 3] += 0.005  # where the arm is and stays, and yet no goal that it reaches
+    task = ReplayTask(start=start, T_world_goal=out_of_plane, frame="tip")
     trace = closed_loop(arm, config, task, lambda t: fields[index(t)], scene_step_at=step_at)
     least = min(step.clearance for step in trace.steps)
     assert bool(asked) is (name == "snapshots")

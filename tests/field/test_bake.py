@@ -191,7 +191,7 @@ def test_bad_boxes_voxels_and_splats_are_named() -> None:
     splats = splat_set(*cloud(10))
     with pytest.raises(UsageError, match="lower < upper"):
         bake(splats, Box(lower=np.zeros(3), upper=np.array([1.0, 0.0, 1.0])), CONFIG)
-    with pytest.raises(UsageError, match="voxel: expected a size above 0"):
+    with pytest.raises(UsageError, match=r"field.voxel: expected 1e-06 to 10 m, got 0.0"):
         bake(splats, BOX, replace(CONFIG, voxel=0.0))
     splats.centers[4] = np.nan
     with pytest.raises(InputError, match="splat 4"):

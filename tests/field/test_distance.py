@@ -257,11 +257,11 @@ def test_bad_queries_and_settings_are_named() -> None:
         make_field(centers, radii, FieldConfig()).query(np.array([[0.0, 0, 0], [0, 0, np.nan]]))
     with pytest.raises(InputError, match=r"expected shape \(Q, 3\)"):
         GpdfField(centers, radii).query(np.zeros(3))
-    with pytest.raises(UsageError, match="length_scale: expected a length above 0"):
+    with pytest.raises(UsageError, match="length_scale: expected 1e-10 to 1000 m"):
         GpdfField(centers, radii, 0.0)
-    with pytest.raises(UsageError, match=r"weights: expected one of rowsum.*, got mass"):
+    with pytest.raises(UsageError, match="weights: expected rowsum, voxel or cg, got 'mass'"):
         GpdfField(centers, radii, weights="mass")
-    with pytest.raises(UsageError, match="distance: expected one of safe, safe_gpdf, hard, se, gpdf, got tsdf"):
+    with pytest.raises(UsageError, match="distance: expected safe, safe_gpdf, hard, se or gpdf, got 'tsdf'"):
         make_field(centers, radii, FieldConfig(distance="tsdf"))
     with pytest.raises(UsageError, match="truncation"):
         GpdfField(centers, radii, truncation=0.0)

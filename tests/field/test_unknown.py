@@ -127,7 +127,7 @@ def test_a_grid_with_blank_cells_says_so_at_every_point_beside_one(grid: Distanc
 
 
 def test_what_cannot_be_applied_is_refused_in_words(grid: DistanceGrid) -> None:
-    with pytest.raises(UsageError, match=r"field.unknown: expected one of free, obstacle, nan, got air"):
+    with pytest.raises(UsageError, match=r"field.unknown: expected free, obstacle or nan, got 'air'"):
         apply_unknown(grid, "air")
     bare = replace(grid, channels={"sdf": grid.channels["sdf"]})
     with pytest.raises(InputError, match="no channel 'observed'"):

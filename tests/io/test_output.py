@@ -1,11 +1,18 @@
 """Outputs appear whole or not at all."""
 
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError, WriteError
-from splatctrl_cli.io.output import output_path, write_durably
+from splatctrl_cli.io import output, output_lock
+from splatctrl_cli.io.output import check_can_be_written, output_path, partial_path, write_durably
 
 
 def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
@@ -219,3 +226,141 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     write_durably(path, lambda p: p.write_text("new"))
     assert path.read_text() == "new"
     assert [p.name for p in tmp_path.iterdir()] == ["state"]
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from splatctrl_cli.io.output import output_path
+with output_path(Path(sys.argv[1]), force=False, is_folder=sys.argv[2] == "folder", checkpoint="state") as partial:
+    if partial.is_dir():
+        (partial / "state").write_text("half")
+    print("writing", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@contextmanager
+def another_writer(out: Path, kind: str) -> Iterator["subprocess.Popen[str]"]:
+    """A process that is in the middle of writing an output until a line is sent to it."""
+    command = [sys.executable, "-c", HOLDER, str(out), kind]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "writing\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+@pytest.mark.parametrize("resume", [False, True])
+def test_the_second_of_two_writers_is_refused_and_the_first_ends_well(
+    tmp_path: Path, kind: str, resume: bool
+) -> None:
+    out = tmp_path / "out"
+    with another_writer(out, kind) as first:
+        with (
+            pytest.raises(UsageError, match=rf"out.partial: another run \(process {first.pid}\) writes it; wait"),
+            output_path(out, force=True, is_folder=kind == "folder", checkpoint="state", resume=resume),
+        ):
+            pytest.fail("must not get here")
+        first.communicate("\n")
+        assert first.returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert kind == "file" or (out / "state").read_text() == "half"
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_a_killed_writer_leaves_no_lock_behind(tmp_path: Path, kind: str) -> None:
+    out = tmp_path / "out"
+    with another_writer(out, kind) as first:
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
+    with output_path(out, force=False, is_folder=kind == "folder") as partial:
+        assert not (partial / "state").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_killed_writer_can_be_gone_on_from(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with another_writer(out, "folder") as first:
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+    with output_path(out, force=False, is_folder=True, checkpoint="state", resume=True) as partial:
+        assert (partial / "state").read_text() == "half"
+    assert (out / "state").read_text() == "half"
+
+
+def test_an_output_within_an_output_is_written(tmp_path: Path) -> None:
+    with (
+        output_path(tmp_path / "out", force=False, is_folder=True) as outer,
+        output_path(outer / "in", force=False, is_folder=True) as inner,
+    ):
+        (inner / "a").write_text("1")
+    assert (tmp_path / "out" / "in" / "a").read_text() == "1"
+
+
+def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+
+    @contextmanager
+    def held_late(partial: Path, *, is_folder: bool) -> Iterator[None]:
+        out.mkdir()  # the other run ended between the look at the output and the lock
+        with output_lock.held(partial, is_folder=is_folder):
+            yield
+
+    monkeypatch.setattr(output, "held", held_late)
+    with pytest.raises(UsageError, match="already exists"), output_path(out, force=False, is_folder=True):
+        pytest.fail("must not get here")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("is_folder", [True, False])
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path, is_folder: bool) -> None:
+    (tmp_path / "disk").mkdir()
+    target, link = tmp_path / "disk" / "real", tmp_path / "link"
+    if is_folder:
+        target.mkdir()
+        (target / "run.json").write_text("{}")
+    else:
+        target.write_text("old")
+    link.symlink_to(target)
+    with output_path(link, force=True, is_folder=is_folder) as partial:
+        assert partial == tmp_path / "disk" / "real.partial" == partial_path(link)
+        (partial / "new" if is_folder else partial).write_text("new")
+    assert link.is_symlink() and link.readlink() == target
+    assert (target / "new" if is_folder else target).read_text() == "new"
+    assert sorted(path.name for path in tmp_path.rglob("re*")) == ["real"]
+
+
+def test_a_link_to_nothing_yet_leads_to_the_output(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "real")
+    with output_path(tmp_path / "link", force=False, is_folder=True) as partial:
+        (partial / "a").write_text("1")
+    assert (tmp_path / "disk" / "real" / "a").read_text() == "1" and (tmp_path / "link").is_symlink()
+
+
+def test_a_link_to_itself_and_a_place_of_a_disk_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with (
+        pytest.raises(UsageError, match="is a link to itself"),
+        output_path(tmp_path / "loop", force=True, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    with pytest.raises(UsageError, match=r"/proc: .*"), output_path(Path("/proc"), force=True, is_folder=True):
+        pytest.fail("must not get here")
+
+
+def test_whether_an_output_can_be_written_is_known_without_trying(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("x")
+    check_can_be_written(tmp_path / "a" / "b" / "c")
+    with pytest.raises(UsageError, match="file is no folder"):
+        check_can_be_written(tmp_path / "file" / "a" / "b")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(UsageError, match="is read-only"):
+        check_can_be_written(tmp_path / "a" / "b" / "c")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

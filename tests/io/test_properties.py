@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
@@ -199,6 +199,8 @@ def test_a_moving_frame_is_rigid_at_all_times_and_where_it_was_seen(samples: Any
 
 @few(80)
 @given(st.lists(st.one_of(st.floats(), st.floats(-1, 1)), min_size=8, max_size=8))
+@example([0.0] * 4 + [2e-160, 1e-160, 0.0, 1.3e-160])  # squares that underflow
+@example([0.0] * 4 + [5e-324, 0.0, 0.0, 0.0])
 def test_a_line_of_poses_is_rigid_or_refused(tmp_path_factory: pytest.TempPathFactory, numbers: list[float]) -> None:
     path = tmp_path_factory.getbasetemp() / "poses.txt"
     path.write_text(" ".join(map(repr, numbers)) + "\n")

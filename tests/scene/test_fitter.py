@@ -124,7 +124,7 @@ def test_no_splat_of_a_robot_that_left_stays_behind() -> None:
 
 
 def test_voxels_smaller_than_the_largest_radius_are_refused() -> None:
-    with pytest.raises(UsageError, match="at least as large"):
+    with pytest.raises(UsageError, match=r"occupancy.voxel: expected at least scene.max_radius"):
         SceneFitter(CONFIG, OccupancyConfig(voxel=0.01), WORKSPACE)
 
 

@@ -1,0 +1,19 @@
+"""Every number of the method, by section of the paper. The paper's value is the default where it gives one."""
+
+from splatctrl_cli.config.load import Config, check_voxel, load_config
+from splatctrl_cli.config.map import FieldConfig, GaussianConfig, HumanConfig, OccupancyConfig, SceneConfig
+from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
+
+__all__ = [
+    "Config",
+    "ControlConfig",
+    "FieldConfig",
+    "GaussianConfig",
+    "HumanConfig",
+    "OccupancyConfig",
+    "PlannerConfig",
+    "SceneConfig",
+    "VerdictConfig",
+    "check_voxel",
+    "load_config",
+]

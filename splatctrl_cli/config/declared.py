@@ -1,0 +1,100 @@
+"""What a key of the configuration may hold, declared once beside its default; checks and docs follow from it."""
+
+import typing
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from splatctrl_cli.errors import UsageError
+
+MOST_SHOWN = 60  # characters of a refused value
+
+
+@dataclass(frozen=True)
+class Within:
+    """A number from `low` to `high`, both allowed, in `unit`; `or_zero`: or 0 alone, which switches something off.
+
+    Its arguments are positional, so that a declaration reads like the row of a table.
+    """
+
+    low: float
+    high: float
+    unit: str
+    reason: str
+    or_zero: bool = False
+
+    @property
+    def expected(self) -> str:
+        """The range as text, ``0.001 to 0.5 m``."""
+        span = f"{'0 or ' if self.or_zero else ''}{self.low:.12g} to {self.high:.12g}"
+        return f"{span} {self.unit}" if self.unit else span
+
+    def holds(self, value: Any) -> bool:
+        """Whether a number, or each number of a tuple, lies in the range; NaN never does."""
+        numbers = value if isinstance(value, tuple) else (value,)
+        is_within = numbers != () and all(self.low <= number <= self.high for number in numbers)
+        return is_within or (self.or_zero and value == 0)
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """One of a few words."""
+
+    words: tuple[str, ...]
+    reason: str
+    unit: ClassVar[str] = ""
+
+    @property
+    def expected(self) -> str:
+        """The words as text."""
+        return f"{', '.join(self.words[:-1])} or {self.words[-1]}"
+
+    def holds(self, value: Any) -> bool:
+        """Whether the value is one of the words."""
+        return value in self.words
+
+
+Declared = Within | OneOf
+
+
+class Section:
+    """A table of the configuration. Its values are checked when it is made, wherever they come from."""
+
+    section: ClassVar[str]
+    declared: ClassVar[dict[str, Declared]]
+
+    def __init_subclass__(cls, *, section: str) -> None:
+        """Raises TypeError for a key that says nothing of what it may hold."""
+        hints = typing.get_type_hints(cls, include_extras=True)
+        cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
+
+    def __post_init__(self) -> None:
+        for key, declared in self.declared.items():
+            value = getattr(self, key)
+            check(declared.holds(value), f"{self.section}.{key}", declared.expected, value)
+
+
+def _declared(hint: Any) -> Declared:
+    for note in typing.get_args(hint)[1:]:
+        if isinstance(note, Within | OneOf):
+            return note
+    raise TypeError(f"{hint}: expected Annotated with a range or words")
+
+
+def check(holds: bool, name: str, expected: str, value: object) -> None:
+    """Raise UsageError with the key, what it may be, and its value, unless that holds."""
+    if not holds:
+        raise UsageError(f"{name}: expected {expected}, got {shown(value)}", remedy="see docs/config.md")
+
+
+def shown(value: object) -> str:
+    """A value as an error shows it."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        return f"{type(value).__name__} too long to show"
+    return cut(text)
+
+
+def cut(text: str) -> str:
+    """The beginning of a long text."""
+    return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."

@@ -1,0 +1,145 @@
+"""The whole configuration: defaults, then a TOML file, then single assignments."""
+
+import dataclasses
+import difflib
+import tomllib
+import types
+import typing
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.config.declared import Section, Within, check, cut, shown
+from splatctrl_cli.config.map import FieldConfig, GaussianConfig, HumanConfig, OccupancyConfig, SceneConfig
+from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
+from splatctrl_cli.errors import InputError, UsageError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """The whole configuration, one table per section in TOML."""
+
+    scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    gaussians: GaussianConfig = dataclasses.field(default_factory=GaussianConfig)
+    occupancy: OccupancyConfig = dataclasses.field(default_factory=OccupancyConfig)
+    human: HumanConfig = dataclasses.field(default_factory=HumanConfig)
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    control: ControlConfig = dataclasses.field(default_factory=ControlConfig)
+    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+    verdict: VerdictConfig = dataclasses.field(default_factory=VerdictConfig)
+
+    def __post_init__(self) -> None:
+        check_voxel(self.scene, self.occupancy)
+        gain, period = self.planner.follow_gain, self.control.period
+        expected = f"at most 1 / control.period = {1 / period:g} 1/s"
+        check(gain * period <= 1 + 1e-9, "planner.follow_gain", expected, gain)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Nested plain values, as written to ``run.json``."""
+        return asdict(self)
+
+
+def check_voxel(scene: SceneConfig, occupancy: OccupancyConfig) -> None:
+    """Raise UsageError for voxels smaller than the largest splat, which III-C excludes."""
+    least = scene.max_radius
+    check(occupancy.voxel >= least, "occupancy.voxel", f"at least scene.max_radius = {least:g} m", occupancy.voxel)
+
+
+def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
+    """Defaults, then the TOML file, then each ``section.key=value``.
+
+    Raises UsageError for an unknown section or key (naming the nearest), a value of the wrong type or out of range,
+    values that contradict each other, or TOML that does not parse; InputError for a file that is not there.
+    """
+    given: dict[str, dict[str, Any]] = {}
+    for where, section, values in _tables(path, assignments):
+        given.setdefault(section, {}).update(_typed(where, section, values))
+    default = Config()
+    return replace(default, **{name: replace(getattr(default, name), **values) for name, values in given.items()})
+
+
+def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Where it is given, the section, and values by key."""
+    for section, values in ({} if path is None else _read_toml(path)).items():
+        _check_known(section, [field.name for field in fields(Config)], str(path), "")
+        if not isinstance(values, dict):
+            raise UsageError(f"{path}: {section}: expected a table, got {shown(values)}")
+        yield str(path), section, values
+    for assignment in assignments:
+        key, separator, text = assignment.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not separator or not dot:
+            raise UsageError(
+                f"--set {assignment}: expected section.key=value", remedy="write it like --set scene.max_splats=3000"
+            )
+        where = f"--set {cut(assignment)}"
+        _check_known(section, [field.name for field in fields(Config)], where, "")
+        yield where, section, {name: _parse_value(text.strip())}
+
+
+def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:
+    """The values with the types of their keys. Raises UsageError for an unknown key or another type."""
+    kind = type(getattr(Config(), section))
+    assert issubclass(kind, Section)
+    hints, declared = typing.get_type_hints(kind), kind.declared
+    typed: dict[str, Any] = {}
+    for key, value in values.items():
+        _check_known(key, declared, where, f"{section}.")
+        typed[key] = _of_type(value, hints[key])
+        if type(typed[key]) not in [typing.get_origin(option) or option for option in _options(hints[key])]:
+            expected = f"{type_name(hints[key])}, " if isinstance(declared[key], Within) else ""
+            expected += declared[key].expected
+            raise UsageError(f"{where}: {section}.{key}: expected {expected}, got {shown(value)}")
+    return typed
+
+
+def _check_known(name: str, known: Collection[str], where: str, prefix: str) -> None:
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+        choices = f"did you mean {prefix}{near[0]}?" if near else f"known here: {_some(known)}"
+        raise UsageError(f"{where}: unknown key {prefix}{name}", remedy=choices)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file", remedy="give --config an existing TOML file") from None
+    except ValueError as error:  # no TOML, no UTF-8, or an integer of thousands of digits
+        raise UsageError(f"{path}: not valid TOML: {error}") from None
+
+
+def _parse_value(text: str) -> Any:
+    """A TOML value; what is none is a word."""
+    try:
+        parsed = tomllib.loads(f"value = {text}")
+    except ValueError:
+        return text
+    return parsed["value"] if list(parsed) == ["value"] else text
+
+
+def _some(names: Collection[str]) -> str:
+    """The first eight; the rest is in docs/config.md."""
+    return ", ".join(list(names)[:8]) + (", ... (docs/config.md has all)" if len(names) > 8 else "")
+
+
+def type_name(hint: Any) -> str:
+    """A key's type in words: int, float, str, or float or list of float."""
+    names = ["list of float" if option == tuple[float, ...] else option.__name__ for option in _options(hint)]
+    return " or ".join(names)
+
+
+def _options(hint: Any) -> tuple[Any, ...]:
+    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+
+
+def _of_type(value: Any, hint: Any) -> Any:
+    """The value, an integer as a float and a list as a tuple where the type asks for these."""
+    options = _options(hint)
+    if isinstance(value, list) and tuple[float, ...] in options:
+        numbers = tuple(_of_type(item, float) for item in value)
+        return numbers if all(type(number) is float for number in numbers) else value
+    if float in options and type(value) is int and abs(value) < 1 << 1023:  # what a float holds
+        return float(value)
+    return value

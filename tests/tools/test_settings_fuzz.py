@@ -1,0 +1,97 @@
+"""Every key of the configuration with values that none should take; the commands themselves run in the whole fuzz."""
+
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.config import load_config
+from splatctrl_cli.errors import UsageError
+from tests.cli import here
+from tools.settings_fuzz import Case, cases, fault_of, section_of
+
+ABSENT = {
+    "scene": ("reconstruct", "absent.mcap"),
+    "gaussians": ("reconstruct", "--method", "3dgs", "--dtu", "absent"),
+    "occupancy": ("reconstruct", "absent.mcap"),
+    "human": ("reconstruct", "absent.mcap"),
+    "field": ("sdf-bake", "absent"),
+    "control": ("replay", "absent.mcap", "--scene", "absent", "--urdf", "absent", "--mode", "closed-loop"),
+    "planner": ("replay", "absent.mcap", "--scene", "absent", "--urdf", "absent", "--mode", "closed-loop"),
+    "verdict": ("replay", "absent.mcap", "--scene", "absent", "--urdf", "absent"),
+}
+
+
+@pytest.mark.parametrize("section", ABSENT)
+def test_every_value_out_of_range_is_refused_in_words_and_every_other_one_is_taken(section: str) -> None:
+    asked = [case for case in cases() if case.section == section]
+    assert len({case.key for case in asked}) == len(section_of(section).declared)
+    for case in asked:
+        name = f"{section}.{case.key}"
+        try:
+            load_config(None, [f"{name}={case.text}"])
+        except UsageError as refused:
+            said = str(refused)
+            assert not case.is_in_range or "at least" in said or "at most" in said or "above" in said, case
+            assert fault_of(case, 2, said, []) == "", said
+        else:
+            assert case.is_in_range, case
+
+
+@pytest.mark.parametrize(("section", "words"), ABSENT.items())
+def test_a_command_refuses_its_settings_before_it_reads_anything(
+    tmp_path: Path, section: str, words: tuple[str, ...]
+) -> None:
+    for case in [case for case in cases() if case.section == section and case.text in {"nan", "bogus", "-1e308"}][:6]:
+        done = here.splatctrl(*words, "-o", tmp_path / "out", "--set", f"{section}.{case.key}={case.text}")
+        left = [path.name for path in tmp_path.iterdir()]
+        assert fault_of(case, done.returncode, done.stderr, left) == "" and done.returncode == 2
+        assert done.stderr.count("\n") == 1 and done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("control.margin=-0.05", "control.margin: expected 0 to 1 m, got -0.05"),
+        ("control.max_linear_speed=-1", "control.max_linear_speed: expected 0.0001 to 20 m/s, got -1.0"),
+        ("control.goal_position=100", "control.goal_position: expected 1e-06 to 0.1 m, got 100.0"),
+        ("control.pose_gain=-1", "control.pose_gain: expected 0 to 1000 1/s, got -1.0"),
+        ("control.smoothness_weight=-1", "control.smoothness_weight: expected 0 to 1000, got -1.0"),
+        ("control.posture_gain=-1", "control.posture_gain: expected 0 to 1000 1/s, got -1.0"),
+        ("control.self_margin=-1", "control.self_margin: expected 0 to 0.5 m, got -1.0"),
+        ("control.period=1e-320", "control.period: expected 0.0001 to 0.1 s, got 1e-320"),
+        ("occupancy.rule=bogus", "occupancy.rule: expected observed or literal, got 'bogus'"),
+        ("occupancy.voxel=5", "occupancy.voxel: expected 0.001 to 0.5 m, got 5.0"),
+        ("scene.radius_per_edge=1e308", "scene.radius_per_edge: expected 0.05 to 5, got 1e+308"),
+    ],
+)
+def test_what_was_taken_without_a_word_is_one_line_and_leaves_nothing(
+    tmp_path: Path, setting: str, said: str
+) -> None:
+    done = here.splatctrl(*ABSENT["control"], "-o", tmp_path / "out", "--set", setting)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"splatctrl: {said}; see docs/config.md\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("goal", ["--goal=nan,0,0,0,0,0,1", "--goal=0.4,0,inf,0,0,0,1", "--goal=1e300,0,0,0,0,0,1"])
+def test_a_goal_that_is_not_finite_is_one_line_and_leaves_nothing(tmp_path: Path, goal: str) -> None:
+    done = here.splatctrl(*ABSENT["control"], "-o", tmp_path / "out", goal)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "argument --goal: expected finite numbers joined by commas, up to 1e6, got" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "left", "fault"),
+    [
+        (None, "", [], "hang"),
+        (-11, "", [], "crash by signal 11"),
+        (70, "", [], "exit 70"),
+        (0, "", [], "taken out of its range"),
+        (2, "no", [], "refused in other words"),
+        (2, "control.margin: expected 0 to 1 m, got nan", ["out.partial"], "left behind: out.partial"),
+        (2, "control.margin: expected 0 to 1 m, got nan", [], ""),
+    ],
+)
+def test_a_fault_is_found(code: int | None, said: str, left: list[str], fault: str) -> None:
+    assert fault_of(Case(section="control", key="margin", text="nan"), code, said, left) == fault
