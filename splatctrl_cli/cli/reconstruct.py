@@ -31,6 +31,7 @@ DAMAGED = 3
 DEFAULT_POSE_JUMP = 1.0  # [m]
 GATED = (
     *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet"),
+    *("unrepresented_voxels", "unrepresented_volume", "max_unrepresented_voxels"),
     *("loss", "psnr"),
 )  # what --require can name
 

@@ -1,4 +1,4 @@
-"""Reads the ``scene/`` folder that `SceneWriter` writes, and its occupancy grids.
+"""Reads the ``scene/`` folder that `SceneWriter` writes.
 
 splats.ply  occupancy.npz  audit.jsonl  snapshots.csv  snapshots/NNNNNN.ply and .npz  checkpoint/state.npz  run.json
 """
@@ -11,19 +11,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.io.arrays import read_arrays, savez
 from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.io.output import PARTIAL
 from splatctrl_cli.io.splats import read_ply
-from splatctrl_cli.records import GaussianSet, OccupancyGrid, SplatSet, UInt8, VoxelState
+from splatctrl_cli.io.voxel_file import read_known_occupancy, read_known_states, read_occupancy, read_states
+from splatctrl_cli.records import GaussianSet, KnownVoxels, OccupancyGrid, SplatSet
 
 FORMAT = "splatctrl-scene 1"
-MOST_VOXELS = 400_000_000  # as many as reconstruct makes
-_HEADER = 1 << 20  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,67 +38,9 @@ class Snapshot:
         """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
         return read_states(self.occupancy_path) if self.occupancy_path.is_file() else None
 
-
-def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
-    """Write ``occupancy.npz``: log_odds, num_updates, entity, and a JSON header with frame and units."""
-    header = {
-        "format": "splatctrl-occupancy 1",
-        "frame": "world",
-        "units": "m",
-        "origin": grid.origin.tolist(),
-        "voxel": grid.voxel,
-        "shape": list(grid.log_odds.shape),
-        "values": "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept",
-    }
-    arrays: dict[str, NDArray[np.generic]] = {
-        "header": np.array(json.dumps(header)),
-        "log_odds": grid.log_odds,
-        "num_updates": grid.num_updates,
-        "entity": grid.entity,
-    }
-    savez(path, arrays)
-
-
-def write_states(path: Path, grid: OccupancyGrid, states: UInt8) -> None:
-    """Write `states` (X, Y, Z) of the voxels of `grid`: a tenth of the size of its occupancy."""
-    header = {
-        "format": "splatctrl-voxel-states 1",
-        "frame": "world",
-        "units": "m",
-        "origin": grid.origin.tolist(),
-        "voxel": grid.voxel,
-        "shape": list(states.shape),
-        "values": {state.name.lower(): int(state) for state in VoxelState},
-    }
-    savez(path, {"header": np.array(json.dumps(header)), "states": states}, level=6)
-
-
-def read_states(path: Path) -> OccupancyGrid:
-    """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
-    try:
-        arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
-        header = json.loads(str(arrays["header"]))
-        states = _voxels(arrays["states"], "states", np.uint8, header)
-        return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
-    except Exception as error:
-        raise InputError(f"{path}: not the voxel states of a snapshot: {error}") from error
-
-
-def read_occupancy(path: Path) -> OccupancyGrid:
-    """Read ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
-    try:
-        kinds: dict[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
-        arrays = read_arrays(path, ("header", *kinds), most=_HEADER + 7 * MOST_VOXELS)
-        header = json.loads(str(arrays["header"]))
-        return OccupancyGrid(
-            origin=np.array(header["origin"], np.float64),
-            voxel=float(header["voxel"]),
-            **{name: _voxels(arrays[name], name, kind, header) for name, kind in kinds.items()},
-        )
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:
-        raise InputError(f"{path}: not an occupancy grid of ours: {error}") from error
+    def known(self) -> KnownVoxels | None:
+        """What was known then of each voxel and when it was last seen; None in a scene of an older version."""
+        return read_known_states(self.occupancy_path) if self.occupancy_path.is_file() else None
 
 
 T = TypeVar("T")
@@ -138,14 +75,6 @@ def _names(value: list[Any]) -> tuple[str, ...]:
 def _color(value: list[Any]) -> tuple[float, float, float]:
     red, green, blue = (float(part) for part in value)
     return red, green, blue
-
-
-def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
-    """An array of one value a voxel. Raises ValueError for one of another type or shape than the header's."""
-    wanted = (np.dtype(kind), tuple(header["shape"]))
-    if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
-        raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
-    return values
 
 
 def _inside(name: str) -> str:
@@ -227,6 +156,11 @@ class SceneFolder:
         """The final occupancy grid."""
         self._expect_isotropic()
         return read_occupancy(self.path / "occupancy.npz")
+
+    def known(self) -> KnownVoxels | None:
+        """What was known at the end, and when it was last seen; None in a scene of an older version."""
+        self._expect_isotropic()
+        return read_known_occupancy(self.path / "occupancy.npz")
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.arrays import read_arrays, savez
 from splatctrl_cli.io.output import flush, write_durably
-from splatctrl_cli.io.scene_folder import Snapshot, write_occupancy, write_states
+from splatctrl_cli.io.scene_folder import Snapshot
 from splatctrl_cli.io.splats import write_ply
-from splatctrl_cli.records import OccupancyGrid, SplatSet, UInt8
+from splatctrl_cli.io.voxel_file import write_occupancy, write_states
+from splatctrl_cli.records import KnownVoxels, SplatSet, UInt8
 
 CHECKPOINT = "checkpoint/state.npz"
 AUDIT = "audit.jsonl"
@@ -102,11 +103,11 @@ class SceneWriter:
         """The rows written so far."""
         return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
 
-    def snapshot(self, stamp_ns: int, splats: SplatSet, grid: OccupancyGrid, states: UInt8) -> None:
-        """Write the splats as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels of `grid`."""
+    def snapshot(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8) -> None:
+        """Write the splats as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels known then."""
         snapshot = Snapshot(stamp_ns=stamp_ns, path=self._place(len(self.snapshots)), num_splats=len(splats))
         write_ply(snapshot.path, splats, self.comments | {"stamp_ns": str(stamp_ns)})
-        write_states(snapshot.occupancy_path, grid, states)
+        write_states(snapshot.occupancy_path, known, states)
         self.snapshots.append(snapshot)
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
@@ -124,10 +125,10 @@ class SceneWriter:
         arrays = {"progress": np.array(json.dumps(header)), **state}
         write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
 
-    def finish(self, stamp_ns: int, splats: SplatSet, grid: OccupancyGrid) -> None:
+    def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels) -> None:
         """Write the final splats, the occupancy grid and the index of snapshots."""
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
-        write_occupancy(self.folder / "occupancy.npz", grid)
+        write_occupancy(self.folder / "occupancy.npz", known)
         with (self.folder / "snapshots.csv").open("w", newline="", encoding="utf-8") as stream:
             table = csv.writer(stream, lineterminator="\n")
             table.writerow(["stamp_ns", "file", "num_splats"])

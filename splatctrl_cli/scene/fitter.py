@@ -17,7 +17,19 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
     unpack_parameters,
 )
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, PointCloud, RgbdFrame, SplatSet
+from splatctrl_cli.records import (
+    Balls,
+    Bool,
+    Box,
+    Float32,
+    Float64,
+    KnownVoxels,
+    Label,
+    OccupancyGrid,
+    PointCloud,
+    RgbdFrame,
+    SplatSet,
+)
 from splatctrl_cli.scene.audit import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.labels import relabel
@@ -39,6 +51,7 @@ from splatctrl_cli.scene.seeding import (
     seeds_at,
     world_points,
 )
+from splatctrl_cli.scene.unrepresented import unrepresented_voxels
 from splatctrl_cli.scene.window import View, Window, halved, make_view
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
@@ -76,6 +89,7 @@ class SceneFitter:
         self.refined = Refined(
             num_blocks=0, filled=Filled(added=0, relocated=0, unmet=0), removed=dict.fromkeys(REASONS, 0)
         )
+        self._unrepresented: Balls | None = None
         self._raster = Rasteriser(self.num_threads)
         self._loss = ImageLoss(self.num_threads)
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
@@ -152,6 +166,22 @@ class SceneFitter:
     def occupancy_grid(self) -> OccupancyGrid:
         """The occupancy grid as it is now."""
         return self.occupancy.grid()
+
+    @property
+    def unrepresented(self) -> Balls:
+        """What is occupied, not the robot, and has no splat, since the last time step or refining."""
+        if self._unrepresented is None:
+            self._unrepresented = unrepresented_voxels(self.occupancy, self.splats(), self.config)
+        return self._unrepresented
+
+    def known_voxels(self) -> KnownVoxels:
+        """What is known of space as it is now."""
+        return KnownVoxels(
+            grid=self.occupancy_grid(),
+            last_seen=self.occupancy.last_seen.copy(),
+            step_stamps_ns=np.array(self.occupancy.step_stamps_ns, np.int64),
+            unrepresented=self.unrepresented,
+        )
 
     def view(self, frame: RgbdFrame) -> View:
         """A frame as the optimiser takes it."""
@@ -363,6 +393,7 @@ class SceneFitter:
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]
     ) -> AuditRow:
         c, buffer = self.config, self.buffer
+        self._unrepresented = None
         counted = [view for view in views if view.target.counted.any()]
         terms = [known.get(id(view)) or self._evaluate(view, self._planes(view)) for view in counted]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
@@ -378,6 +409,7 @@ class SceneFitter:
             removed=removed,
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
             human=int((buffer.labels[buffer.is_alive] == Label.HUMAN).sum()),
+            unrepresented=len(self.unrepresented),
             without_depth=sum(not (view.frame.depth > 0).any() for view in views),
             loss=None if loss is None else round(loss + c.lambda_reg * opacity, 6),
             psnr=None if psnr is None else round(psnr, 4),

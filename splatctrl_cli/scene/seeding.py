@@ -148,7 +148,7 @@ def gap_seeds(
     the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows now; a centre may be half a
     voxel off its surface. With `half` 0 or 1 only every second of the rows and voxels: the other half waits.
     """
-    sources, spheres = [], _Spheres(splats, num_threads)
+    sources, spheres = [], SplatTree(splats, num_threads)
     for frame, mappable in views:
         mask = mappable.copy()
         stride = _gap_stride(frame, config.max_gap)
@@ -177,7 +177,7 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
 
 
-class _Spheres:
+class SplatTree:
     """Splats to look for from many points."""
 
     def __init__(self, splats: SplatSet, num_threads: int) -> None:

@@ -13,6 +13,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
+from tests.known_voxels import known
 
 SECOND = 1_000_000_000
 START = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
@@ -72,8 +73,8 @@ def write_scene(folder: Path, *snapshots: tuple[int, SplatSet], is_seen: bool = 
     folder.mkdir()
     writer = SceneWriter(folder, {"frame": "world"})
     for stamp_ns, splats in snapshots:
-        writer.snapshot(stamp_ns, splats, grid_seen(is_seen), grid_seen(is_seen).states(0.3, 0.7))
-    writer.finish(*snapshots[-1], grid_seen(is_seen))
+        writer.snapshot(stamp_ns, splats, known(grid_seen(is_seen), stamp_ns), grid_seen(is_seen).states(0.3, 0.7))
+    writer.finish(*snapshots[-1], known(grid_seen(is_seen), snapshots[-1][0]))
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": snapshots[-1][0]}
     (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
     return folder

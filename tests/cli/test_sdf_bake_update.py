@@ -15,6 +15,7 @@ from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.records import OccupancyGrid, SplatSet
 from tests.field.scenes import cloud, splat_set
+from tests.known_voxels import known
 
 BOX = "--box=-0.6,-0.6,-0.5,0.6,0.6,0.5"
 OPTIONS = ["--voxel", "0.025", "--formats", "npz", "--no-report", "-q"]
@@ -48,9 +49,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         num_updates=np.ones(shape, np.uint16),
         entity=np.zeros(shape, np.uint8),
     )
-    writer.snapshot(5 * SECOND, before(), occupancy, np.full(shape, 1, np.uint8))
-    writer.snapshot(7 * SECOND, after(before()), occupancy, np.full(shape, 2, np.uint8))
-    writer.finish(7 * SECOND, after(before()), occupancy)
+    writer.snapshot(5 * SECOND, before(), known(occupancy), np.full(shape, 1, np.uint8))
+    writer.snapshot(7 * SECOND, after(before()), known(occupancy), np.full(shape, 2, np.uint8))
+    writer.finish(7 * SECOND, after(before()), known(occupancy))
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": 7 * SECOND}
     (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
     return folder
