@@ -4,19 +4,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.records import Box, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Balls, Box, OccupancyGrid, SplatSet
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
     """Splats, and the occupancy of the same moment where there is one.
 
-    stamp_ns: when the splats were so; workspace: the box outside which the scene keeps no splats; cameras: those that
-    made it. Each None where it is not known (a bare splat file).
+    unrepresented: the occupied voxels without a splat; stamp_ns: when the splats were so; workspace: the box outside
+    which the scene keeps no splats; cameras: those that made it. Each None where it is not known (a bare splat file).
     """
 
     splats: SplatSet
     occupancy: OccupancyGrid | None
+    unrepresented: Balls | None
     stamp_ns: int | None
     workspace: Box | None
     cameras: tuple[str, ...] | None
@@ -41,6 +42,7 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     return BakeSource(
         splats=read_ply(path)[0],
         occupancy=None,
+        unrepresented=None,
         stamp_ns=None,
         workspace=None,
         cameras=None,
@@ -58,6 +60,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
     occupancy: OccupancyGrid | None
     if at_seconds is None:
         splats, occupancy, stamp_ns = scene.splats(), final, scene.stamp_ns
+        unrepresented = scene.unrepresented_at(None)
         files = [path / "splats.ply", path / "occupancy.npz"]
     else:
         if not scene.snapshots:
@@ -65,10 +68,12 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
         wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
         snapshot = scene.snapshot_at(wanted_ns)
         splats, occupancy, stamp_ns = read_ply(snapshot.path)[0], snapshot.occupancy(), snapshot.stamp_ns
+        unrepresented = scene.unrepresented_at(wanted_ns)
         files = [snapshot.path] if occupancy is None else [snapshot.path, snapshot.occupancy_path]
     return BakeSource(
         splats=splats,
         occupancy=occupancy,
+        unrepresented=unrepresented,
         stamp_ns=stamp_ns,
         workspace=_workspace(final),
         cameras=scene.cameras,

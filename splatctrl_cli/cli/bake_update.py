@@ -52,7 +52,8 @@ def read_previous(path: Path, scene: Path) -> Previous:
     if file.is_file():
         _check_memory(file)
     grid, run = read_npz(file), _run_of(path)
-    if run.get("command") != "sdf-bake" or run.get("splatctrl") != __version__:
+    is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
+    if not is_ours or "unrepresented_voxels" not in grid.header:
         raise UsageError(
             f"--update {path}: expected a field that sdf-bake of splatctrl {__version__} wrote, got one of "
             f"{run.get('command')} of {run.get('splatctrl')}",

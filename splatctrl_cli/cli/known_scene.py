@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from splatctrl_cli.control.explain import Obstacle
     from splatctrl_cli.control.rates import SceneStep
     from splatctrl_cli.field.grid import GridField
-    from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, OccupancyGrid, SplatSet
+    from splatctrl_cli.field.obstacles import ObstacleSpheres
+    from splatctrl_cli.records import Balls, Box, DistanceField, DistanceGrid, Float64, OccupancyGrid, SplatSet
 
     Index = NDArray[np.int64]
 
@@ -157,7 +158,8 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         )
 
     def fields(stamp_ns: int | None) -> KnownFields:
-        return splat_fields(scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns), config, threads)
+        splats = scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns)
+        return splat_fields(splats, config, threads, scene.unrepresented_at(stamp_ns))
 
     def key_of(index: int) -> int | None:
         return stamps[index] if index < len(stamps) - 1 else None  # the last is the final map
@@ -183,20 +185,22 @@ def known_space(occupancy: "OccupancyGrid") -> "Observed":
     return observed_lookup(known.astype("uint8"), occupancy.origin, occupancy.voxel)
 
 
-def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFields:
-    """Exact and barrier field of the splats, the robot's own left out; in the latter people count as much nearer as
-    `control.human_margin` asks.
+def splat_fields(
+    splats: "SplatSet", config: "Config", threads: int, unrepresented: "Balls | None" = None
+) -> KnownFields:
+    """Exact and barrier field of the splats and of the occupied voxels without one, the robot's own left out; in the
+    latter people count as much nearer as `control.human_margin` asks.
     """
     import numpy as np
 
     from splatctrl_cli.control.people import guarded
     from splatctrl_cli.field.distance import SphereField, field_over
-    from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats
+    from splatctrl_cli.field.obstacles import obstacle_spheres
     from splatctrl_cli.field.spheres import Spheres
     from splatctrl_cli.records import Label
 
-    chosen = field_splats(splats)
-    index = np.flatnonzero(np.isin(splats.labels, [int(label) for label in DEFAULT_LABELS]))
+    obstacles = obstacle_spheres(splats, unrepresented)
+    chosen = obstacles.splats
     spheres = Spheres.of(chosen.centers, chosen.radii)
     people = chosen.labels == Label.HUMAN
     human = SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None
@@ -206,18 +210,21 @@ def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFie
         barrier=barrier,
         distances={"exact": _distance(exact), "barrier": _distance(barrier)},
         median_radius=float(np.median(chosen.radii)),
-        obstacles=lambda points: _nearest_splats(splats, index[exact.nearest(points)], points),
+        obstacles=lambda points: _nearest_spheres(obstacles, exact.nearest(points), points),
         human=human,
     )
 
 
-def _nearest_splats(splats: "SplatSet", index: "Index", points: "Float64") -> "tuple[Obstacle, ...]":
-    """The splats that are nearest to points (Q, 3), by their index (Q,) in their file."""
+def _nearest_spheres(obstacles: "ObstacleSpheres", index: "Index", points: "Float64") -> "tuple[Obstacle, ...]":
+    """The spheres that are nearest to points (Q, 3), by their index (Q,) in the field."""
     import numpy as np
 
-    from splatctrl_cli.control.explain import Obstacle
+    from splatctrl_cli.control.explain import UNREPRESENTED, Obstacle
+    from splatctrl_cli.field.obstacles import NO_SPLAT
     from splatctrl_cli.records import Label
 
+    splats = obstacles.splats
+    in_file = [None if k == NO_SPLAT else int(k) for k in obstacles.index[index]]
     offset = points - splats.centers[index].astype(np.float64)
     gap = np.linalg.norm(offset, axis=1)
     radius = splats.radii[index].astype(np.float64)
@@ -226,10 +233,10 @@ def _nearest_splats(splats: "SplatSet", index: "Index", points: "Float64") -> "t
         Obstacle(
             distance=float(gap[k] - radius[k]),
             position=_place(surface[k]),
-            splat=int(splat),
-            label=Label(splats.labels[splat]).name.lower(),
+            splat=in_file[k],
+            label=UNREPRESENTED if in_file[k] is None else Label(splats.labels[sphere]).name.lower(),
         )
-        for k, splat in enumerate(index)
+        for k, sphere in enumerate(index)
     )
 
 

@@ -181,8 +181,10 @@ class Lockstep:
 
     def _fields(self, file: Path) -> KnownFields:
         from splatctrl_cli.io.splats import read_ply
+        from splatctrl_cli.io.voxel_file import read_unrepresented
 
-        return splat_fields(read_ply(file)[0], self._config, self._fitted.threads)
+        balls = read_unrepresented(file.with_suffix(".npz"))
+        return splat_fields(read_ply(file)[0], self._config, self._fitted.threads, balls)
 
     def _observed(self, points: "Float64") -> "UInt8":
         """The known space of the log, or of as much of it as the replay has passed."""

@@ -15,8 +15,14 @@ from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.io.output import PARTIAL
 from splatctrl_cli.io.splats import read_ply
-from splatctrl_cli.io.voxel_file import read_known_occupancy, read_known_states, read_occupancy, read_states
-from splatctrl_cli.records import GaussianSet, KnownVoxels, OccupancyGrid, SplatSet
+from splatctrl_cli.io.voxel_file import (
+    read_known_occupancy,
+    read_known_states,
+    read_occupancy,
+    read_states,
+    read_unrepresented,
+)
+from splatctrl_cli.records import Balls, GaussianSet, KnownVoxels, OccupancyGrid, SplatSet
 
 FORMAT = "splatctrl-scene 1"
 
@@ -189,6 +195,11 @@ class SceneFolder:
                 remedy="the scene was not known yet; ask for a later time",
             )
         return known[-1]
+
+    def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
+        """The occupied voxels without a splat, of `snapshot_at` or (None) at the end; None in an older scene."""
+        path = self.path / "occupancy.npz" if stamp_ns is None else self.snapshot_at(stamp_ns).occupancy_path
+        return read_unrepresented(path) if path.is_file() else None
 
     def splats_at(self, stamp_ns: int) -> SplatSet:
         """The splats of `snapshot_at`."""

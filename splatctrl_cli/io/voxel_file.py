@@ -101,6 +101,22 @@ def read_known_occupancy(path: Path) -> KnownVoxels | None:
     return _read_known(path, tuple(_GRID), _grid_of, "an occupancy grid of ours")
 
 
+def read_unrepresented(path: Path) -> Balls | None:
+    """The unrepresented voxels of either file, without the rest; None where an older version wrote it.
+
+    Raises InputError for anything else.
+    """
+    try:
+        header = json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+        if "step_stamps_ns" not in header:
+            return None
+        return _balls(read_arrays(path, _EVIDENCE[1:], most=13 * MOST_VOXELS), float(header["voxel"]))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        raise InputError(f"{path}: not a voxel file of ours: {error}") from error
+
+
 def _read_known(
     path: Path, names: tuple[str, ...], grid_of: Callable[[Arrays, Mapping[str, Any]], OccupancyGrid], what: str
 ) -> KnownVoxels | None:
