@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 DAMAGED = 3
 DEFAULT_POSE_JUMP = 1.0  # [m]
 GATED = (
-    *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet"),
+    *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet", "evicted"),
     *("unrepresented_voxels", "unrepresented_volume", "max_unrepresented_voxels"),
     *("loss", "psnr"),
 )  # what --require can name

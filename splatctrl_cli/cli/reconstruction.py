@@ -226,6 +226,7 @@ class Reconstruction:
             "added": sum(row.added for row in self.rows),
             "relocated": sum(row.relocated for row in self.rows),
             "unmet": last.unmet,
+            "evicted": sum(row.evicted for row in self.rows),
             "unrepresented_voxels": last.unrepresented,
             "unrepresented_volume": self.fitter.unrepresented.volume,
             "max_unrepresented_voxels": max(row.unrepresented for row in self.rows),

@@ -32,6 +32,7 @@ from splatctrl_cli.records import (
 )
 from splatctrl_cli.scene.audit import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
+from splatctrl_cli.scene.eviction import room_for
 from splatctrl_cli.scene.labels import relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.objective import BLACK, Color, loss_weights, mean_loss, psnr_of
@@ -51,11 +52,12 @@ from splatctrl_cli.scene.seeding import (
     seeds_at,
     world_points,
 )
-from splatctrl_cli.scene.unrepresented import unrepresented_voxels
+from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
 from splatctrl_cli.scene.window import View, Window, halved, make_view
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NOT_COVERED = 0.05  # accumulated opacity below which the background shows
+EVICT_EVERY = 5  # time steps: it takes as long as a few iterations, and what has no splat is a ball until then
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
 
@@ -115,7 +117,7 @@ class SceneFitter:
         self._optimise(num_coarse, rng, self._settings(), is_coarse=True)
         terms = self._optimise(num_iterations - num_coarse, rng, self._settings())
         self._prune(robot, views, removed)
-        filled += self._fill_gaps(views, half=self.num_steps % 2 if self.num_steps else None)
+        filled += self._fill_gaps(views, removed, half=self.num_steps % 2 if self.num_steps else None)
         relabel(self.buffer, self.occupancy, robot)
         self.num_steps += 1
         return self._audit(views, filled, removed, terms)
@@ -138,8 +140,9 @@ class SceneFitter:
         for block in range(self.refined.num_blocks, NUM_BLOCKS):
             self._refine_block(block, num_iterations, views)
             progress(num_iterations * (block + 1) // NUM_BLOCKS)
-        filled = self.refined.filled + self._fill_gaps(views)
-        return self._audit(views, filled, self.refined.removed, {})
+        removed = dict(self.refined.removed)
+        filled = self.refined.filled + self._fill_gaps(views, removed)
+        return self._audit(views, filled, removed, {})
 
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
         rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
@@ -272,19 +275,28 @@ class SceneFitter:
         reserve = int(self.config.gap_reserve * self.config.max_splats)
         return self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve)
 
-    def _fill_gaps(self, views: Sequence[View], half: int | None = None) -> Filled:
-        """Put splats where a measured surface is far from every sphere; half of it a time step, in turn."""
-        occupied = self.occupancy.occupied_centers()
+    def _fill_gaps(self, views: Sequence[View], removed: dict[str, int], half: int | None = None) -> Filled:
+        """Put splats where a measured surface is far from every sphere; half of it a time step, in turn.
+
+        Where slots are missing, splats are evicted for them every EVICT_EVERY time steps; counts in `removed`.
+        """
+        splats = self.splats()
         seeds = gap_seeds(
             [(view.frame, view.mappable) for view in views],
-            occupied[self.workspace.contains(occupied)],
+            bare_voxels(self.occupancy, splats, self.workspace, self.config, half),
             self.occupancy.config.voxel,
-            self.splats(),
+            splats,
             self.config,
             half=half,
             num_threads=self.num_threads,
         )
         seeds = seeds.select(self._is_grounded(seeds.centers, views))
+        num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
+        if num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
+            shown = self._misfits(views)[1]
+            is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, self.config.max_gap)
+            self.buffer.kill(is_evicted)
+            removed["evicted"] += int(is_evicted.sum())
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
@@ -406,6 +418,7 @@ class SceneFitter:
             added=filled.added,
             relocated=filled.relocated,
             unmet=filled.unmet,
+            evicted=removed["evicted"],
             removed=removed,
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
             human=int((buffer.labels[buffer.is_alive] == Label.HUMAN).sum()),

@@ -150,6 +150,15 @@ class OccupancyMap:
         """Which of flat indices (K,) the robot was ever in: what it left stays full for a while."""
         return np.asarray(self.entity.reshape(-1)[voxels] & SWEPT > 0)
 
+    def swept_box(self) -> Box | None:
+        """The box around the voxels that the robot was in so far: around its path; None where it was in none."""
+        is_swept = self.entity & SWEPT > 0
+        found = [np.flatnonzero(is_swept.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+        if not len(found[0]):
+            return None
+        lower, upper = (np.array([indices[end] for indices in found]) for end in (0, -1))
+        return Box(lower=self.origin + self.config.voxel * lower, upper=self.origin + self.config.voxel * upper)
+
     def centers_of(self, voxels: NDArray[np.intp]) -> Float32:
         """Centres (K, 3) [m], world, of flat indices (K,)."""
         cells = np.stack(np.unravel_index(voxels, self.log_odds.shape), axis=1)

@@ -146,7 +146,7 @@ def gap_seeds(
     Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Looked at are every
     third pixel and row of the views (a frame and its mappable pixels (H, W)) or fewer, half of `max_gap` apart, and
     the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows now; a centre may be half a
-    voxel off its surface. With `half` 0 or 1 only every second of the rows and voxels: the other half waits.
+    voxel off its surface. With `half` 0 or 1 only every second of the rows: the other half waits.
     """
     sources, spheres = [], SplatTree(splats, num_threads)
     for frame, mappable in views:
@@ -158,7 +158,6 @@ def gap_seeds(
         mask[mask] = spheres.are_further(world_points_at(frame, mask), config.max_gap)
         if mask.any():
             sources.append(candidates(frame, mask))
-    occupied = occupied if half is None else occupied[half::2]
     forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
         sources.append(_of_voxels(forgotten, splats))

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.records import Balls, Bool, Label, SplatSet
+from splatctrl_cli.records import Balls, Bool, Box, Float32, Label, SplatSet
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.seeding import SplatTree
 
@@ -35,6 +35,19 @@ def representing_reach(config: SceneConfig, voxel: float) -> float:
     `max_gap` and half a voxel, beyond which gap filling adds a splat; at most a voxel's diagonal.
     """
     return min(config.max_gap + 0.5 * voxel, 3**0.5 * voxel)
+
+
+def bare_voxels(
+    occupancy: OccupancyMap, splats: SplatSet, workspace: Box, config: SceneConfig, half: int | None = None
+) -> Float32:
+    """Centres (K, 3) [m] of occupied voxels in the workspace that gap filling has to look at: all but those surely
+    near a splat. With `half` 0 or 1 of every second voxel: the other half waits.
+    """
+    voxels = occupancy.occupied_voxels()
+    voxels = voxels[workspace.contains(occupancy.centers_of(voxels))]
+    voxels = voxels if half is None else voxels[half::2]
+    is_near = _surely_near(occupancy, splats, config.max_gap + 0.5 * occupancy.config.voxel)
+    return occupancy.centers_of(voxels[~is_near.reshape(-1)[voxels]])
 
 
 def _surely_near(occupancy: OccupancyMap, splats: SplatSet, reach: float) -> Bool:

@@ -7,7 +7,7 @@ from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.records import SWEPT, Balls, Box, Label, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.unrepresented import representing_reach, unrepresented_voxels
+from splatctrl_cli.scene.unrepresented import bare_voxels, representing_reach, unrepresented_voxels
 from tests.reference.unrepresented import unrepresented
 from tests.scene.wall import WORKSPACE, frame
 
@@ -87,6 +87,21 @@ def test_a_persons_voxels_are_balls_of_a_person() -> None:
 def test_a_ball_contains_its_voxel() -> None:
     balls = Balls.of_voxels(np.zeros((1, 3), np.float32), 0.02, np.zeros(1, np.uint8))
     assert balls.radius >= np.linalg.norm([0.01, 0.01, 0.01])
+
+
+def test_gap_filling_looks_at_all_that_is_bare_and_half_of_it_in_turn() -> None:
+    rng = np.random.default_rng(1)
+    grid = occupied()
+    grid.log_odds[rng.random(grid.log_odds.shape) < 0.2] = 2.0
+    splats = splats_at(rng.uniform(0.0, 0.4, (150, 3)), 0.02)
+    everything = bare_voxels(grid, splats, BOX, CONFIG)
+    halves = [bare_voxels(grid, splats, BOX, CONFIG, half) for half in (0, 1)]
+    assert sorted(np.concatenate(halves).tolist()) == sorted(everything.tolist())
+    assert min(len(half) for half in halves) > 0.3 * len(everything) > 0
+    missing = unrepresented_voxels(grid, splats, CONFIG).centers
+    assert {tuple(c) for c in missing.tolist()} <= {tuple(c) for c in everything.tolist()}
+    above = Box(lower=np.array([0.0, 0.0, 0.2]), upper=BOX.upper)
+    assert (bare_voxels(grid, splats, above, CONFIG)[:, 2] > 0.2).all()
 
 
 def test_what_a_starved_budget_leaves_out_is_told_and_kept() -> None:
