@@ -31,7 +31,7 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     for a time before the first snapshot.
     """
     from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.splats import read_ply
+    from splatctrl_cli.io.splats import read_world_splats
 
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
@@ -40,7 +40,7 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     if at_seconds is not None:
         raise UsageError(f"--at {at_seconds:g}: {path} is one splat set", remedy="give the scene's folder")
     return BakeSource(
-        splats=read_ply(path)[0],
+        splats=read_world_splats(path),
         occupancy=None,
         unrepresented=None,
         stamp_ns=None,
@@ -53,7 +53,6 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
 def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
     from splatctrl_cli.io.output import sha256
     from splatctrl_cli.io.scene_folder import open_scene
-    from splatctrl_cli.io.splats import read_ply
 
     scene = open_scene(path)
     final = scene.occupancy()
@@ -67,7 +66,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
             raise NotEvaluableError(f"{path}: has no snapshots", remedy="bake without --at")
         wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
         snapshot = scene.snapshot_at(wanted_ns)
-        splats, occupancy, stamp_ns = read_ply(snapshot.path)[0], snapshot.occupancy(), snapshot.stamp_ns
+        splats, occupancy, stamp_ns = snapshot.splats(), snapshot.occupancy(), snapshot.stamp_ns
         unrepresented = scene.unrepresented_at(wanted_ns)
         files = [snapshot.path] if occupancy is None else [snapshot.path, snapshot.occupancy_path]
     return BakeSource(

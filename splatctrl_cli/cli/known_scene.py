@@ -116,10 +116,11 @@ def from_grid(path: Path) -> KnownScene:
     from splatctrl_cli.field.grid import GridField, exact_channel
     from splatctrl_cli.io.grid import read_npz
     from splatctrl_cli.io.output import sha256
+    from splatctrl_cli.io.parts import Parts
     from splatctrl_cli.records import Box
 
     file = path / "field.npz" if path.is_dir() else path
-    grid = read_npz(file)
+    grid = read_npz(Parts.beside(file).checked(file))
     barrier = GridField(grid)
     fields = KnownFields(
         barrier=barrier,

@@ -62,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
         result = report.summary() | ({"accuracy": report.accuracy} if report.accuracy else {})
         truth = None if report.accuracy is None else report.accuracy.get("truth")
         figures = metrics(result, truth)
+        _remove(partial / FOLDER)
         write_run(
             partial,
             command="sdf-bake",
@@ -71,7 +72,6 @@ def run(args: argparse.Namespace) -> int:
             stopwatch=stopwatch,
             seed=args.seed,
         )
-        _remove(partial / FOLDER)
     console.log(f"baked in {stopwatch.seconds['bake']:.2f} s; wrote {out}")
     console.result(result, lines)
     check_gates(args.require, figures)

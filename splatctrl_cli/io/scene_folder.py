@@ -8,13 +8,15 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.io.output import PARTIAL
-from splatctrl_cli.io.splats import read_ply
+from splatctrl_cli.io.parts import Parts
+from splatctrl_cli.io.splats import read_world_splats
 from splatctrl_cli.io.voxel_file import (
     read_known_occupancy,
     read_known_states,
@@ -34,6 +36,7 @@ class Snapshot:
     stamp_ns: int
     path: Path
     num_splats: int
+    parts: Parts | None = None  # of its scene
 
     @property
     def occupancy_path(self) -> Path:
@@ -42,11 +45,26 @@ class Snapshot:
 
     def occupancy(self) -> OccupancyGrid | None:
         """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
-        return read_states(self.occupancy_path) if self.occupancy_path.is_file() else None
+        return read_states(self._checked(self.occupancy_path)) if self._has_voxels else None
 
     def known(self) -> KnownVoxels | None:
         """What was known then of each voxel and when it was last seen; None in a scene of an older version."""
-        return read_known_states(self.occupancy_path) if self.occupancy_path.is_file() else None
+        return read_known_states(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def unrepresented(self) -> Balls | None:
+        """The occupied voxels that had no splat then; None in a scene of an older version."""
+        return read_unrepresented(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def splats(self) -> SplatSet:
+        """The splats of that moment."""
+        return read_world_splats(self._checked(self.path))
+
+    @property
+    def _has_voxels(self) -> bool:
+        return self.occupancy_path.is_file() if self.parts is None else self.parts.has(self.occupancy_path)
+
+    def _checked(self, path: Path) -> Path:
+        return path if self.parts is None else self.parts.checked(path)
 
 
 T = TypeVar("T")
@@ -109,6 +127,16 @@ class SceneFolder:
                 raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
         return dict(run)
 
+    @cached_property
+    def parts(self) -> Parts:
+        """By which every file is checked when it is opened."""
+        return Parts.of_run(self.path, self.run)
+
+    @property
+    def has_digests(self) -> bool:
+        """False for a scene of an older version, whose files cannot be told from others."""
+        return self.parts.digests is not None
+
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that trained the scene."""
@@ -144,12 +172,12 @@ class SceneFolder:
 
     def gaussians(self) -> GaussianSet:
         """The Gaussians of a scene that is anisotropic."""
-        return read_gaussian_ply(self.path / "splats.ply")[0]
+        return read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
 
     def splats(self) -> SplatSet:
         """The final splats."""
         self._expect_isotropic()
-        return read_ply(self.path / "splats.ply")[0]
+        return read_world_splats(self.parts.checked(self.path / "splats.ply"))
 
     def _expect_isotropic(self) -> None:
         if self.is_anisotropic:
@@ -161,18 +189,28 @@ class SceneFolder:
     def occupancy(self) -> OccupancyGrid:
         """The final occupancy grid."""
         self._expect_isotropic()
-        return read_occupancy(self.path / "occupancy.npz")
+        return read_occupancy(self.parts.checked(self.path / "occupancy.npz"))
 
     def known(self) -> KnownVoxels | None:
         """What was known at the end, and when it was last seen; None in a scene of an older version."""
         self._expect_isotropic()
-        return read_known_occupancy(self.path / "occupancy.npz")
+        return read_known_occupancy(self.parts.checked(self.path / "occupancy.npz"))
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:
-        """By time."""
+        """By time. Raises InputError for a table that is not the one written, or whose stamps do not ascend."""
         self._expect_isotropic()
-        path = self.path / "snapshots.csv"
+        path = self.parts.checked(self.path / "snapshots.csv")
+        taken = self._snapshots_in(path)
+        for before, after in pairwise(taken):
+            if after.stamp_ns <= before.stamp_ns:
+                raise InputError(
+                    f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
+                    remedy="reconstruct the scene again",
+                )
+        return taken
+
+    def _snapshots_in(self, path: Path) -> tuple[Snapshot, ...]:
         try:
             with path.open(encoding="utf-8", newline="") as stream:
                 return tuple(
@@ -180,6 +218,7 @@ class SceneFolder:
                         stamp_ns=int(row["stamp_ns"]),
                         path=self.path / _inside(row["file"]),
                         num_splats=int(row["num_splats"]),
+                        parts=self.parts,
                     )
                     for row in csv.DictReader(stream)
                 )
@@ -198,12 +237,14 @@ class SceneFolder:
 
     def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
         """The occupied voxels without a splat, of `snapshot_at` or (None) at the end; None in an older scene."""
-        path = self.path / "occupancy.npz" if stamp_ns is None else self.snapshot_at(stamp_ns).occupancy_path
-        return read_unrepresented(path) if path.is_file() else None
+        if stamp_ns is not None:
+            return self.snapshot_at(stamp_ns).unrepresented()
+        path = self.path / "occupancy.npz"
+        return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
 
     def splats_at(self, stamp_ns: int) -> SplatSet:
         """The splats of `snapshot_at`."""
-        return read_ply(self.snapshot_at(stamp_ns).path)[0]
+        return self.snapshot_at(stamp_ns).splats()
 
 
 def open_scene(path: Path) -> SceneFolder:
