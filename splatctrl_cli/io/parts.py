@@ -8,6 +8,8 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.output import sha256
 
+REMEDY = "make it again with the command in run.json"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Parts:
@@ -15,6 +17,7 @@ class Parts:
 
     folder: Path
     digests: Mapping[str, str] | None = None
+    remedy: str = REMEDY
 
     @classmethod
     def of_run(cls, folder: Path, run: Mapping[str, object]) -> "Parts":
@@ -23,7 +26,7 @@ class Parts:
         if digests is not None and not (
             isinstance(digests, dict) and all(isinstance(value, str) for value in digests.values())
         ):
-            raise InputError(f"{folder / 'run.json'}: parts: expected digests by file name", remedy=_REMEDY)
+            raise InputError(f"{folder / 'run.json'}: parts: expected digests by file name", remedy=REMEDY)
         return cls(folder=folder, digests=digests)
 
     @classmethod
@@ -51,15 +54,12 @@ class Parts:
             return path
         wanted = self.digests.get(self._name(path))
         if wanted is None:
-            raise InputError(f"{path}: not among the parts that run.json lists", remedy=_REMEDY)
+            raise InputError(f"{path}: not among the parts that were listed", remedy=self.remedy)
         if not path.is_file():
-            raise InputError(f"{path}: missing; run.json lists it", remedy=_REMEDY)
+            raise InputError(f"{path}: missing; it was listed", remedy=self.remedy)
         if sha256(path) != wanted:
-            raise InputError(f"{path}: was changed after it was written (sha256 is not run.json's)", remedy=_REMEDY)
+            raise InputError(f"{path}: was changed after it was written (another sha256)", remedy=self.remedy)
         return path
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()
-
-
-_REMEDY = "make it again with the command in run.json"

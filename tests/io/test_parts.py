@@ -70,7 +70,7 @@ def test_a_file_that_was_changed_or_removed_is_refused_by_name(
         look(open_scene(scene))
     if name != "splats.ply":  # without which it is no scene
         (scene / name).unlink()
-        with pytest.raises(InputError, match=f"{name}: missing; run.json lists it"):
+        with pytest.raises(InputError, match=f"{name}: missing; it was listed"):
             look(open_scene(scene))
 
 

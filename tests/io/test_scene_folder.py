@@ -135,6 +135,16 @@ def test_a_partial_scene_that_lacks_a_file_does_not_go_on(tmp_path: Path, name: 
         SceneWriter(folder, {}, read_checkpoint(folder))
 
 
+def test_a_snapshot_that_was_changed_since_the_checkpoint_is_not_gone_on_with(tmp_path: Path) -> None:
+    folder = written(tmp_path / "scene")
+    checkpoint = read_checkpoint(folder)
+    file = folder / "snapshots" / "000001.npz"
+    file.write_bytes(file.read_bytes()[:-1] + b"x")
+    with pytest.raises(InputError, match=r"000001.npz: was changed after it was written .*; start over"):
+        SceneWriter(folder, {}, checkpoint)
+    SceneWriter(folder, {}, replace(checkpoint, parts=None))  # of an older version
+
+
 def test_an_interrupted_run_is_not_read_as_a_scene(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"an interrupted run; continue it: .*--resume"):
         open_scene(written(tmp_path / "scene.partial"))
