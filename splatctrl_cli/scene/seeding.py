@@ -180,7 +180,8 @@ class SplatTree:
     """Splats to look for from many points."""
 
     def __init__(self, splats: SplatSet, num_threads: int) -> None:
-        self._radii, self._num_threads = splats.radii, num_threads
+        self._num, self._num_threads = len(splats), num_threads
+        self._radii = np.append(splats.radii, np.float32(0.0))  # the last of what is not found, infinitely far
         self._tree = cKDTree(splats.centers)
 
     def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
@@ -188,12 +189,15 @@ class SplatTree:
 
         The nearest settles most of them, at a third of the cost of eight.
         """
-        if not len(self._radii) or not len(points):
+        if not self._num or not len(points):
             return np.ones(len(points), bool)
-        distance, nearest = self._tree.query(points, workers=self._num_threads)
+        most = float(gap + self._radii.max()) * 1.001
+        distance, nearest = self._tree.query(points, distance_upper_bound=most, workers=self._num_threads)
         is_further: Bool = distance - self._radii[nearest] > gap
-        order = np.arange(1, min(8, len(self._radii)) + 1)
-        distance, nearest = self._tree.query(points[is_further], k=order, workers=self._num_threads)
+        order = np.arange(1, min(8, self._num) + 1)
+        distance, nearest = self._tree.query(
+            points[is_further], k=order, distance_upper_bound=most, workers=self._num_threads
+        )
         is_further[is_further] = (distance - self._radii[nearest]).min(axis=1) > gap
         return is_further
 
