@@ -13,7 +13,18 @@ from typing import Any
 from benchmarks.measure import ROOT, Options, OtherLoad, Result, machine
 from splatctrl_cli.cli.common import table
 
-NAMES = ("iteration", "streaming", "occupancy", "field", "control", "cli", "ingest", "long_log", "planner")
+NAMES = (
+    "iteration",
+    "streaming",
+    "occupancy",
+    "sufficiency",
+    "field",
+    "control",
+    "cli",
+    "ingest",
+    "long_log",
+    "planner",
+)
 BASELINE = ROOT / "benchmarks" / "baseline.json"
 NOISE = 1.3  # a ratio that fell by less than this factor says nothing on a shared machine
 

@@ -307,6 +307,52 @@ class OccupancyGrid:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Balls:
+    """Equal balls that stand for voxels: centers (K, 3) float32 [m], world; radius [m], half a voxel's diagonal, so
+    that a ball contains its voxel; labels (K,) uint8 (`Label`).
+    """
+
+    centers: Float32
+    radius: float
+    labels: UInt8
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @classmethod
+    def of_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
+        """The balls around voxels of edge `voxel` [m] at centers (K, 3)."""
+        return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
+
+    @property
+    def volume(self) -> float:
+        """[m^3] of the voxels that they stand for."""
+        return len(self) * (2.0 * self.radius / 3**0.5) ** 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownVoxels:
+    """What was known of space at one moment, and how old that evidence is.
+
+    last_seen (X, Y, Z) uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which a camera
+    returned depth through or on the voxel, 0 never. unrepresented: what is occupied, not the robot, and has no splat.
+    """
+
+    grid: OccupancyGrid
+    last_seen: NDArray[np.uint16]
+    step_stamps_ns: NDArray[np.int64]
+    unrepresented: Balls
+
+    def last_seen_ns(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        """points (Q, 3) [m], world -> stamps (Q,) [ns] at which their voxels were last seen; -1 never, or outside."""
+        cell = np.floor((points - self.grid.origin) / self.grid.voxel + 0.5)
+        is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
+        i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
+        step = np.where(is_inside, self.last_seen[i, j, k], 0).astype(np.int64)
+        return np.concatenate([[-1], self.step_stamps_ns])[step]
+
+
+@dataclass(frozen=True, kw_only=True)
 class SphereSet:
     """Spheres that stand for a robot's links: centers (S, 3) [m] in the frame of links[s], radii (S,) [m]."""
 

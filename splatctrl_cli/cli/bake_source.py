@@ -4,19 +4,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.records import Box, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Balls, Box, OccupancyGrid, SplatSet
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakeSource:
     """Splats, and the occupancy of the same moment where there is one.
 
-    stamp_ns: when the splats were so; workspace: the box outside which the scene keeps no splats; cameras: those that
-    made it. Each None where it is not known (a bare splat file).
+    unrepresented: the occupied voxels without a splat; stamp_ns: when the splats were so; workspace: the box outside
+    which the scene keeps no splats; cameras: those that made it. Each None where it is not known (a bare splat file).
     """
 
     splats: SplatSet
     occupancy: OccupancyGrid | None
+    unrepresented: Balls | None
     stamp_ns: int | None
     workspace: Box | None
     cameras: tuple[str, ...] | None
@@ -30,7 +31,7 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     for a time before the first snapshot.
     """
     from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.splats import read_ply
+    from splatctrl_cli.io.splats import read_world_splats
 
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
@@ -39,8 +40,9 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     if at_seconds is not None:
         raise UsageError(f"--at {at_seconds:g}: {path} is one splat set", remedy="give the scene's folder")
     return BakeSource(
-        splats=read_ply(path)[0],
+        splats=read_world_splats(path),
         occupancy=None,
+        unrepresented=None,
         stamp_ns=None,
         workspace=None,
         cameras=None,
@@ -51,24 +53,26 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
 def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
     from splatctrl_cli.io.output import sha256
     from splatctrl_cli.io.scene_folder import open_scene
-    from splatctrl_cli.io.splats import read_ply
 
     scene = open_scene(path)
     final = scene.occupancy()
     occupancy: OccupancyGrid | None
     if at_seconds is None:
         splats, occupancy, stamp_ns = scene.splats(), final, scene.stamp_ns
+        unrepresented = scene.unrepresented_at(None)
         files = [path / "splats.ply", path / "occupancy.npz"]
     else:
         if not scene.snapshots:
             raise NotEvaluableError(f"{path}: has no snapshots", remedy="bake without --at")
         wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
         snapshot = scene.snapshot_at(wanted_ns)
-        splats, occupancy, stamp_ns = read_ply(snapshot.path)[0], snapshot.occupancy(), snapshot.stamp_ns
+        splats, occupancy, stamp_ns = snapshot.splats(), snapshot.occupancy(), snapshot.stamp_ns
+        unrepresented = scene.unrepresented_at(wanted_ns)
         files = [snapshot.path] if occupancy is None else [snapshot.path, snapshot.occupancy_path]
     return BakeSource(
         splats=splats,
         occupancy=occupancy,
+        unrepresented=unrepresented,
         stamp_ns=stamp_ns,
         workspace=_workspace(final),
         cameras=scene.cameras,

@@ -45,14 +45,17 @@ def read_previous(path: Path, scene: Path) -> Previous:
     from splatctrl_cli import __version__
     from splatctrl_cli.io.grid import read_npz
     from splatctrl_cli.io.output import sha256
+    from splatctrl_cli.io.parts import Parts
 
     if not path.is_dir():
         raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
     file = path / "field.npz"
     if file.is_file():
         _check_memory(file)
-    grid, run = read_npz(file), _run_of(path)
-    if run.get("command") != "sdf-bake" or run.get("splatctrl") != __version__:
+    run = _run_of(path)
+    grid = read_npz(Parts.of_run(path, run).checked(file))
+    is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
+    if not is_ours or "unrepresented_voxels" not in grid.header:
         raise UsageError(
             f"--update {path}: expected a field that sdf-bake of splatctrl {__version__} wrote, got one of "
             f"{run.get('command')} of {run.get('splatctrl')}",

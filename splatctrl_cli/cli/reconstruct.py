@@ -34,7 +34,8 @@ DECIDING_OPTIONS = (
 )  # what decides the bytes of a scene, beside the configuration
 PASSED_ON = ("urdf", "spheres", "points", "allow_disagreement", "force", "resume", "seed", "threads")
 GATED = (
-    *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet"),
+    *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet", "evicted"),
+    *("unrepresented_voxels", "unrepresented_volume", "max_unrepresented_voxels"),
     *("loss", "psnr"),
 )  # what --require can name
 

@@ -79,13 +79,16 @@ def _protocol(reference: Reference, scene: "SceneFolder", scores: Scores, lpips:
 def _free_mass(path: Path, scene: "SceneFolder") -> float:
     """nan where the scene has no occupancy grid."""
     from splatctrl_cli.evaluate.free_space import free_mass
+    from splatctrl_cli.field.obstacles import obstacle_spheres
     from splatctrl_cli.io.scene_folder import run_value
+    from splatctrl_cli.records import Label
 
     if not (path / "occupancy.npz").is_file():
         return nan
     keys = ("config", "occupancy", "free_below")
     free_below = run_value(scene.run, keys, float, where=str(path / "run.json"))
-    return free_mass(scene.splats(), scene.occupancy(), free_below)
+    spheres = obstacle_spheres(scene.splats(), scene.unrepresented_at(None), frozenset(Label))
+    return free_mass(spheres.splats, scene.occupancy(), free_below)
 
 
 def write_scores(

@@ -63,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
         result = report.summary() | ({"accuracy": report.accuracy} if report.accuracy else {})
         truth = None if report.accuracy is None else report.accuracy.get("truth")
         figures = metrics(result, truth)
+        _remove(partial / FOLDER)
         write_run(
             partial,
             command="sdf-bake",
@@ -72,7 +73,6 @@ def run(args: argparse.Namespace) -> int:
             stopwatch=stopwatch,
             seed=args.seed,
         )
-        _remove(partial / FOLDER)
     console.log(f"baked in {stopwatch.seconds['bake']:.2f} s; wrote {out}")
     console.result(result, lines)
     check_gates(args.require, figures)
@@ -81,12 +81,15 @@ def run(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class _Job:
-    """What was read, and what is to be made of it; chosen: the splats of the field."""
+    """What was read, and what is to be made of it; chosen: the spheres of the field, splats and then
+    balls around unrepresented voxels.
+    """
 
     config: "Config"
     source: "BakeSource"
     previous: "Previous | None"
     chosen: "SplatSet"
+    num_unrepresented: int
     labels: "frozenset[Label]"
     formats: tuple[str, ...]
     baker: "Baker"
@@ -135,13 +138,14 @@ def _read(
     from splatctrl_cli.cli.bake_update import check_same, read_previous
     from splatctrl_cli.field.baker import Baker
     from splatctrl_cli.field.layout import GridLayout
-    from splatctrl_cli.field.selection import field_splats
+    from splatctrl_cli.field.obstacles import obstacle_spheres
     from splatctrl_cli.io.grid_formats import check_formats
 
     with stopwatch.stage("read"):
         source = read_bake_source(args.scene, args.at)
         previous = None if args.update is None else read_previous(args.update, args.previous_scene or args.scene)
-    chosen = field_splats(source.splats, labels)
+    obstacles = obstacle_spheres(source.splats, source.unrepresented, labels)
+    chosen = obstacles.splats
     channels = channels_of(
         args, DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels), config.field.unknown
     )
@@ -167,6 +171,7 @@ def _read(
         source=source,
         previous=previous,
         chosen=chosen,
+        num_unrepresented=obstacles.num_unrepresented,
         labels=labels,
         formats=formats,
         baker=baker,
@@ -222,7 +227,12 @@ def _baked(
         ranges = list(slabs(baker.layout, baker.channels))
         baker.counts = counts_after(counts, old, baker, task.kept.mask, ranges)
     header = field_header(
-        job.source.splats, job.chosen, job.labels, baker, has_occupancy=job.source.occupancy is not None
+        job.source.splats,
+        job.chosen,
+        job.labels,
+        baker,
+        has_occupancy=job.source.occupancy is not None,
+        num_unrepresented=job.num_unrepresented,
     )
     treated = {} if task.unknown is None else task.unknown.header()
     place = {"digests": job.source.digests, "stamp_ns": job.source.stamp_ns}
@@ -234,7 +244,7 @@ def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | N
     from splatctrl_cli.cli.bake_run import BakeTask
     from splatctrl_cli.field.baker import Baker
     from splatctrl_cli.field.incremental import changed_blocks
-    from splatctrl_cli.field.selection import field_splats
+    from splatctrl_cli.field.obstacles import obstacle_spheres
     from splatctrl_cli.field.slabs import Kept
     from splatctrl_cli.jobs.resume import deciding_versions
 
@@ -249,7 +259,8 @@ def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | N
         task = BakeTask(baker=job.baker, settings=settings, unknown=_unknown(job), formats=job.formats)
         return task, None, None
     settings |= {f"sha256 of {name}": value for name, value in job.previous.digests.items()}
-    before = field_splats(job.previous.source.splats, job.labels)
+    past = job.previous.source
+    before = obstacle_spheres(past.splats, past.unrepresented, job.labels).splats
     needed = [name for name in ("sdf", "se", "gpdf") if name in job.baker.channels]
     old = Baker(before, job.baker.layout, job.config.field, channels=needed, threads=args.threads)
     changes = changed_blocks(before, old, job.chosen, job.baker)

@@ -13,6 +13,7 @@ from splatctrl_cli.control.motion_limits import Strain
 from splatctrl_cli.control.step import ControlStep, RowKind
 from splatctrl_cli.records import Bool, Float64
 
+UNREPRESENTED = "unrepresented voxel"  # label of an obstacle that is occupied and has no splat
 MAX_NAMES = 12  # of an event; how many there are is in num_names
 
 
@@ -52,7 +53,7 @@ INTERVENTIONS = frozenset(
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
     """What is nearest: its surface's distance [m] to a point and its place (3,) [m], world; a splat's index in the
-    file of its scene and its label, or a grid's cell, or the name of what it is.
+    file of its scene and its label (UNREPRESENTED without a splat), a grid's cell, or the name of what it is.
     """
 
     distance: float
@@ -65,8 +66,11 @@ class Obstacle:
     def __str__(self) -> str:
         where = ", ".join(f"{v:.3f}" for v in self.position)
         if self.name:
-            return f"{self.name} at ({where})"
-        what = f"cell {self.cell}" if self.splat is None else f"{self.label} splat {self.splat}"
+            what = self.name
+        elif self.splat is not None:
+            what = f"{self.label} splat {self.splat}"
+        else:
+            what = UNREPRESENTED if self.label == UNREPRESENTED else f"cell {self.cell}"
         return f"{what} at ({where})"
 
 

@@ -20,9 +20,17 @@ MEANING = {
 
 
 def field_header(
-    splats: SplatSet, chosen: SplatSet, labels: Collection[Label], baker: Baker, *, has_occupancy: bool
+    splats: SplatSet,
+    chosen: SplatSet,
+    labels: Collection[Label],
+    baker: Baker,
+    *,
+    has_occupancy: bool,
+    num_unrepresented: int = 0,
 ) -> dict[str, object]:
-    """The header of what `baker` baked of `chosen`, those of `splats` that have one of `labels`."""
+    """The header of what `baker` baked of `chosen`: those of `splats` that have one of `labels`, then
+    `num_unrepresented` balls around occupied voxels without a splat.
+    """
     config = baker.config
     radii: Mapping[str, float] = {
         "min": float(chosen.radii.min()),
@@ -53,7 +61,8 @@ def field_header(
         "inside": "a shell: cells deep inside a closed object read positive; take the sign there from observed",
         "labels": sorted(label.name.lower() for label in labels),
         "splats_given": label_counts(splats),
-        "splats_used": label_counts(chosen),
+        "splats_used": label_counts(chosen.select(np.arange(len(chosen)) < len(chosen) - num_unrepresented)),
+        "unrepresented_voxels": num_unrepresented,
         "radius": radii,
         "health": field_health(chosen.centers, chosen.radii, config.length_scale, kernels=baker.kernels).as_dict(),
     }

@@ -15,10 +15,7 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
 
     Raises NotEvaluableError where none is left, InputError for a label that is none of ours.
     """
-    unknown = ~np.isin(splats.labels, [int(label) for label in Label])
-    if unknown.any():
-        i = int(np.argmax(unknown))
-        raise InputError(f"splat {i}: expected a label of 0, 1 or 2, got {splats.labels[i]}")
+    check_labels(splats)
     kept = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
     if not len(kept):
         names = ", ".join(label.name.lower() for label in sorted(labels))
@@ -27,6 +24,14 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
             remedy="bake a scene that has some, or name other labels with --include",
         )
     return kept
+
+
+def check_labels(splats: SplatSet) -> None:
+    """Raise InputError for a label that is none of ours."""
+    unknown = ~np.isin(splats.labels, [int(label) for label in Label])
+    if unknown.any():
+        i = int(np.argmax(unknown))
+        raise InputError(f"splat {i}: expected a label of 0, 1 or 2, got {splats.labels[i]}")
 
 
 def label_counts(splats: SplatSet) -> dict[str, int]:

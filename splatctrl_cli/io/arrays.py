@@ -31,15 +31,13 @@ class Pieces:
     make: Callable[[], Iterable[NDArray[np.generic]]]
 
 
-def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 1) -> None:
+def savez(path: Path, arrays: Mapping[str, NDArray[np.generic] | Pieces], *, level: int = 6) -> None:
     """What `np.savez_compressed` writes, at zlib's `level` (0: stored), one array at a time."""
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(path, "w", method, compresslevel=level) as archive:
         for name, array in arrays.items():
-            entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-            entry.compress_type = method
             size = np.dtype(array.dtype).itemsize * int(np.prod(array.shape))
-            with archive.open(entry, "w", force_zip64=size >= 2**30) as stream:
+            with archive.open(f"{name}.npy", "w", force_zip64=size >= 2**30) as stream:
                 if isinstance(array, Pieces):
                     layout = {"descr": array.dtype, "fortran_order": False, "shape": array.shape}
                     np.lib.format.write_array_header_1_0(stream, layout)

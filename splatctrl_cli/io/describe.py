@@ -22,10 +22,11 @@ from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.raw_log import RawLog
 from splatctrl_cli.io.rig import camera_topics, missing
 from splatctrl_cli.io.rig_folder import RigFolderSource, open_image_folder
-from splatctrl_cli.io.scene_folder import read_occupancy, run_value
+from splatctrl_cli.io.scene_folder import run_value
 from splatctrl_cli.io.shot import Shot
 from splatctrl_cli.io.summary import Grid, Summary
 from splatctrl_cli.io.survey import Survey, TopicSurvey
+from splatctrl_cli.io.voxel_file import read_occupancy
 
 _LOG_MAGICS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3")
 _LOG_SUFFIXES = {".mcap", ".bag", ".db3"}

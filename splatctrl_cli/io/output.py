@@ -21,6 +21,8 @@ MARKERS = ("run.json", "capture.json")  # at the top of every folder that a comm
 PARTIAL = ".partial"  # ends the name of an output that is not whole
 PACKAGES = ("numpy", "scipy", "torch", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
+WITH_PARTS = ("reconstruct", "sdf-bake", "replay")  # commands whose folders others rely on
+NO_PARTS = ("run.json", "checkpoint")  # what holds the digests, and what only an interrupted run reads
 
 
 def is_write_failure(error: OSError, output: Path | None = None) -> bool:
@@ -192,6 +194,12 @@ class Stopwatch:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
+def part_digests(folder: Path) -> dict[str, str]:
+    """sha256 by name, relative to `folder`, of every file in it and in its folders."""
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return {name: sha256(folder / name) for name in names if name.partition("/")[0] not in NO_PARTS}
+
+
 def write_run(
     folder: Path,
     *,
@@ -202,7 +210,8 @@ def write_run(
     stopwatch: Stopwatch,
     seed: int = 0,
 ) -> None:
-    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, and what came out.
+    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, and what came out; of WITH_PARTS
+    also the sha256 of every file, which is checked when one is opened: it is to be written last.
 
     ``--resume`` is left out of the arguments: an interrupted run leaves what an uninterrupted one does.
     """
@@ -219,6 +228,8 @@ def write_run(
         "metrics": metrics,
         "seconds": {name: round(value, 4) for name, value in stopwatch.seconds.items()},
     }
+    if command in WITH_PARTS:
+        run["parts"] = part_digests(folder)
     write_json(folder / "run.json", run)
 
 

@@ -1,4 +1,4 @@
-"""Reads the ``scene/`` folder that `SceneWriter` writes, and its occupancy grids.
+"""Reads the ``scene/`` folder that `SceneWriter` writes.
 
 splats.ply  occupancy.npz  audit.jsonl  snapshots.csv  snapshots/NNNNNN.ply and .npz  checkpoint/state.npz  run.json
 """
@@ -8,22 +8,25 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.io.arrays import read_arrays, savez
 from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.io.output import PARTIAL
-from splatctrl_cli.io.splats import read_ply
-from splatctrl_cli.records import GaussianSet, OccupancyGrid, SplatSet, UInt8, VoxelState
+from splatctrl_cli.io.parts import Parts
+from splatctrl_cli.io.splats import read_world_splats
+from splatctrl_cli.io.voxel_file import (
+    read_known_occupancy,
+    read_known_states,
+    read_occupancy,
+    read_states,
+    read_unrepresented,
+)
+from splatctrl_cli.records import Balls, GaussianSet, KnownVoxels, OccupancyGrid, SplatSet
 
 FORMAT = "splatctrl-scene 1"
-MOST_VOXELS = 400_000_000  # as many as reconstruct makes
-_HEADER = 1 << 20  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +36,7 @@ class Snapshot:
     stamp_ns: int
     path: Path
     num_splats: int
+    parts: Parts | None = None  # of its scene
 
     @property
     def occupancy_path(self) -> Path:
@@ -41,69 +45,26 @@ class Snapshot:
 
     def occupancy(self) -> OccupancyGrid | None:
         """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
-        return read_states(self.occupancy_path) if self.occupancy_path.is_file() else None
+        return read_states(self._checked(self.occupancy_path)) if self._has_voxels else None
 
+    def known(self) -> KnownVoxels | None:
+        """What was known then of each voxel and when it was last seen; None in a scene of an older version."""
+        return read_known_states(self._checked(self.occupancy_path)) if self._has_voxels else None
 
-def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
-    """Write ``occupancy.npz``: log_odds, num_updates, entity, and a JSON header with frame and units."""
-    header = {
-        "format": "splatctrl-occupancy 1",
-        "frame": "world",
-        "units": "m",
-        "origin": grid.origin.tolist(),
-        "voxel": grid.voxel,
-        "shape": list(grid.log_odds.shape),
-        "values": "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept",
-    }
-    arrays: dict[str, NDArray[np.generic]] = {
-        "header": np.array(json.dumps(header)),
-        "log_odds": grid.log_odds,
-        "num_updates": grid.num_updates,
-        "entity": grid.entity,
-    }
-    savez(path, arrays)
+    def unrepresented(self) -> Balls | None:
+        """The occupied voxels that had no splat then; None in a scene of an older version."""
+        return read_unrepresented(self._checked(self.occupancy_path)) if self._has_voxels else None
 
+    def splats(self) -> SplatSet:
+        """The splats of that moment."""
+        return read_world_splats(self._checked(self.path))
 
-def write_states(path: Path, grid: OccupancyGrid, states: UInt8) -> None:
-    """Write `states` (X, Y, Z) of the voxels of `grid`: a tenth of the size of its occupancy."""
-    header = {
-        "format": "splatctrl-voxel-states 1",
-        "frame": "world",
-        "units": "m",
-        "origin": grid.origin.tolist(),
-        "voxel": grid.voxel,
-        "shape": list(states.shape),
-        "values": {state.name.lower(): int(state) for state in VoxelState},
-    }
-    savez(path, {"header": np.array(json.dumps(header)), "states": states}, level=6)
+    @property
+    def _has_voxels(self) -> bool:
+        return self.occupancy_path.is_file() if self.parts is None else self.parts.has(self.occupancy_path)
 
-
-def read_states(path: Path) -> OccupancyGrid:
-    """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
-    try:
-        arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
-        header = json.loads(str(arrays["header"]))
-        states = _voxels(arrays["states"], "states", np.uint8, header)
-        return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
-    except Exception as error:
-        raise InputError(f"{path}: not the voxel states of a snapshot: {error}") from error
-
-
-def read_occupancy(path: Path) -> OccupancyGrid:
-    """Read ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
-    try:
-        kinds: dict[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
-        arrays = read_arrays(path, ("header", *kinds), most=_HEADER + 7 * MOST_VOXELS)
-        header = json.loads(str(arrays["header"]))
-        return OccupancyGrid(
-            origin=np.array(header["origin"], np.float64),
-            voxel=float(header["voxel"]),
-            **{name: _voxels(arrays[name], name, kind, header) for name, kind in kinds.items()},
-        )
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:
-        raise InputError(f"{path}: not an occupancy grid of ours: {error}") from error
+    def _checked(self, path: Path) -> Path:
+        return path if self.parts is None else self.parts.checked(path)
 
 
 T = TypeVar("T")
@@ -140,14 +101,6 @@ def _color(value: list[Any]) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
-    """An array of one value a voxel. Raises ValueError for one of another type or shape than the header's."""
-    wanted = (np.dtype(kind), tuple(header["shape"]))
-    if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
-        raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
-    return values
-
-
 def _inside(name: str) -> str:
     """The name itself. Raises ValueError where it leads out of its folder."""
     if Path(name).is_absolute() or ".." in Path(name).parts:
@@ -173,6 +126,16 @@ class SceneFolder:
             if not isinstance(run, dict) or not isinstance(run.get(name, {}), dict):
                 raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
         return dict(run)
+
+    @cached_property
+    def parts(self) -> Parts:
+        """By which every file is checked when it is opened."""
+        return Parts.of_run(self.path, self.run)
+
+    @property
+    def has_digests(self) -> bool:
+        """False for a scene of an older version, whose files cannot be told from others."""
+        return self.parts.digests is not None
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -209,12 +172,12 @@ class SceneFolder:
 
     def gaussians(self) -> GaussianSet:
         """The Gaussians of a scene that is anisotropic."""
-        return read_gaussian_ply(self.path / "splats.ply")[0]
+        return read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
 
     def splats(self) -> SplatSet:
         """The final splats."""
         self._expect_isotropic()
-        return read_ply(self.path / "splats.ply")[0]
+        return read_world_splats(self.parts.checked(self.path / "splats.ply"))
 
     def _expect_isotropic(self) -> None:
         if self.is_anisotropic:
@@ -226,13 +189,28 @@ class SceneFolder:
     def occupancy(self) -> OccupancyGrid:
         """The final occupancy grid."""
         self._expect_isotropic()
-        return read_occupancy(self.path / "occupancy.npz")
+        return read_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+
+    def known(self) -> KnownVoxels | None:
+        """What was known at the end, and when it was last seen; None in a scene of an older version."""
+        self._expect_isotropic()
+        return read_known_occupancy(self.parts.checked(self.path / "occupancy.npz"))
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:
-        """By time."""
+        """By time. Raises InputError for a table that is not the one written, or whose stamps do not ascend."""
         self._expect_isotropic()
-        path = self.path / "snapshots.csv"
+        path = self.parts.checked(self.path / "snapshots.csv")
+        taken = self._snapshots_in(path)
+        for before, after in pairwise(taken):
+            if after.stamp_ns <= before.stamp_ns:
+                raise InputError(
+                    f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
+                    remedy="reconstruct the scene again",
+                )
+        return taken
+
+    def _snapshots_in(self, path: Path) -> tuple[Snapshot, ...]:
         try:
             with path.open(encoding="utf-8", newline="") as stream:
                 return tuple(
@@ -240,6 +218,7 @@ class SceneFolder:
                         stamp_ns=int(row["stamp_ns"]),
                         path=self.path / _inside(row["file"]),
                         num_splats=int(row["num_splats"]),
+                        parts=self.parts,
                     )
                     for row in csv.DictReader(stream)
                 )
@@ -256,9 +235,16 @@ class SceneFolder:
             )
         return known[-1]
 
+    def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
+        """The occupied voxels without a splat, of `snapshot_at` or (None) at the end; None in an older scene."""
+        if stamp_ns is not None:
+            return self.snapshot_at(stamp_ns).unrepresented()
+        path = self.path / "occupancy.npz"
+        return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
+
     def splats_at(self, stamp_ns: int) -> SplatSet:
         """The splats of `snapshot_at`."""
-        return read_ply(self.snapshot_at(stamp_ns).path)[0]
+        return self.snapshot_at(stamp_ns).splats()
 
 
 def open_scene(path: Path) -> SceneFolder:

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.arrays import read_arrays, savez
-from splatctrl_cli.io.output import flush, write_durably
-from splatctrl_cli.io.scene_folder import Snapshot, write_occupancy, write_states
+from splatctrl_cli.io.output import flush, sha256, write_durably
+from splatctrl_cli.io.parts import Parts
+from splatctrl_cli.io.scene_folder import Snapshot
 from splatctrl_cli.io.splats import write_ply
-from splatctrl_cli.records import OccupancyGrid, SplatSet, UInt8
+from splatctrl_cli.io.voxel_file import write_occupancy, write_states
+from splatctrl_cli.records import KnownVoxels, SplatSet, UInt8
 
 CHECKPOINT = "checkpoint/state.npz"
 AUDIT = "audit.jsonl"
+START_OVER = "start over: the same command without --resume"
 _MOST_STATE = 1 << 32  # bytes: a grid of as many voxels as reconstruct makes takes 2.8e9, its splats the rest
 
 State = Mapping[str, NDArray[np.generic]]
@@ -27,13 +30,15 @@ State = Mapping[str, NDArray[np.generic]]
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
     """An interrupted run: `progress` as it was given to `SceneWriter.checkpoint`, the fitter's `state`, and what of
-    the folder was written then (bytes of the audit; stamp and number of splats of each snapshot).
+    the folder was written then (bytes of the audit; stamp and number of splats of each snapshot; sha256 of the
+    snapshots' files by name, None in a checkpoint of an older version).
     """
 
     progress: dict[str, Any]
     state: State
     audit_bytes: int
     snapshots: tuple[tuple[int, int], ...]
+    parts: dict[str, str] | None = None
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
@@ -47,11 +52,10 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             state=state,
             audit_bytes=int(header["audit_bytes"]),
             snapshots=tuple((int(stamp_ns), int(count)) for stamp_ns, count in header["snapshots"]),
+            parts=header.get("parts"),
         )
     except Exception as error:
-        raise InputError(
-            f"{path}: cannot be read: {error}", remedy="start over: the same command without --resume"
-        ) from error
+        raise InputError(f"{path}: cannot be read: {error}", remedy=START_OVER) from error
 
 
 class SceneWriter:
@@ -63,6 +67,7 @@ class SceneWriter:
         self.snapshots: list[Snapshot] = []
         self._audit = folder / AUDIT
         self._num_flushed = 0  # snapshots that are known to be on disk
+        self._digests: dict[str, str] = {}  # of their files, by name
         if checkpoint is None:
             (folder / "snapshots").mkdir()
             (folder / CHECKPOINT).parent.mkdir()
@@ -80,9 +85,14 @@ class SceneWriter:
         missing = sorted(path.name for path in kept if not path.is_file())
         if missing or self._audit.stat().st_size < checkpoint.audit_bytes:
             raise InputError(
-                f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it",
-                remedy="start over: the same command without --resume",
+                f"{self.folder}: {missing[0] if missing else AUDIT}: not as the checkpoint left it", remedy=START_OVER
             )
+        written = Parts(
+            folder=self.folder, digests=checkpoint.parts, remedy="start over: the same command without --resume"
+        )
+        for path in sorted(kept - {self._audit, self.folder / CHECKPOINT}):
+            written.checked(path)
+        self._digests = dict(checkpoint.parts or {})
         for path in sorted(self.folder.rglob("*")):
             if path not in kept and not path.is_dir():
                 path.unlink()
@@ -102,32 +112,34 @@ class SceneWriter:
         """The rows written so far."""
         return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
 
-    def snapshot(self, stamp_ns: int, splats: SplatSet, grid: OccupancyGrid, states: UInt8) -> None:
-        """Write the splats as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels of `grid`."""
+    def snapshot(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8) -> None:
+        """Write the splats as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels known then."""
         snapshot = Snapshot(stamp_ns=stamp_ns, path=self._place(len(self.snapshots)), num_splats=len(splats))
         write_ply(snapshot.path, splats, self.comments | {"stamp_ns": str(stamp_ns)})
-        write_states(snapshot.occupancy_path, grid, states)
+        write_states(snapshot.occupancy_path, known, states)
         self.snapshots.append(snapshot)
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
         """Replace the checkpoint in one step, when all that it counts on is on disk; the last is compressed."""
         flush(self._audit)
         for snapshot in self.snapshots[self._num_flushed :]:
-            flush(snapshot.path)
-            flush(snapshot.occupancy_path)
+            for path in (snapshot.path, snapshot.occupancy_path):
+                flush(path)
+                self._digests[path.relative_to(self.folder).as_posix()] = sha256(path)
         self._num_flushed = len(self.snapshots)
         header = {
             "progress": progress,
             "audit_bytes": self._audit.stat().st_size,
             "snapshots": [[s.stamp_ns, s.num_splats] for s in self.snapshots],
+            "parts": self._digests,
         }
         arrays = {"progress": np.array(json.dumps(header)), **state}
         write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
 
-    def finish(self, stamp_ns: int, splats: SplatSet, grid: OccupancyGrid) -> None:
+    def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels) -> None:
         """Write the final splats, the occupancy grid and the index of snapshots."""
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
-        write_occupancy(self.folder / "occupancy.npz", grid)
+        write_occupancy(self.folder / "occupancy.npz", known)
         with (self.folder / "snapshots.csv").open("w", newline="", encoding="utf-8") as stream:
             table = csv.writer(stream, lineterminator="\n")
             table.writerow(["stamp_ns", "file", "num_splats"])

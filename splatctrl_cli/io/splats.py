@@ -24,6 +24,7 @@ NAMES = (
 )
 DTYPE = np.dtype([*((name, "<f4") for name in NAMES), ("label", "u1"), ("density", "<f4")])
 REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz"} and not name.startswith("rot_"))
+METRES = ("m", "metre", "metres", "meter", "meters")
 HEADER_COMMENTS = {
     "frame": "world",
     "units": "metre",
@@ -62,6 +63,21 @@ def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
     """
     ply = read_table(path, "vertex", REQUIRED)
     return splats_of(ply), ply.pairs()
+
+
+def read_world_splats(path: Path) -> SplatSet:
+    """The splats of a PLY file whose distances mean metres in the world. Raises as `read_ply`, and InputError for a
+    file whose comments name other units or another frame; one that names none is taken at its word.
+    """
+    splats, comments = read_ply(path)
+    for key, known in (("units", METRES), ("frame", ("world",))):
+        said = comments.get(key)
+        if said is not None and said.lower() not in known:
+            raise InputError(
+                f"{path}: comment '{key}: {said}': expected {known[0]}",
+                remedy="distances are in metres in the world: transform the splats, and correct the comment",
+            )
+    return splats
 
 
 def splats_of(ply: PlyFile) -> SplatSet:

@@ -13,18 +13,29 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction, Observed, observed_lookup
-from splatctrl_cli.control.explain import Obstacle
+from splatctrl_cli.control.explain import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.people import guarded
 from splatctrl_cli.control.rates import SceneStep
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid import GridField, exact_channel
-from splatctrl_cli.field.selection import DEFAULT_LABELS, field_splats
+from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.io.grid import read_npz
 from splatctrl_cli.io.output import sha256
+from splatctrl_cli.io.parts import Parts
 from splatctrl_cli.io.scene_folder import open_scene
-from splatctrl_cli.records import SWEPT, Box, DistanceField, DistanceGrid, Float64, Label, OccupancyGrid, SplatSet
+from splatctrl_cli.records import (
+    SWEPT,
+    Balls,
+    Box,
+    DistanceField,
+    DistanceGrid,
+    Float64,
+    Label,
+    OccupancyGrid,
+    SplatSet,
+)
 
 Index = NDArray[np.int64]
 
@@ -37,6 +48,7 @@ class KnownFields:
     """The fields of one scene: `barrier` is what a controller uses, `distances` what an audit puts side by side.
 
     obstacles: points (Q, 3) [m], world -> what is nearest to each. human: its people alone, None without any.
+    splats_alone: the exact distance without voxels that no splat represents, None where there are no such voxels.
     """
 
     barrier: "DistanceField"
@@ -44,6 +56,7 @@ class KnownFields:
     median_radius: float
     obstacles: "Callable[[Float64], tuple[Obstacle, ...]]"
     human: "DistanceField | None" = None
+    splats_alone: "DistanceFunction | None" = None
 
 
 def _nothing(_: int) -> None:
@@ -122,7 +135,7 @@ def from_grid(path: Path) -> KnownScene:
     """The scene of a baked grid: one field for all times. `path` is a field folder or a ``field.npz``."""
 
     file = path / "field.npz" if path.is_dir() else path
-    grid = read_npz(file)
+    grid = read_npz(Parts.beside(file).checked(file))
     barrier = GridField(grid)
     fields = KnownFields(
         barrier=barrier,
@@ -160,7 +173,8 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         )
 
     def fields(stamp_ns: int | None) -> KnownFields:
-        return splat_fields(scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns), config, threads)
+        splats = scene.splats() if stamp_ns is None else scene.splats_at(stamp_ns)
+        return splat_fields(splats, config, threads, scene.unrepresented_at(stamp_ns))
 
     def key_of(index: int) -> int | None:
         return stamps[index] if index < len(stamps) - 1 else None  # the last is the final map
@@ -185,13 +199,15 @@ def known_space(occupancy: "OccupancyGrid") -> "Observed":
     return observed_lookup(known.astype("uint8"), occupancy.origin, occupancy.voxel)
 
 
-def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFields:
-    """Exact and barrier field of the splats, the robot's own left out; in the latter people count as much nearer as
-    `control.human_margin` asks.
+def splat_fields(
+    splats: "SplatSet", config: "Config", threads: int, unrepresented: Balls | None = None
+) -> KnownFields:
+    """Exact and barrier field of the splats and of the occupied voxels without one, the robot's own left out; in the
+    latter people count as much nearer as `control.human_margin` asks.
     """
 
-    chosen = field_splats(splats)
-    index = np.flatnonzero(np.isin(splats.labels, [int(label) for label in DEFAULT_LABELS]))
+    obstacles = obstacle_spheres(splats, unrepresented)
+    chosen = obstacles.splats
     spheres = Spheres.of(chosen.centers, chosen.radii)
     people = chosen.labels == Label.HUMAN
     human = SphereField(chosen.centers[people], chosen.radii[people], threads=threads) if people.any() else None
@@ -201,14 +217,27 @@ def splat_fields(splats: "SplatSet", config: "Config", threads: int) -> KnownFie
         barrier=barrier,
         distances={"exact": _distance(exact), "barrier": _distance(barrier)},
         median_radius=float(np.median(chosen.radii)),
-        obstacles=lambda points: _nearest_splats(splats, index[exact.nearest(points)], points),
+        obstacles=lambda points: _nearest_spheres(obstacles, exact.nearest(points), points),
         human=human,
+        splats_alone=_splats_alone(obstacles, threads),
     )
 
 
-def _nearest_splats(splats: "SplatSet", index: "Index", points: "Float64") -> "tuple[Obstacle, ...]":
-    """The splats that are nearest to points (Q, 3), by their index (Q,) in their file."""
+def _splats_alone(obstacles: ObstacleSpheres, threads: int) -> DistanceFunction | None:
+    """The exact distance without the balls of voxels that no splat represents, None where there are none."""
+    if not obstacles.num_unrepresented:
+        return None
+    is_splat = obstacles.index != NO_SPLAT
+    centers, radii = obstacles.splats.centers[is_splat], obstacles.splats.radii[is_splat]
+    if not len(radii):
+        return lambda points: np.full(len(points), np.inf)
+    return _distance(SphereField(centers, radii, threads=threads))
 
+
+def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) -> tuple[Obstacle, ...]:
+    """The spheres that are nearest to points (Q, 3), by their index (Q,) in the field."""
+    splats = obstacles.splats
+    in_file = [None if k == NO_SPLAT else int(k) for k in obstacles.index[index]]
     offset = points - splats.centers[index].astype(np.float64)
     gap = np.linalg.norm(offset, axis=1)
     radius = splats.radii[index].astype(np.float64)
@@ -217,10 +246,10 @@ def _nearest_splats(splats: "SplatSet", index: "Index", points: "Float64") -> "t
         Obstacle(
             distance=float(gap[k] - radius[k]),
             position=_place(surface[k]),
-            splat=int(splat),
-            label=Label(splats.labels[splat]).name.lower(),
+            splat=in_file[k],
+            label=UNREPRESENTED if in_file[k] is None else Label(splats.labels[sphere]).name.lower(),
         )
-        for k, splat in enumerate(index)
+        for k, sphere in enumerate(index)
     )
 
 

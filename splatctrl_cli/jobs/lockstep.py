@@ -14,6 +14,7 @@ from splatctrl_cli.io.ros_log import RosLogSource
 from splatctrl_cli.io.shot import ShotSource
 from splatctrl_cli.io.splats import read_ply
 from splatctrl_cli.io.state_source import open_states
+from splatctrl_cli.io.voxel_file import read_unrepresented
 from splatctrl_cli.jobs.known_scene import (
     KnownFields,
     KnownScene,
@@ -160,7 +161,8 @@ class Lockstep:
 
     def _fields(self, file: Path) -> KnownFields:
 
-        return splat_fields(read_ply(file)[0], self._config, self._fitted.threads)
+        balls = read_unrepresented(file.with_suffix(".npz"))
+        return splat_fields(read_ply(file)[0], self._config, self._fitted.threads, balls)
 
     def _observed(self, points: "Float64") -> "UInt8":
         """The known space of the log, or of as much of it as the replay has passed."""

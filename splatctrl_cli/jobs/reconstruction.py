@@ -207,7 +207,7 @@ class Reconstruction:
     def finish(self) -> None:
         """Write what the end of the log left."""
         assert self.fitter is not None
-        self.writer.finish(self.rows[-1].stamp_ns, self.fitter.splats(), self.fitter.occupancy_grid())
+        self.writer.finish(self.rows[-1].stamp_ns, self.fitter.splats(), self.fitter.known_voxels())
         self._save(is_last=True)
 
     def metrics(self) -> dict[str, object]:
@@ -226,7 +226,11 @@ class Reconstruction:
             "added": sum(row.added for row in self.rows),
             "relocated": sum(row.relocated for row in self.rows),
             "robot_joints": None if self.robot is None else list(self.robot.joint_names),
-            "unmet": sum(row.unmet for row in self.rows),
+            "unmet": last.unmet,
+            "evicted": sum(row.evicted for row in self.rows),
+            "unrepresented_voxels": last.unrepresented,
+            "unrepresented_volume": self.fitter.unrepresented.volume,
+            "max_unrepresented_voxels": max(row.unrepresented for row in self.rows),
             "loss": last.loss,
             "psnr": last.psnr,
             "background": list(self.fitter.background or (0.0, 0.0, 0.0)),
@@ -255,9 +259,9 @@ class Reconstruction:
     def snapshot(self, stamp_ns: int) -> None:
         """Write the map as it is."""
         assert self.fitter is not None
-        grid, thresholds = self.fitter.occupancy_grid(), self.config.occupancy
-        states = grid.states(thresholds.free_below, thresholds.occupied_above)
-        self.writer.snapshot(stamp_ns, self.fitter.splats(), grid, states)
+        known, thresholds = self.fitter.known_voxels(), self.config.occupancy
+        states = known.grid.states(thresholds.free_below, thresholds.occupied_above)
+        self.writer.snapshot(stamp_ns, self.fitter.splats(), known, states)
 
     def _save_if_due(self) -> None:
         period = self.config.scene.checkpoint_period

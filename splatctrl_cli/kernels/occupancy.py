@@ -35,23 +35,26 @@ def integrate_depth(
     grid: Float64,
     log_odds: NDArray[np.float32],
     num_updates: NDArray[np.uint16],
+    last_seen: NDArray[np.uint16],
     hits: UInt8,
     image: DepthImage,
     *,
     hit: float,
     miss: float,
     limit: float,
+    step: int,
     num_threads: int,
 ) -> None:
-    """Add one depth image to log_odds and num_updates (X, Y, Z); hits (X, Y, Z) is scratch, zero before and after.
+    """Add one depth image to log_odds and num_updates (X, Y, Z); last_seen (X, Y, Z) becomes `step` where they
+    change. hits (X, Y, Z) is scratch, zero before and after.
 
     A voxel that holds a pixel's point is a hit. Else it is a miss where its centre falls on a pixel whose depth lies
     beyond the centre; a pixel without depth takes that of the nearest one with it, up to where the two rays are
     half a voxel apart. Depth beyond max_range frees what is nearer.
     """
     native.integrate_depth(
-        grid, log_odds, num_updates, hits, image.intrinsics, image.T_world_camera, image.depth, image.min_range,
-        image.max_range, hit, miss, limit, num_threads,
+        grid, log_odds, num_updates, last_seen, hits, image.intrinsics, image.T_world_camera, image.depth,
+        image.min_range, image.max_range, hit, miss, limit, step, num_threads,
     )  # fmt: skip
 
 

@@ -10,8 +10,10 @@ class AuditRow:
     """What one time step did: counts of splats, loss (eq. 4) and PSNR [dB] over the newest frames, each as the last
     iteration that looked at it found it.
 
-    dead: slots that wait to be reused. unmet: seeds that found no free slot. without_depth: frames without any valid
-    depth, which seed nothing. loss and psnr are None where no view shows anything of the workspace.
+    dead: slots that wait to be reused. unmet: seeds that found no slot. evicted: splats that
+    gave theirs to surface without any. unrepresented: occupied voxels that no splat
+    stands for. without_depth: frames without any valid depth, which seed nothing. loss and psnr are None where no
+    view shows anything of the workspace.
     """
 
     stamp_ns: int
@@ -21,9 +23,11 @@ class AuditRow:
     added: int
     relocated: int
     unmet: int
+    evicted: int
     removed: dict[str, int]
     robot: int
     human: int
+    unrepresented: int
     without_depth: int
     loss: float | None
     psnr: float | None

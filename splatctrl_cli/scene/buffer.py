@@ -27,6 +27,10 @@ class Seeds:
         """The seeds where `keep` (K,) is true, in order."""
         return Seeds(centers=self.centers[keep], radii=self.radii[keep], colors=self.colors[keep])
 
+    def reordered(self, order: NDArray[np.intp]) -> "Seeds":
+        """The seeds at indices `order`."""
+        return Seeds(centers=self.centers[order], radii=self.radii[order], colors=self.colors[order])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:

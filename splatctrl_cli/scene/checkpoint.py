@@ -18,7 +18,7 @@ from splatctrl_cli.scene.window import Window
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
-GRID_NAMES = ("log_odds", "num_updates", "entity")
+GRID_NAMES = ("log_odds", "num_updates", "entity", "last_seen")
 DENSITY_NAMES = ("edge", "tolerance", "num_candidates")
 FILLED_NAMES = ("added", "relocated", "unmet")
 FRAME_NAMES = tuple(field.name for field in fields(RgbdFrame))
@@ -32,6 +32,7 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     """
     arrays: dict[str, NDArray[np.generic]] = dict(fitter.buffer.arrays())
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
+    arrays["step_stamps_ns"] = np.array(fitter.occupancy.step_stamps_ns, np.int64)
     arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
     arrays["counters"] = np.array([fitter.num_steps, fitter.num_iterations], np.int64)
     arrays["refined"] = _refined_array(fitter.refined)
@@ -54,6 +55,7 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
         array[...] = arrays[name]
     for name in GRID_NAMES:
         getattr(fitter.occupancy, name)[...] = arrays[name]
+    fitter.occupancy.step_stamps_ns = [int(stamp) for stamp in arrays["step_stamps_ns"]]
     fitter.num_steps, fitter.num_iterations = (int(n) for n in arrays["counters"])
     fitter.refined = _refined(arrays["refined"])
     masks = {name.removeprefix("mounted/"): array for name, array in arrays.items() if name.startswith("mounted/")}

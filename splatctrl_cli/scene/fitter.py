@@ -16,9 +16,22 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
     unpack_parameters,
 )
-from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, OccupancyGrid, PointCloud, RgbdFrame, SplatSet
+from splatctrl_cli.records import (
+    Balls,
+    Bool,
+    Box,
+    Float32,
+    Float64,
+    KnownVoxels,
+    Label,
+    OccupancyGrid,
+    PointCloud,
+    RgbdFrame,
+    SplatSet,
+)
 from splatctrl_cli.scene.audit import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
+from splatctrl_cli.scene.eviction import room_for
 from splatctrl_cli.scene.labels import relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.objective import BLACK, Color, loss_weights, mean_loss, psnr_of
@@ -38,10 +51,12 @@ from splatctrl_cli.scene.seeding import (
     seeds_at,
     world_points,
 )
+from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
 from splatctrl_cli.scene.window import View, Window, halved, make_view
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NOT_COVERED = 0.05  # accumulated opacity below which the background shows
+EVICT_EVERY = 5  # time steps: it takes as long as a few iterations, and what has no splat is a ball until then
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
 
@@ -71,6 +86,7 @@ class SceneFitter:
         self.refined = Refined(
             num_blocks=0, filled=Filled(added=0, relocated=0, unmet=0), removed=dict.fromkeys(REASONS, 0)
         )
+        self._unrepresented: Balls | None = None
         self._raster = Rasteriser(self.num_threads)
         self._loss = ImageLoss(self.num_threads)
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
@@ -96,7 +112,7 @@ class SceneFitter:
         self._optimise(num_coarse, rng, self._settings(), is_coarse=True)
         terms = self._optimise(num_iterations - num_coarse, rng, self._settings())
         self._prune(robot, views, removed)
-        filled += self._fill_gaps(views, half=self.num_steps % 2 if self.num_steps else None)
+        filled += self._fill_gaps(views, removed, half=self.num_steps % 2 if self.num_steps else None)
         relabel(self.buffer, self.occupancy, robot)
         self.num_steps += 1
         return self._audit(views, filled, removed, terms)
@@ -119,8 +135,9 @@ class SceneFitter:
         for block in range(self.refined.num_blocks, NUM_BLOCKS):
             self._refine_block(block, num_iterations, views)
             progress(num_iterations * (block + 1) // NUM_BLOCKS)
-        filled = self.refined.filled + self._fill_gaps(views)
-        return self._audit(views, filled, self.refined.removed, {})
+        removed = dict(self.refined.removed)
+        filled = self.refined.filled + self._fill_gaps(views, removed)
+        return self._audit(views, filled, removed, {})
 
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
         rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
@@ -147,6 +164,22 @@ class SceneFitter:
     def occupancy_grid(self) -> OccupancyGrid:
         """The occupancy grid as it is now."""
         return self.occupancy.grid()
+
+    @property
+    def unrepresented(self) -> Balls:
+        """What is occupied, not the robot, and has no splat, since the last time step or refining."""
+        if self._unrepresented is None:
+            self._unrepresented = unrepresented_voxels(self.occupancy, self.splats(), self.config)
+        return self._unrepresented
+
+    def known_voxels(self) -> KnownVoxels:
+        """What is known of space as it is now."""
+        return KnownVoxels(
+            grid=self.occupancy_grid(),
+            last_seen=self.occupancy.last_seen.copy(),
+            step_stamps_ns=np.array(self.occupancy.step_stamps_ns, np.int64),
+            unrepresented=self.unrepresented,
+        )
 
     def view(self, frame: RgbdFrame) -> View:
         """A frame as the optimiser takes it."""
@@ -237,19 +270,28 @@ class SceneFitter:
         reserve = int(self.config.gap_reserve * self.config.max_splats)
         return self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve)
 
-    def _fill_gaps(self, views: Sequence[View], half: int | None = None) -> Filled:
-        """Put splats where a measured surface is far from every sphere; half of it a time step, in turn."""
-        occupied = self.occupancy.occupied_centers()
+    def _fill_gaps(self, views: Sequence[View], removed: dict[str, int], half: int | None = None) -> Filled:
+        """Put splats where a measured surface is far from every sphere; half of it a time step, in turn.
+
+        Where slots are missing, splats are evicted for them every EVICT_EVERY time steps; counts in `removed`.
+        """
+        splats = self.splats()
         seeds = gap_seeds(
             [(view.frame, view.mappable) for view in views],
-            occupied[self.workspace.contains(occupied)],
+            bare_voxels(self.occupancy, splats, self.workspace, self.config, half),
             self.occupancy.config.voxel,
-            self.splats(),
+            splats,
             self.config,
             half=half,
             num_threads=self.num_threads,
         )
         seeds = seeds.select(self._is_grounded(seeds.centers, views))
+        num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
+        if num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
+            shown = self._misfits(views)[1]
+            is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, self.config.max_gap)
+            self.buffer.kill(is_evicted)
+            removed["evicted"] += int(is_evicted.sum())
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
@@ -358,6 +400,7 @@ class SceneFitter:
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]
     ) -> AuditRow:
         c, buffer = self.config, self.buffer
+        self._unrepresented = None
         counted = [view for view in views if view.target.counted.any()]
         terms = [known.get(id(view)) or self._evaluate(view, self._planes(view)) for view in counted]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
@@ -370,9 +413,11 @@ class SceneFitter:
             added=filled.added,
             relocated=filled.relocated,
             unmet=filled.unmet,
+            evicted=removed["evicted"],
             removed=removed,
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
             human=int((buffer.labels[buffer.is_alive] == Label.HUMAN).sum()),
+            unrepresented=len(self.unrepresented),
             without_depth=sum(not (view.frame.depth > 0).any() for view in views),
             loss=None if loss is None else round(loss + c.lambda_reg * opacity, 6),
             psnr=None if psnr is None else round(psnr, 4),

@@ -11,6 +11,7 @@ from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_h
 from splatctrl_cli.records import SWEPT, Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
 
 MAX_VOXELS = 400_000_000
+MAX_STEPS = 65_535  # time steps that `last_seen` tells apart
 
 
 class OccupancyMap:
@@ -31,6 +32,8 @@ class OccupancyMap:
         self.log_odds: Float32 = np.zeros(shape, np.float32)
         self.num_updates: NDArray[np.uint16] = np.zeros(shape, np.uint16)
         self.entity: NDArray[np.uint8] = np.zeros(shape, np.uint8)
+        self.last_seen: NDArray[np.uint16] = np.zeros(shape, np.uint16)
+        self.step_stamps_ns: list[int] = []  # of the time steps that `last_seen` counts, from 1
         self._hits: NDArray[np.uint8] = np.zeros(shape, np.uint8)
         self._packed = pack_grid(self.origin, config.voxel, shape)
 
@@ -40,6 +43,7 @@ class OccupancyMap:
         A voxel loses the bit when rays pass it, or when masked images hit it with other pixels alone. What nothing
         passes and no masked image hits keeps it: who stands behind something is still there.
         """
+        self._begin_step(frames)
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
         entity, log_odds = self.entity.reshape(-1), self.log_odds.reshape(-1)
         human = np.flatnonzero(entity & Label.HUMAN) if masked else np.zeros(0, np.int64)
@@ -52,17 +56,28 @@ class OccupancyMap:
         for frame, mask in masked:
             self._label_hits(frame, mask != 0, set_bits=Label.HUMAN)
 
+    def _begin_step(self, frames: Sequence[RgbdFrame]) -> None:
+        """Count a time step, by its earliest stamp. Where there are too many, every second one goes: what was seen in
+        it counts as seen in the one before.
+        """
+        if len(self.step_stamps_ns) == MAX_STEPS:
+            self.step_stamps_ns = self.step_stamps_ns[::2]
+            self.last_seen -= self.last_seen // 2  # (n + 1) // 2, without an overflow
+        self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
+
     def integrate(self, frame: RgbdFrame) -> None:
-        """Add one depth image: what its rays pass is free, where they end are hits."""
+        """Add one depth image: what its rays pass is free, where they end are hits; both are now last seen."""
         integrate_depth(
             self._packed,
             self.log_odds,
             self.num_updates,
+            self.last_seen,
             self._hits,
             self._image(frame),
             hit=self.config.log_odds_hit,
             miss=self.config.log_odds_miss,
             limit=self.config.log_odds_limit,
+            step=len(self.step_stamps_ns),
             num_threads=self.num_threads,
         )
 
@@ -124,17 +139,34 @@ class OccupancyMap:
         log_odds = np.where(is_observed, largest, np.float32(0.0))
         return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32), is_observed
 
-    def occupied_centers(self) -> Float32:
-        """Centres (K, 3) [m] of voxels that were hit more than once and that the robot was never in.
-
-        One hit may be noise; voxels that the robot left stay full for a while.
-        """
+    def occupied_voxels(self) -> NDArray[np.intp]:
+        """Flat indices (K,) of voxels that were hit more than once (one hit may be noise) and are not the robot's."""
         config = self.config
         threshold = float(np.log(config.occupied_above / (1.0 - config.occupied_above)))
         voxels = np.flatnonzero(self.log_odds > max(threshold, 1.5 * config.log_odds_hit))
-        voxels = voxels[self.entity.ravel()[voxels] & SWEPT == 0]
+        return voxels[~self._may_be_robot(voxels)]
+
+    def _may_be_robot(self, voxels: NDArray[np.intp]) -> Bool:
+        """Which of flat indices (K,) the robot was ever in: what it left stays full for a while."""
+        return np.asarray(self.entity.reshape(-1)[voxels] & SWEPT > 0)
+
+    def swept_box(self) -> Box | None:
+        """The box around the voxels that the robot was in so far: around its path; None where it was in none."""
+        is_swept = self.entity & SWEPT > 0
+        found = [np.flatnonzero(is_swept.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+        if not len(found[0]):
+            return None
+        lower, upper = (np.array([indices[end] for indices in found]) for end in (0, -1))
+        return Box(lower=self.origin + self.config.voxel * lower, upper=self.origin + self.config.voxel * upper)
+
+    def centers_of(self, voxels: NDArray[np.intp]) -> Float32:
+        """Centres (K, 3) [m], world, of flat indices (K,)."""
         cells = np.stack(np.unravel_index(voxels, self.log_odds.shape), axis=1)
-        return (self.origin + config.voxel * cells).astype(np.float32)
+        return (self.origin + self.config.voxel * cells).astype(np.float32)
+
+    def occupied_centers(self) -> Float32:
+        """Centres (K, 3) [m] of `occupied_voxels`."""
+        return self.centers_of(self.occupied_voxels())
 
     def grid(self) -> OccupancyGrid:
         """A copy of the grid as it is now."""

@@ -9,7 +9,7 @@ from splatctrl_cli.records import Bool, Box, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 
-REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak")
+REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
 
 
 def nearest_depth(frame: RgbdFrame) -> Float32:
@@ -57,6 +57,7 @@ def removals(
     seen_through: it floats before what a camera measured.
     uncertain: occupancy between 0.3 and 0.7 for longer than the patience. trail: was robot or human, is no longer.
     robot: none here; those that the optimiser moved off the robot or a person.
+    evicted: none here; those that gave their slot to surface that had none.
     weak: none here; those that show least and are given up for detail elsewhere are counted under it by refining.
     Updates the buffer's count of uncertain time steps,
     where this is one. Splats whose surroundings were never seen stay, unless the
@@ -82,6 +83,7 @@ def removals(
         "trail": is_trail,
         "robot": np.zeros(len(centers), bool),
         "weak": np.zeros(len(centers), bool),
+        "evicted": np.zeros(len(centers), bool),
     }
     remaining = buffer.is_alive.copy()
     reasons = {}

@@ -146,9 +146,9 @@ def gap_seeds(
     Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Looked at are every
     third pixel and row of the views (a frame and its mappable pixels (H, W)) or fewer, half of `max_gap` apart, and
     the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows now; a centre may be half a
-    voxel off its surface. With `half` 0 or 1 only every second of the rows and voxels: the other half waits.
+    voxel off its surface. With `half` 0 or 1 only every second of the rows: the other half waits.
     """
-    sources, spheres = [], _Spheres(splats, num_threads)
+    sources, spheres = [], SplatTree(splats, num_threads)
     for frame, mappable in views:
         mask = mappable.copy()
         stride = _gap_stride(frame, config.max_gap)
@@ -158,7 +158,6 @@ def gap_seeds(
         mask[mask] = spheres.are_further(world_points_at(frame, mask), config.max_gap)
         if mask.any():
             sources.append(candidates(frame, mask))
-    occupied = occupied if half is None else occupied[half::2]
     forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
     if len(forgotten):
         sources.append(_of_voxels(forgotten, splats))
@@ -177,11 +176,12 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
 
 
-class _Spheres:
+class SplatTree:
     """Splats to look for from many points."""
 
     def __init__(self, splats: SplatSet, num_threads: int) -> None:
-        self._radii, self._num_threads = splats.radii, num_threads
+        self._num, self._num_threads = len(splats), num_threads
+        self._radii = np.append(splats.radii, np.float32(0.0))  # the last of what is not found, infinitely far
         self._tree = cKDTree(splats.centers)
 
     def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
@@ -189,12 +189,15 @@ class _Spheres:
 
         The nearest settles most of them, at a third of the cost of eight.
         """
-        if not len(self._radii) or not len(points):
+        if not self._num or not len(points):
             return np.ones(len(points), bool)
-        distance, nearest = self._tree.query(points, workers=self._num_threads)
+        most = float(gap + self._radii.max()) * 1.001
+        distance, nearest = self._tree.query(points, distance_upper_bound=most, workers=self._num_threads)
         is_further: Bool = distance - self._radii[nearest] > gap
-        order = np.arange(1, min(8, len(self._radii)) + 1)
-        distance, nearest = self._tree.query(points[is_further], k=order, workers=self._num_threads)
+        order = np.arange(1, min(8, self._num) + 1)
+        distance, nearest = self._tree.query(
+            points[is_further], k=order, distance_upper_bound=most, workers=self._num_threads
+        )
         is_further[is_further] = (distance - self._radii[nearest]).min(axis=1) > gap
         return is_further
 

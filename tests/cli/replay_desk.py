@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
+from tests.known_voxels import known
 
 SECOND = 1_000_000_000
 START = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
@@ -68,12 +70,16 @@ def grid_seen(is_seen: bool = True) -> OccupancyGrid:
     )
 
 
-def write_scene(folder: Path, *snapshots: tuple[int, SplatSet], is_seen: bool = True) -> Path:
+def write_scene(
+    folder: Path, *snapshots: tuple[int, SplatSet], is_seen: bool = True, unrepresented: ArrayLike = ()
+) -> Path:
+    """A scene of these snapshots; voxels of 10 cm at `unrepresented` (K, 3) [m] have no splat at any time."""
     folder.mkdir()
     writer = SceneWriter(folder, {"frame": "world"})
     for stamp_ns, splats in snapshots:
-        writer.snapshot(stamp_ns, splats, grid_seen(is_seen), grid_seen(is_seen).states(0.3, 0.7))
-    writer.finish(*snapshots[-1], grid_seen(is_seen))
+        voxels = known(grid_seen(is_seen), stamp_ns, unrepresented)
+        writer.snapshot(stamp_ns, splats, voxels, voxels.grid.states(0.3, 0.7))
+    writer.finish(*snapshots[-1], known(grid_seen(is_seen), snapshots[-1][0], unrepresented))
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": snapshots[-1][0]}
     (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
     return folder

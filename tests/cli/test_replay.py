@@ -155,7 +155,7 @@ def test_the_truth_is_reported_beside_the_scene(
         (["--lock", "nose=0"], 4, "no joint 'nose' to lock"),
         (["--truth", "nowhere.json"], 4, "nowhere.json"),
         (["--require", "clearence>=1"], 2, "unknown metric"),
-        (["--start-time", "nan"], 2, "expected finite numbers"),
+        (["--start-time", "nan"], 2, "expected 0 to 100000000 s or first-map"),
         (["--start-time", "60"], 4, "give an earlier --start-time"),
         (["--mode", "open-loop", "--re-anchor", "1"], 2, "--re-anchor: expected --mode closed-loop, got open-loop"),
         (["--goal", "0,0,1,0,0,0,1"], 2, "--goal: expected --mode open-loop or closed-loop, got audit"),

@@ -105,6 +105,9 @@ class FakeScene:
             entity=np.zeros((1, 1, 1), np.uint8),
         )
 
+    def unrepresented_at(self, stamp_ns: int | None) -> None:
+        return None
+
     def splats(self) -> SplatSet:
         return wall()
 

@@ -24,6 +24,7 @@ from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.simulate.truth import load_truth
 from tests.cli import here
 from tests.field.scenes import cloud, splat_set
+from tests.known_voxels import known
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -187,9 +188,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         entity=np.zeros(shape, np.uint8),
     )
     for second, splats in enumerate(at):
-        writer.snapshot(start_ns + second * 10**9, splats, free, np.full(shape, second, np.uint8))
+        writer.snapshot(start_ns + second * 10**9, splats, known(free), np.full(shape, second, np.uint8))
     (folder / "snapshots" / "000000.npz").unlink()  # as in a scene of an older version
-    writer.finish(start_ns + 2 * 10**9, at[-1], free)
+    writer.finish(start_ns + 2 * 10**9, at[-1], known(free))
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": start_ns + 2 * 10**9}
     (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
     return folder

@@ -8,6 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import audit
 from splatctrl_cli.control.explain import (
+    UNREPRESENTED,
     Event,
     EventKind,
     Obstacle,
@@ -138,6 +139,8 @@ def test_an_obstacle_says_what_and_where() -> None:
         "human splat 7 at (1.000, 0.000, 0.500)"
     )
     assert str(Obstacle(distance=0.1, position=(1, 0, 0.5), cell=(1, 2, 3))).startswith("cell (1, 2, 3) at")
+    said = str(Obstacle(distance=0.1, position=(1, 0, 0.5), label=UNREPRESENTED))
+    assert said == "unrepresented voxel at (1.000, 0.000, 0.500)"
 
 
 def test_a_row_that_no_joint_changes_is_an_event_of_its_own_distance() -> None:

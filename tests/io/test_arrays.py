@@ -14,8 +14,8 @@ from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.grid import MOST_PACKED, read_npz
 from splatctrl_cli.io.idr import read_idr
 from splatctrl_cli.io.npz_columns import NpzFile
-from splatctrl_cli.io.scene_folder import MOST_VOXELS, read_occupancy, read_states
 from splatctrl_cli.io.scene_writer import CHECKPOINT, read_checkpoint
+from splatctrl_cli.io.voxel_file import MOST_VOXELS, read_occupancy, read_states
 from splatctrl_cli.scene import occupancy
 from tests.io.make_npz import write_zeros
 

@@ -10,13 +10,14 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.io.capture import write_capture
 from splatctrl_cli.io.describe import describe
-from splatctrl_cli.io.scene_folder import write_occupancy
 from splatctrl_cli.io.source import SourceOptions, open_source
 from splatctrl_cli.io.splat_formats import FORMATS
 from splatctrl_cli.io.splats import write_ply
+from splatctrl_cli.io.voxel_file import write_occupancy
 from splatctrl_cli.records import SWEPT, Label, OccupancyGrid, SplatSet
 from tests.io.make_log import LogRecipe, make_log
 from tests.io.test_gaussian_ply import gaussian_set
+from tests.known_voxels import known
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
@@ -304,7 +305,7 @@ def test_a_scene_says_how_much_of_its_space_is_known_by_its_own_thresholds(tmp_p
         num_updates=np.uint16([1, 1, 1, 1, 1, 0, 0, 0]).reshape(2, 2, 2),
         entity=np.uint8([0, 0, 0, Label.HUMAN, Label.ROBOT | SWEPT, SWEPT, 0, 0]).reshape(2, 2, 2),
     )
-    write_occupancy(tmp_path / "occupancy.npz", grid)
+    write_occupancy(tmp_path / "occupancy.npz", known(grid))
     (tmp_path / "splats.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n")
     expected = {"never_seen": 0.25, "free": 0.375, "occupied": 0.125, "uncertain": 0.125, "swept_by_robot": 0.125}
     space = describe(tmp_path).facts["space"]

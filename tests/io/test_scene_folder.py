@@ -1,17 +1,30 @@
 """The scene folder reads back what was written, and says what is wrong with others."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.io.arrays import read_arrays, savez
 from splatctrl_cli.io.describe import describe
 from splatctrl_cli.io.output import write_json
-from splatctrl_cli.io.scene_folder import open_scene, read_occupancy, read_states, write_occupancy, write_states
+from splatctrl_cli.io.scene_folder import open_scene
 from splatctrl_cli.io.scene_writer import CHECKPOINT, SceneWriter, read_checkpoint
-from splatctrl_cli.records import SWEPT, OccupancyGrid, SplatSet
+from splatctrl_cli.io.voxel_file import (
+    read_known_occupancy,
+    read_known_states,
+    read_occupancy,
+    read_states,
+    write_occupancy,
+    write_states,
+)
+from splatctrl_cli.records import SWEPT, Label, OccupancyGrid, SplatSet
+from tests.known_voxels import known
 
 
 @dataclass(frozen=True)
@@ -50,8 +63,8 @@ def written(folder: Path) -> Path:
     writer = SceneWriter(folder, {"frame": "world"})
     for stamp in (100, 200, 300):
         writer.audit(Row(stamp))
-        writer.snapshot(stamp, splats(stamp // 100), grid(), grid().states(0.3, 0.7))
-    writer.finish(300, splats(3), grid())
+        writer.snapshot(stamp, splats(stamp // 100), known(grid(), stamp), grid().states(0.3, 0.7))
+    writer.finish(300, splats(3), known(grid(), 300))
     writer.checkpoint({}, STATE, is_last=True)
     write_json(folder / "run.json", {"metrics": {"cameras": ["cam0"], "has_clock": True, "stamp_ns": 300}})
     return folder
@@ -67,7 +80,7 @@ def test_a_scene_is_known_by_its_newest_snapshot(tmp_path: Path) -> None:
 
 
 def test_occupancy_comes_back_bit_by_bit(tmp_path: Path) -> None:
-    write_occupancy(tmp_path / "occupancy.npz", grid())
+    write_occupancy(tmp_path / "occupancy.npz", known(grid()))
     again = read_occupancy(tmp_path / "occupancy.npz")
     want = grid()
     assert again.voxel == want.voxel
@@ -94,11 +107,11 @@ def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path)
         writer = SceneWriter(folder, {"frame": "world"})
         for stamp in (100, 200):
             writer.audit(Row(stamp))
-            writer.snapshot(stamp, splats(2), grid(), grid().states(0.3, 0.7))
+            writer.snapshot(stamp, splats(2), known(grid()), grid().states(0.3, 0.7))
         writer.checkpoint({"num_read": 2}, STATE)
         if folder is cut:
             writer.audit(Row(999))
-            writer.snapshot(999, splats(9), grid(), grid().states(0.3, 0.7))
+            writer.snapshot(999, splats(9), known(grid()), grid().states(0.3, 0.7))
             for name in ("audit.jsonl", "snapshots/000003.ply", f"{CHECKPOINT}.new", "splats.ply", "run.json"):
                 with (folder / name).open("ab") as stream:
                     stream.write(b'{"stamp')
@@ -107,8 +120,8 @@ def test_a_run_that_goes_on_drops_what_came_after_its_checkpoint(tmp_path: Path)
             writer = SceneWriter(folder, {"frame": "world"}, again)
             assert [row["stamp_ns"] for row in writer.audited()] == [100, 200]
         writer.audit(Row(300))
-        writer.snapshot(300, splats(3), grid(), grid().states(0.3, 0.7))
-        writer.finish(300, splats(3), grid())
+        writer.snapshot(300, splats(3), known(grid()), grid().states(0.3, 0.7))
+        writer.finish(300, splats(3), known(grid(), 300))
         writer.checkpoint({"num_read": 3}, STATE, is_last=True)
     files = {p.relative_to(cut): p.read_bytes() for p in cut.rglob("*") if p.is_file()}
     assert files == {p.relative_to(straight): p.read_bytes() for p in straight.rglob("*") if p.is_file()}
@@ -122,6 +135,16 @@ def test_a_partial_scene_that_lacks_a_file_does_not_go_on(tmp_path: Path, name: 
         SceneWriter(folder, {}, read_checkpoint(folder))
 
 
+def test_a_snapshot_that_was_changed_since_the_checkpoint_is_not_gone_on_with(tmp_path: Path) -> None:
+    folder = written(tmp_path / "scene")
+    checkpoint = read_checkpoint(folder)
+    file = folder / "snapshots" / "000001.npz"
+    file.write_bytes(file.read_bytes()[:-1] + b"x")
+    with pytest.raises(InputError, match=r"000001.npz: was changed after it was written .*; start over"):
+        SceneWriter(folder, {}, checkpoint)
+    SceneWriter(folder, {}, replace(checkpoint, parts=None))  # of an older version
+
+
 def test_an_interrupted_run_is_not_read_as_a_scene(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"an interrupted run; continue it: .*--resume"):
         open_scene(written(tmp_path / "scene.partial"))
@@ -133,7 +156,7 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
     want.num_updates[1, 0], want.entity[1, 0] = 0, SWEPT
     states = want.states(0.3, 0.7)
     assert set(states.ravel().tolist()) == {0, 1, 2, 3, 4}
-    write_states(tmp_path / "a.npz", want, states)
+    write_states(tmp_path / "a.npz", known(want), states)
     again = read_states(tmp_path / "a.npz")
     assert again.voxel == want.voxel
     assert again.origin.tobytes() == want.origin.tobytes()
@@ -142,6 +165,49 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
     (tmp_path / "b.npz").write_bytes(b"PK")
     with pytest.raises(InputError, match="not the voxel states"):
         read_states(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize("num_steps", [2, 300])
+def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_path: Path, num_steps: int) -> None:
+    want = replace(
+        known(grid(), unrepresented=[[0.0, 0.25, 0.4]], label=Label.HUMAN),
+        step_stamps_ns=np.arange(num_steps) * 10,
+        last_seen=np.zeros((3, 4, 5), np.uint16),
+    )
+    want.last_seen[1, 2, 3], want.last_seen[0, 0, 0] = num_steps, 1
+    points = want.grid.origin + 0.05 * np.array([[1.4, 1.6, 3.0], [0.0, 0.4, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    write_states(tmp_path / "a.npz", want, want.grid.states(0.3, 0.7))
+    write_occupancy(tmp_path / "b.npz", want)
+    for again in (read_known_states(tmp_path / "a.npz"), read_known_occupancy(tmp_path / "b.npz")):
+        assert again is not None
+        assert again.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
+        assert again.unrepresented.centers.tolist() == want.unrepresented.centers.tolist()
+        assert again.unrepresented.labels.tolist() == [Label.HUMAN]
+        assert again.unrepresented.radius == pytest.approx(0.025 * 3**0.5)
+        assert again.unrepresented.volume == pytest.approx(0.05**3)
+
+
+def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Path) -> None:
+    header = {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 1]}
+    np.savez(tmp_path / "a.npz", header=np.array(json.dumps(header)), states=np.full((1, 1, 1), 2, np.uint8))
+    assert read_known_states(tmp_path / "a.npz") is None
+    assert read_states(tmp_path / "a.npz").log_odds.item() == 20.0
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"last_seen": np.full((3, 4, 5), 2, np.uint16)}, "last_seen: expected at most 1 time steps, got 2"),
+        ({"last_seen": np.zeros((3, 4), np.uint16)}, "last_seen: expected uint16"),
+        ({"unrepresented": np.zeros((2, 3), np.float32)}, "unrepresented: expected"),
+        ({"unrepresented": np.full((1, 3), np.nan, np.float32)}, "unrepresented: expected finite"),
+    ],
+)
+def test_evidence_that_is_none_is_named(tmp_path: Path, changed: dict[str, NDArray[Any]], said: str) -> None:
+    write_occupancy(tmp_path / "a.npz", known(grid(), unrepresented=[[0.0, 0.25, 0.4]]))
+    savez(tmp_path / "a.npz", {**read_arrays(tmp_path / "a.npz", most=1 << 20), **changed})
+    with pytest.raises(InputError, match=said):
+        read_known_occupancy(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize(
@@ -188,7 +254,7 @@ def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
 def test_a_foreign_or_cut_occupancy_grid_is_refused(tmp_path: Path) -> None:
     foreign, cut = tmp_path / "foreign.npz", tmp_path / "cut.npz"
     np.savez(foreign, x=np.zeros(3))
-    write_occupancy(cut, grid())
+    write_occupancy(cut, known(grid()))
     cut.write_bytes(cut.read_bytes()[:-40])
     pickled = tmp_path / "pickled.npz"
     np.savez(pickled, header=np.array({"a": 1}, dtype=object))

@@ -1,5 +1,7 @@
 """The occupancy grid: what one camera over a floor sees."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
@@ -110,13 +112,49 @@ def test_pixels_without_depth_free_nothing_of_their_own() -> None:
     assert not grid.num_updates[is_blind].any()
 
 
+@pytest.mark.parametrize("holes", [0.0, 0.3])
+def test_what_an_image_changes_is_last_seen_in_its_time_step(holes: float) -> None:
+    grid = OccupancyMap(AROUND, OccupancyConfig(voxel=0.08), 2)
+    grid.take_in([frame(stamp_ns=7)])
+    first, counts = grid.last_seen.copy(), grid.num_updates.copy()
+    assert ((first == 1) == (counts > 0)).all()
+    grid.take_in([replace(tilted(holes=holes), stamp_ns=9)])
+    is_seen = grid.num_updates > counts
+    assert (grid.last_seen == np.where(is_seen, 2, first)).all()
+    assert is_seen.any()
+    assert grid.step_stamps_ns == [7, 9]
+
+
+def test_an_image_without_depth_renews_nothing() -> None:
+    grid = OccupancyMap(AROUND, CONFIG, 1)
+    grid.take_in([frame(stamp_ns=7)])
+    before = grid.last_seen.copy()
+    blind = frame(stamp_ns=9)
+    grid.take_in([replace(blind, depth=np.zeros_like(blind.depth))])
+    assert (grid.last_seen == before).all()
+    assert grid.step_stamps_ns == [7, 9]
+
+
+def test_beyond_65535_time_steps_the_evidence_is_never_said_to_be_younger_than_it_is() -> None:
+    grid = OccupancyMap(WORKSPACE, CONFIG, 1)
+    grid.take_in([frame(stamp_ns=0)])
+    grid.step_stamps_ns = list(range(65_535))
+    steps = np.array([0, 1, 2, 3, 65_534, 65_535], np.uint16)
+    grid.last_seen.ravel()[-6:] = steps
+    blind = frame(stamp_ns=65_535)
+    grid.take_in([replace(blind, depth=np.zeros_like(blind.depth))])
+    stamps_ns = np.concatenate([[-1], grid.step_stamps_ns])[grid.last_seen.ravel()[-6:]]
+    assert stamps_ns.tolist() == [-1, 0, 0, 2, 65_532, 65_534]
+    assert grid.step_stamps_ns[-1] == 65_535
+
+
 def test_thread_count_does_not_change_a_bit() -> None:
     grids = []
     for threads in (1, 2, 5):
         grid = OccupancyMap(AROUND, OccupancyConfig(voxel=0.02), threads)
         for view in (tilted(), tilted(holes=0.5), frame(block=0.1)):
-            grid.integrate(view)
-        grids.append((grid.log_odds.tobytes(), grid.num_updates.tobytes()))
+            grid.take_in([view])
+        grids.append((grid.log_odds.tobytes(), grid.num_updates.tobytes(), grid.last_seen.tobytes()))
     assert grids[0] == grids[1] == grids[2]
 
 

@@ -38,22 +38,23 @@ void bind_occupancy(nb::module_& m) {
   m.def(
       "integrate_depth",
       [](const Array<const double>& grid, const Array<float>& log_odds, const Array<std::uint16_t>& num_updates,
-         const Array<std::uint8_t>& hits, const Array<const double>& intrinsics,
+         const Array<std::uint16_t>& last_seen, const Array<std::uint8_t>& hits, const Array<const double>& intrinsics,
          const Array<const double>& T_world_camera, const Array<const float>& depth, float min_range,
-         float max_range, float hit, float miss, float limit, int num_threads) {
+         float max_range, float hit, float miss, float limit, std::uint16_t step, int num_threads) {
         const VoxelGrid g = grid_from(grid, log_odds.size());
         const DepthImage image = image_from(intrinsics, T_world_camera, depth, min_range, max_range);
-        if (num_updates.size() != log_odds.size() || hits.size() != log_odds.size()) {
+        if (num_updates.size() != log_odds.size() || last_seen.size() != log_odds.size() ||
+            hits.size() != log_odds.size()) {
           throw std::invalid_argument("expected voxel arrays of one shape");
         }
         const nb::gil_scoped_release release;
-        integrate_depth(g, {log_odds.data(), num_updates.data(), hits.data()}, image, {hit, miss, limit},
-                        num_threads);
+        integrate_depth(g, {log_odds.data(), num_updates.data(), last_seen.data(), hits.data()}, image,
+                        {hit, miss, limit}, step, num_threads);
       },
       nb::arg("grid").noconvert(), nb::arg("log_odds").noconvert(), nb::arg("num_updates").noconvert(),
-      nb::arg("hits").noconvert(), nb::arg("intrinsics").noconvert(), nb::arg("T_world_camera").noconvert(),
+      nb::arg("last_seen").noconvert(), nb::arg("hits").noconvert(), nb::arg("intrinsics").noconvert(), nb::arg("T_world_camera").noconvert(),
       nb::arg("depth").noconvert(), nb::arg("min_range"), nb::arg("max_range"), nb::arg("hit"), nb::arg("miss"),
-      nb::arg("limit"), nb::arg("num_threads"));
+      nb::arg("limit"), nb::arg("step"), nb::arg("num_threads"));
   m.def(
       "label_hits",
       [](const Array<const double>& grid, const Array<std::uint8_t>& entity, const Array<const double>& intrinsics,

@@ -128,7 +128,7 @@ Int8 passed_lanes(const int* cell, const Projection& projection, const DepthReac
 
 // Changes kLanes voxels in a row; a hit outweighs that a ray has passed.
 template <bool kHasHits>
-inline void update(const VoxelArrays& at, Int8 is_passed, const LogOdds& change) {
+inline void update(const VoxelArrays& at, Int8 is_passed, const LogOdds& change, std::uint16_t step) {
   Int8 is_hit = {};
   if (kHasHits) {
     Byte8 hits;
@@ -140,34 +140,43 @@ inline void update(const VoxelArrays& at, Int8 is_passed, const LogOdds& change)
   const Float8 before = load8(at.log_odds);
   const Float8 after = before + (is_hit ? splat8(change.hit) : splat8(change.miss));
   store8(at.log_odds, is_touched ? min8(max8(after, splat8(-change.limit)), splat8(change.limit)) : before);
+  const Count8 touched = __builtin_convertvector(is_touched, Count8);
   Count8 count;
   std::memcpy(&count, at.num_updates, sizeof count);
-  count -= __builtin_convertvector(is_touched, Count8) & static_cast<Count8>(count != 65535);
+  count -= touched & static_cast<Count8>(count != 65535);
   std::memcpy(at.num_updates, &count, sizeof count);
+  Count8 seen;
+  std::memcpy(&seen, at.last_seen, sizeof seen);
+  seen = (seen & ~touched) | (touched & step);
+  std::memcpy(at.last_seen, &seen, sizeof seen);
 }
 
 // The same for the first `num` of them.
-void update_some(const VoxelArrays& at, int num, Int8 is_passed, const LogOdds& change) {
+void update_some(const VoxelArrays& at, int num, Int8 is_passed, const LogOdds& change, std::uint16_t step) {
   alignas(32) float log_odds[kLanes] = {};
-  std::uint16_t num_updates[kLanes] = {};
+  std::uint16_t num_updates[kLanes] = {}, last_seen[kLanes] = {};
   std::uint8_t hits[kLanes] = {};
   std::copy(at.log_odds, at.log_odds + num, log_odds);
   std::copy(at.num_updates, at.num_updates + num, num_updates);
+  std::copy(at.last_seen, at.last_seen + num, last_seen);
   std::copy(at.hits, at.hits + num, hits);
-  update<true>({log_odds, num_updates, hits}, is_passed, change);
+  update<true>({log_odds, num_updates, last_seen, hits}, is_passed, change, step);
   std::copy(log_odds, log_odds + num, at.log_odds);
   std::copy(num_updates, num_updates + num, at.num_updates);
+  std::copy(last_seen, last_seen + num, at.last_seen);
   std::copy(hits, hits + num, at.hits);
 }
 
 // One image's change of the grid.
 class Sweep {
  public:
-  Sweep(const VoxelGrid& grid, const VoxelArrays& voxels, const DepthImage& image, const LogOdds& change)
+  Sweep(const VoxelGrid& grid, const VoxelArrays& voxels, const DepthImage& image, const LogOdds& change,
+        std::uint16_t step)
       : grid_(grid),
         voxels_(voxels),
         image_(image),
         change_(change),
+        step_(step),
         projection_(grid, image),
         seen_(image, grid.voxel),
         is_hit_(static_cast<std::size_t>(num_blocks(kBlock))),
@@ -236,18 +245,20 @@ class Sweep {
     for (cell[0] = box.low[0]; cell[0] < box.high[0]; ++cell[0]) {
       for (cell[1] = box.low[1]; cell[1] < box.high[1]; ++cell[1]) {
         const std::size_t first = index_of(grid_, cell);
-        const VoxelArrays at{voxels_.log_odds + first, voxels_.num_updates + first, voxels_.hits + first};
+        const VoxelArrays at{voxels_.log_odds + first, voxels_.num_updates + first, voxels_.last_seen + first,
+                             voxels_.hits + first};
         if (cell[0] + 1 < box.high[0]) {  // rows lie too far apart for the processor to guess the next
           __builtin_prefetch(at.log_odds + slab, 1);
           __builtin_prefetch(at.log_odds + slab + num - 1, 1);
           __builtin_prefetch(at.num_updates + slab, 1);
+          __builtin_prefetch(at.last_seen + slab, 1);
         }
         const Int8 is_passed = passed == Passed::kSome ? passed_lanes(cell, projection_, seen_)
                                                        : Int8{} - static_cast<int>(passed == Passed::kAll);
         if (num == kLanes) {
-          update<kHasHits>(at, is_passed, change_);
+          update<kHasHits>(at, is_passed, change_, step_);
         } else {
-          update_some(at, num, is_passed, change_);
+          update_some(at, num, is_passed, change_, step_);
         }
       }
     }
@@ -257,6 +268,7 @@ class Sweep {
   const VoxelArrays& voxels_;
   const DepthImage& image_;
   const LogOdds& change_;
+  const std::uint16_t step_;
   const Projection projection_;
   DepthReach seen_;
   std::vector<std::uint8_t> is_hit_, is_super_hit_;  // blocks with a hit
@@ -265,8 +277,8 @@ class Sweep {
 }  // namespace
 
 void integrate_depth(const VoxelGrid& grid, const VoxelArrays& voxels, const DepthImage& image, const LogOdds& change,
-                     int num_threads) {
-  Sweep(grid, voxels, image, change).run(num_threads);
+                     std::uint16_t step, int num_threads) {
+  Sweep(grid, voxels, image, change, step).run(num_threads);
 }
 
 }  // namespace splatctrl

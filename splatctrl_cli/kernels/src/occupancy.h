@@ -11,10 +11,12 @@ struct LogOdds {
   float hit, miss, limit;
 };
 
-// Arrays of one shape. hits is scratch: it must be zero, and is zero again afterwards.
+// Arrays of one shape. last_seen becomes `step` where a voxel changes. hits is scratch: it must be zero, and is zero
+// again afterwards.
 struct VoxelArrays {
   float* log_odds;
   std::uint16_t* num_updates;
+  std::uint16_t* last_seen;
   std::uint8_t* hits;
 };
 
@@ -22,6 +24,6 @@ struct VoxelArrays {
 // reaches beyond it (DepthReach): the ray has passed, and ends in another voxel. log odds change by `hit` or `miss`
 // within +-limit.
 void integrate_depth(const VoxelGrid& grid, const VoxelArrays& voxels, const DepthImage& image, const LogOdds& change,
-                     int num_threads);
+                     std::uint16_t step, int num_threads);
 
 }  // namespace splatctrl

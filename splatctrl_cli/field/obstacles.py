@@ -1,0 +1,47 @@
+"""What a field of a scene is made of: its splats, and balls around occupied voxels that have none."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.field.selection import DEFAULT_LABELS, check_labels, field_splats
+from splatctrl_cli.records import Balls, Label, SplatSet
+
+NO_SPLAT = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObstacleSpheres:
+    """The N spheres of a field, balls last, as splats; index (N,) in the scene's splats, NO_SPLAT of a ball."""
+
+    splats: SplatSet
+    index: NDArray[np.int64]
+
+    @property
+    def num_unrepresented(self) -> int:
+        """How many are balls."""
+        return int(np.count_nonzero(self.index == NO_SPLAT))
+
+
+def obstacle_spheres(
+    splats: SplatSet, balls: Balls | None, labels: Collection[Label] = DEFAULT_LABELS
+) -> ObstacleSpheres:
+    """The splats and the balls with one of `labels`. Raises as `field_splats`, where there is no such ball either."""
+    values = [int(label) for label in labels]
+    is_chosen = np.isin(splats.labels, values)
+    kept = np.zeros(0, bool) if balls is None else np.isin(balls.labels, values)
+    if balls is None or not kept.any():
+        return ObstacleSpheres(splats=field_splats(splats, labels), index=np.flatnonzero(is_chosen))
+    check_labels(splats)
+    count, chosen = int(kept.sum()), splats.select(is_chosen)
+    both = SplatSet(
+        centers=np.concatenate([chosen.centers, balls.centers[kept]]),
+        radii=np.concatenate([chosen.radii, np.full(count, balls.radius, np.float32)]),
+        colors=np.concatenate([chosen.colors, np.full((count, 3), 0.5, np.float32)]),
+        opacities=np.concatenate([chosen.opacities, np.ones(count, np.float32)]),
+        labels=np.concatenate([chosen.labels, balls.labels[kept]]),
+        density=np.concatenate([chosen.density, np.zeros(count, np.float32)]),
+    )
+    return ObstacleSpheres(splats=both, index=np.concatenate([np.flatnonzero(is_chosen), np.full(count, NO_SPLAT)]))
