@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from splatctrl_cli.cli.known_scene import from_grid
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
@@ -13,6 +12,7 @@ from splatctrl_cli.io.output import Stopwatch, part_digests, sha256, write_run
 from splatctrl_cli.io.parts import Parts
 from splatctrl_cli.io.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.io.splats import read_ply, read_world_splats, write_ply
+from splatctrl_cli.jobs.known_scene import from_grid
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
 
 BOX = ("--box=-0.1,-0.1,-0.1,0.1,0.1,0.1", "--voxel", "0.1", "--no-report")
