@@ -31,7 +31,7 @@ def test_a_way_is_planned_where_the_controller_stalls(desk: Desk) -> None:
 def test_a_negative_number_of_ways_is_refused(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(desk.folder / "scene", (0, splats_of(*WALL)))
     assert desk.replay("--scene", str(scene), "--set", "control.max_detours=-1") == 2
-    assert "control.max_detours: expected 0 or more, got -1" in capsys.readouterr().err
+    assert "control.max_detours: expected 0 to 1000, got -1" in capsys.readouterr().err
 
 
 def test_a_gate_of_another_mode_is_told_the_mode(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
