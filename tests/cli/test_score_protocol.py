@@ -136,7 +136,7 @@ def test_a_protocol_whose_views_the_scan_lacks_is_refused(place: Path, capsys: p
         (["--seed", "3"], "--seed: only with --fit"),
         (["--fit-iterations", "3"], "--fit-iterations: only with --fit"),
         (["--cloud-unit", "1"], "--cloud-unit: only with --cloud"),
-        (["--cloud", "a.ply", "--cloud-max", "0"], "--cloud-max: expected 1e-06 to 1000 m"),
+        (["--cloud", "a.ply", "--cloud-max", "0"], "argument --cloud-max: expected 1e-06 to 1000 m, got '0'"),
     ],
 )
 def test_bad_usage_names_the_thing(
