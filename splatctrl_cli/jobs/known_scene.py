@@ -32,6 +32,7 @@ from splatctrl_cli.records import (
     DistanceField,
     DistanceGrid,
     Float64,
+    KnownVoxels,
     Label,
     OccupancyGrid,
     SplatSet,
@@ -63,6 +64,11 @@ def _nothing(_: int) -> None:
     """For a scene that is all there from the beginning."""
 
 
+def _nothing_known(_: int) -> KnownVoxels | None:
+    """For a scene without records of what was seen when."""
+    return None
+
+
 @dataclass(frozen=True, kw_only=True)
 class KnownScene:
     """`at(stamp_ns)` gives the same object for the same scene as long as it is in use; nothing is known before
@@ -72,7 +78,8 @@ class KnownScene:
     after the other (so far, where they are made on the way: `advance` to a stamp makes those known then), empty for
     one scene for all times; each is known `latency_ns` after its stamp. finish: to be called when the replay is done.
     box: of the centres of a grid's cells, None for splats. moment_ns: the one time that a baked field is of, None
-    where it has none. has_people_margin: whether people are kept at another distance than things.
+    where it has none. voxels_at: what was known of voxels at a stamp, None where that is not
+    recorded. has_people_margin: whether people are kept at another distance than things.
     """
 
     at: Callable[[int], KnownFields]
@@ -86,6 +93,7 @@ class KnownScene:
     finish: Callable[[], None] = lambda: None
     box: "Box | None" = None
     moment_ns: int | None = None
+    voxels_at: Callable[[int], KnownVoxels | None] = _nothing_known
     has_people_margin: bool = False
 
     def age_s(self, stamp_ns: int) -> float:
@@ -179,6 +187,15 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
     def key_of(index: int) -> int | None:
         return stamps[index] if index < len(stamps) - 1 else None  # the last is the final map
 
+    @lru_cache(maxsize=HELD)
+    def voxels(index: int) -> KnownVoxels | None:
+        is_last = not has_times or index == len(stamps) - 1
+        return scene.known() if is_last else scene.snapshot_at(stamps[index]).known()
+
+    def voxels_at(stamp_ns: int) -> KnownVoxels | None:
+        index = bisect_right(stamps, stamp_ns - latency_ns) - 1 if has_times else 0
+        return None if index < 0 else voxels(index)
+
     always = stamps if has_times else [-(2**63)]
     return KnownScene(
         at=fields_at(always, latency_ns, key_of if has_times else lambda _: None, fields),
@@ -188,6 +205,7 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         digests={"splats.ply": sha256(path / "splats.ply")},
         stamps_ns=tuple(stamps) if has_times else (),
         latency_ns=latency_ns,
+        voxels_at=voxels_at,
         has_people_margin=config.control.human_margin > config.control.margin,
     )
 

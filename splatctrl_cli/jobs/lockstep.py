@@ -1,5 +1,7 @@
 """A log's reconstruction in lockstep with its replay: frame sets are taken in as the replay's clock passes them."""
 
+from bisect import bisect_right
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +16,7 @@ from splatctrl_cli.io.ros_log import RosLogSource
 from splatctrl_cli.io.shot import ShotSource
 from splatctrl_cli.io.splats import read_ply
 from splatctrl_cli.io.state_source import open_states
-from splatctrl_cli.io.voxel_file import read_unrepresented
+from splatctrl_cli.io.voxel_file import read_known_states, read_unrepresented
 from splatctrl_cli.jobs.known_scene import (
     KnownFields,
     KnownScene,
@@ -27,7 +29,7 @@ from splatctrl_cli.jobs.known_scene import (
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruct import check_pose_jumps
 from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP, ReplayRequest
-from splatctrl_cli.records import Float64, UInt8
+from splatctrl_cli.records import Float64, KnownVoxels, UInt8
 from splatctrl_cli.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -122,13 +124,20 @@ class Lockstep:
             self._take()
         self._fitted.check_found()
         known_at = fields_at(self._stamps_ns, self._latency_ns, self._files.__getitem__, self._fields)
+        voxels = lru_cache(maxsize=1)(lambda file: read_known_states(file.with_suffix(".npz")))
 
         def at(stamp_ns: int) -> KnownFields:
             self._advance(stamp_ns)
             return known_at(stamp_ns)
 
+        def voxels_at(stamp_ns: int) -> KnownVoxels | None:
+            self._advance(stamp_ns)
+            index = bisect_right(self._stamps_ns, stamp_ns - self._latency_ns) - 1
+            return None if index < 0 else voxels(self._files[index])
+
         return KnownScene(
             at=at,
+            voxels_at=voxels_at,
             observed=self._observed,
             first_ns=self._stamps_ns[0] + self._latency_ns,
             cameras=tuple(self._fitted.cameras),

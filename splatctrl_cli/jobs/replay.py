@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.io.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.io.scene_folder import open_scene
-from splatctrl_cli.jobs.evidence import Mismatch, scene_mismatches
+from splatctrl_cli.jobs.evidence import Mismatch, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.lockstep import check_lockstep, opened_scene
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone
@@ -103,6 +104,8 @@ def _read(request: ReplayRequest, folder: Path, progress: Progress) -> tuple[Rep
     model = read_robot(request, request.config.control)
     truth = None if request.truth is None else load_truth(request.truth)
     logged = read_states(request, model)
+    if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
+        raise InputError(other.sentence, remedy=other.remedy)
     scene = opened_scene(request, request.config, model, folder, progress)
     source = logged.source
     files = [path for path in (request.urdf, request.spheres, request.srdf, request.truth) if path is not None]

@@ -49,8 +49,8 @@ class Replay:
     """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
 
     num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
-    the first state in the log [s]; between, strain and statics: as `ReplayRecord` has them; obstacles (T,): what is
-    nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps: of a controller;
+    the first state in the log [s]; between, near, strain and statics: as `ReplayRecord` has them; obstacles (T,):
+    what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps: of a controller;
     separations: with a standstill the distances from people, by name of the motion, sampled at `period` [s];
     comparison: every motion of --baseline and its figures.
     """
@@ -66,6 +66,7 @@ class Replay:
     map_age_s: FloatRows
     start_time_s: float
     between: Figures
+    near: Figures
     strain: Figures
     statics: "Mapping[str, tuple[float, float]]"
     open_loop: StoredOpenLoop | None = None
@@ -291,6 +292,7 @@ def _replay(
         map_age_s=record.ages.rows("map_age_s"),
         start_time_s=float(int(stamps[0]) - int(inputs.states.stamp_ns[0])) * 1e-9,
         between=record.between,
+        near=record.near,
         strain=record.strain,
         statics=record.statics,
         events=record.events.events(),

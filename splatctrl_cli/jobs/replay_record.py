@@ -6,7 +6,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.audit import AuditTrace, Stamps, audited
+from splatctrl_cli.control.audit import AuditTrace, Stamps, audited, moving_clearance
 from splatctrl_cli.control.checks import static_clearance
 from splatctrl_cli.control.explain import (
     EventFold,
@@ -20,6 +20,7 @@ from splatctrl_cli.control.explain import (
 )
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.motion_limits import MotionLimits
+from splatctrl_cli.control.near_space import NearSpace
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replay_store import BLOCK, Figures, StoredAudit, StoredObjects
@@ -34,9 +35,10 @@ class ReplayRecord:
     words, the age (T,) [s] of each state's scene, and what happened.
 
     between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), the time [s] that
-    nobody can bound (`unbounded`), and the clearance [m] of the body at the state (`surface`). strain: its velocity
-    and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in the first
-    scene and the least in any.
+    nobody can bound (`unbounded`), the clearance [m] of the body at the state (`surface`), and that of the spheres to
+    the splats alone (`represented`). near: what was known about the arm (`unseen`, `age` as `NearFigures` has them),
+    NaN at states that were not looked at. strain: velocity and acceleration as shares of their limits. statics: by
+    sphere that no joint moves, its clearance [m] in the first scene and the least in any.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class ReplayRecord:
             np.asarray(model.velocity_limit),
             np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
         )
+        self.near, self._near = Figures(), NearSpace(model, config.control.margin)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
 
@@ -92,6 +95,8 @@ class ReplayRecord:
         self.strain.append(velocity=strain.velocity, acceleration=strain.acceleration)
         self._strain = strain
         self._look_at_statics(part)
+        self._look_around(part)
+        self._tell_represented(part)
         return part
 
     def explain(self, part: AuditTrace, steps: Sequence[ControlStep | None] = ()) -> None:
@@ -156,6 +161,28 @@ class ReplayRecord:
         for name, value in static_clearance(self._model, known.distances["exact"], part.position[0]).items():
             first, least = self.statics.get(name, (value, value))
             self.statics[name] = (first, min(least, value))
+
+    def _look_around(self, part: AuditTrace) -> None:
+        """What was known of the space about the arm, at some of the states."""
+        num = len(part.stamp_ns)
+        unseen, age = np.full(num, np.nan), np.full(num, np.nan)
+        for at in self._near.due(part.stamp_ns):
+            stamp = int(part.stamp_ns[at])
+            known = self._scene.voxels_at(stamp)
+            if known is not None:
+                figures = self._near.look(stamp, part.position[at], known.last_seen_ns)
+                unseen[at], age[at] = figures.unseen, figures.age
+        self.near.append(unseen=unseen, age=age)
+
+    def _tell_represented(self, part: AuditTrace) -> None:
+        """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""
+        exact = part.clearance["exact"].distance
+        alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
+        low = np.flatnonzero(exact < self._margin - SLIGHT)
+        if splats_alone is not None and len(low):
+            centers = self._model.sphere_centers_batch(part.position[low])
+            alone[low] = moving_clearance(self._model, centers, splats_alone)[0].distance
+        self.between.append(represented=alone)
 
     def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
         """What is nearest to the nearest sphere, by the controller's field; None without a distance."""

@@ -20,6 +20,7 @@ SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "li
 STATIC_CHANGE = 0.01  # [m] by which a fixed sphere must come nearer to count: splats move by less about a surface
 MOUNTED = 0.03  # [m] the same of one that stands within the margin of its mount, whose map grows in the first frames
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
+UNSEEN = 0.5  # of the points about the arm: three cameras about a table leave 0.02 to 0.3
 TOO_MUCH = 1.01  # of a velocity or acceleration limit
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
 SLOW = "log joint states more often"
@@ -104,6 +105,10 @@ def _clearance(judged: Judged) -> Iterator[Reason]:
 def _by_source(judged: Judged, source: str, criterion: str) -> Iterator[Reason]:
     """Contact, margin broken or kept, by one of the distances."""
     replay = judged.replay
+    represented = _least(replay.between["represented"])
+    if source == "exact" and represented is not None and represented >= judged.threshold:
+        yield from _unrepresented(judged)
+        return
     values = replay.true_clearance if source == "true" else replay.audit.clearance[source].distance
     least = _least(np.asarray(values))
     if least is None:
@@ -129,6 +134,33 @@ def _by_source(judged: Judged, source: str, criterion: str) -> Iterator[Reason]:
         cause="" if worst.obstacle is None else f"near {worst.obstacle}",
         count=judged.num_states,
         label=CONTACT if least < 0 else MARGIN,
+    )
+
+
+def _unrepresented(judged: Judged) -> Iterator[Reason]:
+    """Kept by the splats; where the voxels without one break the margin the map does not suffice."""
+    replay = judged.replay
+    least = _least(replay.audit.clearance["exact"].distance)
+    represented = _least(replay.between["represented"])
+    assert least is not None
+    if least >= judged.threshold:
+        yield _passed("clearance", f"at least {_mm(least)}", least, replay.margin, "m", judged.num_states)
+        return
+    worst = min(_events(replay, EventKind.BELOW_MARGIN, "exact"), key=lambda event: event.worst)
+    yield Reason(
+        criterion="clearance",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"{worst.worst_name} is {_mm(least)} from space that is occupied and has no splat (the splats are "
+        f"{_mm(represented or 0.0)} away), margin {_mm(replay.margin)}",
+        value=least,
+        threshold=replay.margin,
+        unit="m",
+        time_s=worst.worst_s,
+        place=None if worst.obstacle is None else worst.obstacle.position,
+        who=worst.worst_name,
+        cause="" if worst.obstacle is None else f"near {worst.obstacle}",
+        remedy="the map is starved: raise --max-splats",
+        count=judged.num_states,
     )
 
 
@@ -282,7 +314,20 @@ def _limits(judged: Judged) -> Iterator[Reason]:
 
 
 def _unknown(judged: Judged) -> Iterator[Reason]:
-    """Space that no camera ever saw, where the arm's spheres are."""
+    """Space that no camera ever saw: where the arm's spheres are, and about them where the motion newly comes."""
+    near = _near(judged, "unseen")
+    if near is not None and near[0] > UNSEEN:
+        yield Reason(
+            criterion="known space",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"{100 * near[0]:.0f} % of the space about the arm that the motion comes to was never seen by a "
+            f"camera, allowed {100 * UNSEEN:g} %",
+            value=near[0],
+            threshold=UNSEEN,
+            time_s=near[1],
+            remedy="add a camera that sees where the arm goes",
+            count=near[2],
+        )
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
         yield Reason(
@@ -314,7 +359,21 @@ def _unknown(judged: Judged) -> Iterator[Reason]:
 
 
 def _age(judged: Judged) -> Iterator[Reason]:
-    """How old the map was that a state was judged by."""
+    """How old the map was that a state was judged by, and the evidence about the arm."""
+    near = _near(judged, "age")
+    if near is not None and near[0] > judged.request.max_map_age:
+        yield Reason(
+            criterion="evidence age",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"the cameras last returned depth from about the arm {near[0]:.2f} s before, allowed "
+            f"{judged.request.max_map_age:g} s",
+            value=near[0],
+            threshold=judged.request.max_map_age,
+            unit="s",
+            time_s=near[1],
+            remedy="frames without depth renew nothing: check the cameras ('splatctrl check')",
+            count=near[2],
+        )
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
     known = ages[np.isfinite(ages)]
     if not len(known):
@@ -336,6 +395,13 @@ def _age(judged: Judged) -> Iterator[Reason]:
         remedy="the cameras must cover the motion in time; --max-map-age says how old a map may be",
         count=len(known),
     )
+
+
+def _near(judged: Judged, column: str) -> tuple[float, float, int] | None:
+    """The largest value of what was known about the arm, when [s], and over how many states; None without one."""
+    values = judged.replay.near[column]
+    num = int(np.isfinite(values).sum())
+    return (float(np.nanmax(values)), _seconds(judged, int(np.nanargmax(values))), num) if num else None
 
 
 def _unjudged(judged: Judged) -> Iterator[Reason]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.io.output import part_digests
 from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
@@ -81,7 +82,7 @@ def write_scene(
         writer.snapshot(stamp_ns, splats, voxels, voxels.grid.states(0.3, 0.7))
     writer.finish(*snapshots[-1], known(grid_seen(is_seen), snapshots[-1][0], unrepresented))
     metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": snapshots[-1][0]}
-    (folder / "run.json").write_text(json.dumps({"metrics": metrics}))
+    (folder / "run.json").write_text(json.dumps({"metrics": metrics, "parts": part_digests(folder)}))
     return folder
 
 

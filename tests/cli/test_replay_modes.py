@@ -74,7 +74,7 @@ def test_open_loop_says_when_and_why_the_logged_velocity_was_changed(
     assert scene_event["obstacle"]["splat"] == 1 and scene_event["obstacle"]["label"] == "object"  # type: ignore[index]
     assert scene_event["start_s"] == pytest.approx(metrics["first_intervention_s"])
     assert str(scene_event["worst_name"]).startswith("hand[")
-    first = capsys.readouterr().out.splitlines()[2]
+    first = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("first intervention"))
     assert first.startswith(f"first intervention: {scene_event['start_s']:.2f} to 1.00 s, scene row hand[")
     assert "near object splat 1 at (" in first
     assert json.loads((desk.folder / "out" / "summary.json").read_text())["when_and_why"][0] == first

@@ -27,7 +27,9 @@ def replayed(desk: Desk, *options: str, frame: str = "link0", out: str = "out") 
     if not scene.exists():
         write_scene(scene, (START_NS, splats_of(BALL)))
     known = ["--scene", str(scene), "-o", str(desk.folder / out), "-q"]
-    return main(["replay", str(log), *desk.robot, *known, "--set", "control.twist_timeout=0.1", *options])
+    return main(
+        ["replay", str(log), *desk.robot, *known, "--set", "control.twist_timeout=0.1", "--report-only", *options]
+    )
 
 
 def test_a_driven_arm_does_what_the_log_asked_for(desk: Desk, arm: RobotModel) -> None:

@@ -1,0 +1,94 @@
+"""What cameras knew of the space just outside of a moving arm, and how old that evidence was.
+
+The space inside the arm is never seen, and that the arm was somewhere says nothing of what is beside it. So the
+question is put to points on shells: each moving sphere's radius and the margin away from its centre, outside of all
+other spheres of the arm.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.records import Float64
+
+EVERY_NS = 50_000_000  # between states that are looked at: neither map nor evidence changes faster
+APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
+NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
+FRESH_SHARE = 0.9  # of the points that were seen, whose age is the oldest of this share
+MIN_POINTS = 8  # fewer say nothing
+
+LastSeen = Callable[[Float64], NDArray[np.int64]]
+"""points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera last returned depth through or on them, -1 never."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NearFigures:
+    """Of one state: unseen, the share of the points in space that is new to the motion that no camera had ever seen;
+    age [s] within which `FRESH_SHARE` of the seen points were last seen. NaN where there are too few points.
+    """
+
+    unseen: float
+    age: float
+
+
+class NearSpace:
+    """Asks for the shells of states, at most one every `EVERY_NS`."""
+
+    def __init__(self, model: ArmModel, margin: float) -> None:
+        self._model, self._margin = model, margin
+        self._moving = np.flatnonzero(model.moving_spheres)
+        self._radii = np.asarray(model.sphere_set.radii, np.float64)
+        self._first: Float64 | None = None  # centres (S, 3) of the first state
+        self._next_ns = -(2**63)
+
+    def due(self, stamps: NDArray[np.int64]) -> list[int]:
+        """Of states (T,) [ns] that do not go back, those to look at."""
+        chosen = []
+        for index, stamp in enumerate(stamps.tolist()):
+            if stamp >= self._next_ns:
+                chosen.append(index)
+                self._next_ns = stamp + EVERY_NS
+        return chosen
+
+    def look(self, stamp_ns: int, q: Float64, last_seen: LastSeen) -> NearFigures:
+        """What was known about the posture q (J,) at a stamp."""
+        centers = self._model.sphere_centers(q)
+        if self._first is None:
+            self._first = centers
+        points = self._shell(centers)
+        if len(points) < MIN_POINTS:
+            return NearFigures(unseen=np.nan, age=np.nan)
+        seen = last_seen(points)
+        is_never = seen < 0
+        is_new = _gap(points, self._first, self._radii) > NEW
+        unseen = float(is_never[is_new].mean()) if is_new.sum() >= MIN_POINTS else np.nan
+        age = np.nan
+        if (~is_never).sum() >= MIN_POINTS:
+            age = float(np.quantile((stamp_ns - seen[~is_never]) * 1e-9, FRESH_SHARE))
+        return NearFigures(unseen=unseen, age=age)
+
+    def _shell(self, centers: Float64) -> Float64:
+        """Points (Q, 3) [m] on the shells, outside of the other spheres."""
+        reach = self._radii[self._moving] + self._margin
+        points = centers[self._moving][:, None] + reach[:, None, None] * DIRECTIONS
+        flat = points.reshape(-1, 3)
+        own = np.repeat(self._moving, len(DIRECTIONS))
+        distance = np.linalg.norm(flat[:, None] - centers, axis=2) - self._radii
+        distance[np.arange(len(flat)), own] = np.inf
+        return np.asarray(flat[distance.min(axis=1) > APART])
+
+
+def _gap(points: Float64, centers: Float64, radii: Float64) -> Float64:
+    return np.asarray((np.linalg.norm(points[:, None] - centers, axis=2) - radii).min(axis=1))
+
+
+def _directions() -> Float64:
+    """Unit vectors (26, 3) towards the faces, edges and corners of a cube."""
+    steps = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)], np.float64) - 1.0
+    return np.asarray(steps / np.linalg.norm(steps, axis=1)[:, None])
+
+
+DIRECTIONS = _directions()
