@@ -35,6 +35,7 @@ class SceneConfig:
     min_opacity: float = 0.1  # III-C, alpha_min
     radius_per_edge: float = 0.45  # of a seed, in edges of its cube
     max_gap: float = 0.018  # [m] from a measured point to the nearest splat's sphere; beyond, one is added
+    contact_radius: float = 0.010  # [m] of splats of objects within 2 cm of the moving robot, which hides contact
     gap_reserve: float = 0.02  # share of the budget that only such gaps may use
     when_idle: str = "detail"  # refining with nothing to add: seed where colours are wrong; or "clone", "leave"
     weak_share: float = 0.03  # of the splats, those that show least, given up for such detail after each block
@@ -104,7 +105,8 @@ class OccupancyConfig:
     max_range: float = 3.0  # [m]; farther depth is no hit, it frees what is nearer
     see_through: float = 0.015  # [m] by which a splat must stand before every depth around its pixel to be floating
     uncertain_patience: int = 10  # time steps a splat may stand in uncertain voxels
-    robot_margin: float = 0.015  # [m] beyond the robot's spheres that still counts as robot
+    self_mask_tolerance: float = 0.004  # [m] of calibration: how far the robot may be from where its joints put it
+    depth_error: float = 0.0015  # [m] sigma of depth at 1 m, growing with its square: 0.05 px of a D435's disparity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +190,13 @@ class PlannerConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class HumanConfig:
+    """People (label 10 of III-C)."""
+
+    memory: float = 5.0  # [s] what no camera sees any more stays human; then it is unknown
+
+
+@dataclass(frozen=True, kw_only=True)
 class Config:
     """The whole configuration, one table per section in TOML."""
 
@@ -197,6 +206,7 @@ class Config:
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     control: ControlConfig = dataclasses.field(default_factory=ControlConfig)
     planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+    human: HumanConfig = dataclasses.field(default_factory=HumanConfig)
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values, as written to ``run.json``."""
@@ -242,7 +252,14 @@ _AT_LEAST_ZERO = (
     *("gaussians.densify_from", "gaussians.densify_until", "gaussians.densify_gradient", "gaussians.dense_share"),
     *("gaussians.reset_every", "scene.weak_share", "scene.coarse_share"),
     *("scene.lambda_dssim", "scene.lambda_color", "scene.lambda_depth", "scene.lambda_reg", "scene.lambda_opacity"),
-    *("scene.lambda_mde", "scene.min_depth_error", "scene.max_gap", "scene.gap_reserve", "scene.hole_opacity"),
+    *(
+        "scene.lambda_mde",
+        "scene.min_depth_error",
+        "scene.max_gap",
+        "scene.contact_radius",
+        "scene.gap_reserve",
+        "scene.hole_opacity",
+    ),
     *("scene.iterations_per_step", "scene.first_iterations", "scene.refine_iterations", "scene.refine_geometry"),
     *("scene.lr_center", "scene.lr_log_radius", "scene.lr_color", "scene.lr_logit_opacity", "scene.window"),
     *("scene.keyframe_distance", "scene.keyframe_angle", "occupancy.min_range", "occupancy.see_through"),
@@ -250,7 +267,9 @@ _AT_LEAST_ZERO = (
         "occupancy.uncertain_patience",
         "scene.snapshot_period",
         "scene.checkpoint_period",
-        "occupancy.robot_margin",
+        "occupancy.self_mask_tolerance",
+        "occupancy.depth_error",
+        "human.memory",
         "field.noise",
         "field.padding",
         "scene.noise",

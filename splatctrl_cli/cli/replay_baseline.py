@@ -103,7 +103,7 @@ def separations(
         return {}
     import numpy as np
 
-    people, control = _people(args, inputs), config.control
+    people, control = _people(args, inputs, config.human.memory), config.control
     driven = separation_of(
         inputs.model,
         trace.stamp_ns,
@@ -146,9 +146,11 @@ def separation_figures(separation: "Separation", period: float) -> dict[str, flo
     return dict(zip(FIGURES, values, strict=True))
 
 
-def _people(args: argparse.Namespace, inputs: "ReplayInputs") -> "DistanceToPeople":
-    """The people of the truth where it is given, else those that the scene labels human."""
+def _people(args: argparse.Namespace, inputs: "ReplayInputs", memory: float) -> "DistanceToPeople":
+    """The people of the truth where it is given, else those that the scene labels human, for `memory` [s]."""
     import numpy as np
+
+    from splatctrl_cli.control.standstill import remembered
 
     scene = inputs.scene
     if inputs.truth is not None:
@@ -178,4 +180,4 @@ def _people(args: argparse.Namespace, inputs: "ReplayInputs") -> "DistanceToPeop
         human = scene.at(stamp_ns).human
         return np.full(len(points), np.inf) if human is None else human.query(points)[0]
 
-    return distance
+    return remembered(distance, scene.age_s, memory)

@@ -16,6 +16,19 @@ from splatctrl_cli.records import Bool, Box, Float64
 DistanceToPeople = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""
 
+
+def remembered(people: DistanceToPeople, age_s: Callable[[int], float], memory: float) -> DistanceToPeople:
+    """The people of maps while they are known: nobody where the map in use at a stamp is older than `memory` [s].
+
+    age_s: stamp [ns] -> the age [s] of that map; NaN where maps have no times, and then they stay.
+    """
+
+    def distance(points: Float64, stamp_ns: int) -> Float64:
+        return np.full(len(points), np.inf) if age_s(stamp_ns) > memory else people(points, stamp_ns)
+
+    return distance
+
+
 RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
 EIGHTHS = np.array(list(product((-0.5, 0.5), repeat=3)))
 

@@ -1,6 +1,6 @@
 """What a time step, and the refining of a scene that stands still, report of themselves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from splatctrl_cli.scene.buffer import Filled
 
@@ -11,7 +11,9 @@ class AuditRow:
     iteration that looked at it found it.
 
     dead: slots that wait to be reused. unmet: seeds that found no free slot. without_depth: frames without any valid
-    depth, which seed nothing. loss and psnr are None where no view shows anything of the workspace.
+    depth, which seed nothing. loss and psnr are None where no view shows anything of the workspace. self_mask: by
+    link, measured less rendered depth over the pixels within the robot's outline: `median_mm`, its `sign` and
+    `num_pixels`. inside_robot: by link, measured points inside it that its surface does not explain.
     """
 
     stamp_ns: int
@@ -27,6 +29,8 @@ class AuditRow:
     without_depth: int
     loss: float | None
     psnr: float | None
+    self_mask: dict[str, dict[str, float]] = field(default_factory=dict)
+    inside_robot: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
