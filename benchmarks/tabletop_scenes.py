@@ -14,7 +14,7 @@ from splatctrl_cli.control.target import pose_error
 from splatctrl_cli.evaluate.visibility import seen_by
 from splatctrl_cli.records import Box, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.simulate.noise import DepthNoise
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.random_tabletop import random_things
@@ -81,15 +81,9 @@ def reconstructed(scene: TableScene, config: Config) -> SplatSet:
     model = sample_robot()
     reach, base = model.reach(), model.base_position
     fitter = SceneFitter(config.scene, config.occupancy, Box(lower=base - reach, upper=base + reach), seed=scene.seed)
-    spheres, q = model.sphere_set, scene.task.start
-    pose = {link: model.frame_pose(q, link) for link in set(spheres.links)}
-    posture = RobotPosture(
-        centers=model.sphere_centers(q),
-        radii=spheres.radii,
-        T_world_link=np.array([pose[link] for link in spheres.links]),
-    )
+    q = scene.task.start
     for frames in scene.frames:
-        fitter.step(frames, posture)
+        fitter.step(frames, posture_of(model, q, {frame.stamp_ns: q for frame in frames}))
     return fitter.splats()
 
 

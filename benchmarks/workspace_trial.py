@@ -20,7 +20,7 @@ from splatctrl_cli.control.target import Guide
 from splatctrl_cli.jobs.known_scene import splat_fields
 from splatctrl_cli.records import Bool, Box, DistanceField, Float64
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.posture import posture_of
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions
 from splatctrl_cli.simulate.shared_workspace import HOME, TASK, Visit, visit_of
@@ -95,13 +95,15 @@ class LiveMap:
         self._recording, self._config, self._model = recording, config, recording.robot
         reach, base = self._model.reach(), self._model.base_position
         workspace = Box(lower=base - reach, upper=base + reach)
-        self._fitter = SceneFitter(config.scene, config.occupancy, workspace, seed=seed, threads=1)
+        self._fitter = SceneFitter(
+            config.scene, config.occupancy, workspace, human=config.human, seed=seed, threads=1
+        )
         self._fields: list[DistanceField] = []
 
     def see(self, index: int, q: Float64) -> DistanceField:
         """Take in frame `index` of the training cameras, with the arm at q (J,)."""
         frames = list(self._recording.frames_at(index, q, TRAINING))
-        self._fitter.step(frames, posture_of(q))
+        self._fitter.step(frames, posture_of(self._model, q, {frame.stamp_ns: q for frame in frames}))
         field = splat_fields(self._fitter.splats(), self._config, 1).barrier
         self._fields = [*self._fields[-1:], field]
         return field
@@ -111,17 +113,6 @@ class LiveMap:
         if len(self._fields) < 2:
             return None
         return SceneStep(newer=self._fields[1], older=self._fields[0], seconds=1 / FPS)
-
-
-def posture_of(q: Float64) -> RobotPosture:
-    """Where the arm's spheres are at q (J,)."""
-    model = sample_robot()
-    pose = {link: model.frame_pose(q, link) for link in set(model.sphere_set.links)}
-    return RobotPosture(
-        centers=model.sphere_centers(q),
-        radii=model.sphere_set.radii,
-        T_world_link=np.array([pose[link] for link in model.sphere_set.links]),
-    )
 
 
 def driven(config: Config, see: Callable[[int, Float64], DistanceField], live: LiveMap | None) -> Drive:

@@ -42,6 +42,9 @@ class Label(IntEnum):
 
 MAX_PLACE = 1e6  # [m] of a workspace's corner from the world's origin
 SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
+SOLID = (
+    0b1000  # entity bit of a voxel that a pixel of an object hit since it was last seen free, in a log with a robot
+)
 
 
 class VoxelState(IntEnum):
@@ -274,7 +277,8 @@ class OccupancyGrid:
     """Log-odds voxels; voxel (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
 
     log_odds (X, Y, Z) float32; num_updates (X, Y, Z) uint16, 0 = never seen; entity (X, Y, Z) uint8 bits of
-    `Label`, and `SWEPT`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is observed free, above 0.7 occupied.
+    `Label`, `SWEPT` and `SOLID`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is observed free, above 0.7
+    occupied.
     """
 
     origin: Float64

@@ -57,6 +57,9 @@ class SceneConfig(Section, section="scene"):
         float,
         Within(0, 1e9, "m", "from a measured point to the nearest splat's sphere; beyond, one is added; 1e9: none"),
     ] = 0.018
+    contact_radius: Annotated[
+        float, Within(0.001, 0.1, "m", "of objects' splats within 2 cm of the moving robot, which hides contact")
+    ] = 0.010
     gap_reserve: Annotated[float, Within(0, 1, "", "share of the budget that only such gaps may use")] = 0.02
     when_idle: Annotated[
         str,
@@ -187,9 +190,12 @@ class OccupancyConfig(Section, section="occupancy"):
     uncertain_patience: Annotated[
         int, Within(0, 1_000_000, "", "time steps a splat may stand in uncertain voxels")
     ] = 10
-    robot_margin: Annotated[
-        float, Within(0, 0.5, "m", "beyond the robot's spheres that still counts as robot; a link is no thicker")
-    ] = 0.015
+    self_mask_tolerance: Annotated[
+        float, Within(0, 0.1, "m", "of calibration: how far the robot may be from where its joints put it")
+    ] = 0.004
+    depth_error: Annotated[
+        float, Within(0, 0.1, "m", "sigma of depth at 1 m, growing with its square: 0.05 px of a D435's disparity")
+    ] = 0.0015
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,6 +17,20 @@ DistanceToPeople = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""
 
 MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
+
+
+def remembered(people: DistanceToPeople, age_s: Callable[[int], float], memory: float) -> DistanceToPeople:
+    """The people of maps while they are known: nobody where the map in use at a stamp is older than `memory` [s].
+
+    age_s: stamp [ns] -> the age [s] of that map; NaN where maps have no times, and then they stay.
+    """
+
+    def distance(points: Float64, stamp_ns: int) -> Float64:
+        return np.full(len(points), np.inf) if age_s(stamp_ns) > memory else people(points, stamp_ns)
+
+    return distance
+
+
 RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
 EIGHTHS = np.array(list(product((-0.5, 0.5), repeat=3)))
 

@@ -9,11 +9,10 @@ import numpy as np
 from splatctrl_cli.io.check_images import strided_lens
 from splatctrl_cli.io.finding import Finding, note, warning
 from splatctrl_cli.io.state_columns import StateColumns
-from splatctrl_cli.io.state_motion import CameraMotion, silhouettes
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 
-NEAR = 0.10  # [m] beyond the spheres: something else is seen where the arm should be; nearer by more: it is hidden
+NEAR = 0.10  # [m] beyond its surface: something else is seen where the arm should be; nearer by more: it is hidden
 COVER = 0.02  # [m] by which covering spheres may stand before the surface
 MAX_OFFSET = 0.03  # [m]
 MAX_SEEN_THROUGH = 0.25  # of the arm's pixels
@@ -31,9 +30,9 @@ Posture = Callable[[int], Float64 | None]
 
 @dataclass(frozen=True, kw_only=True)
 class ArmAgreement:
-    """Depth minus the depth of the robot's spheres, over the pixels that they cover, of one camera's frames.
+    """Depth minus the rendered depth of the robot's surface, over the pixels that it covers, of one camera's frames.
 
-    median [m] of those within `NEAR`, positive where the surface lies behind the spheres' own; misfit [m]: mean
+    median [m] of those within `NEAR`, positive where the robot is measured behind its surface; misfit [m]: mean
     distance from it (from 0 where it is negative, from `COVER` where it is more), each cut at `NEAR`; seen_through:
     share of the pixels whose depth lies more than `NEAR` behind; num_pixels with depth; num_frames with joint states;
     scale: depth over predicted depth where it is one factor for most pixels.
@@ -103,8 +102,8 @@ def arm_agreement(
         q = posture(frame.stamp_ns - round(offset_s * 1e9))
         if q is None:
             continue
-        camera = CameraMotion(intrinsics=frame.intrinsics, T_world_camera=frame.T_world_camera)
-        predicted = silhouettes(model.sphere_centers(q)[None], model.sphere_set.radii, camera)[0]
+        T_world_link = model.surface.poses({link: model.frame_pose(q, link) for link in model.surface.links})
+        predicted = model.surface.render(T_world_link, frame.intrinsics, frame.T_world_camera, frame.depth).depth
         both = (predicted > 0) & (frame.depth > 0)
         parts.append(np.stack([frame.depth[both], predicted[both]]).astype(np.float64))
     rows = np.concatenate(parts, axis=1) if parts else np.zeros((2, 0))
@@ -184,7 +183,7 @@ def arm_finding(where: str, agreement: ArmAgreement) -> Finding:
     share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
     seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
     if agreement.is_good and agreement.scale is None:
-        text = f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its spheres (median); {seen}"
+        text = f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); {seen}"
         return note("arm", where, text, value=round(1e3 * agreement.median, 1), unit="mm")
     assert agreement.scale is not None
     text = f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say"

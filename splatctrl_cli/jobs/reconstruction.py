@@ -7,7 +7,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from splatctrl_cli.config import Config
@@ -22,7 +21,7 @@ from splatctrl_cli.scene.audit import AuditRow
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspace_of
 from splatctrl_cli.scene.consistency import agreements
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
@@ -212,6 +211,8 @@ class Reconstruction:
 
     def metrics(self) -> dict[str, object]:
         """For ``run.json`` and gates."""
+        from splatctrl_cli.scene.self_mask import self_mask_metrics
+
         assert self.fitter is not None
         last = self.rows[-1]
         return {
@@ -237,6 +238,7 @@ class Reconstruction:
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.disagreement,
+            **self_mask_metrics(self.rows),
             "first_frames": list(self.first_frames.values()),
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }
@@ -305,7 +307,8 @@ class Reconstruction:
     def _new_fitter(self, workspace: "Box") -> "SceneFitter":
 
         scene = self.config.scene if self.source.has_clock else replace(self.config.scene, fill=1.0)
-        return SceneFitter(scene, self.config.occupancy, workspace, seed=self.seed, threads=self.threads)
+        human = self.config.human
+        return SceneFitter(scene, self.config.occupancy, workspace, human=human, seed=self.seed, threads=self.threads)
 
     def _needs_depth(self) -> bool:
         """Whether only depth can say where the workspace is."""
@@ -326,11 +329,6 @@ class Reconstruction:
 
         if self.robot is None or step.position is None:
             return None
-        q = step.position[self.robot.joint_order(self.source.joint_names)]
-        spheres = self.robot.sphere_set
-        pose = {link: self.robot.frame_pose(q, link) for link in set(spheres.links)}
-        return RobotPosture(
-            centers=self.robot.sphere_centers(q),
-            radii=spheres.radii,
-            T_world_link=np.array([pose[link] for link in spheres.links]),
-        )
+        order = self.robot.joint_order(self.source.joint_names)
+        at_frames = {stamp_ns: q[order] for stamp_ns, q in step.positions.items()}
+        return posture_of(self.robot, step.position[order], at_frames)

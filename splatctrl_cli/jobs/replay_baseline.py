@@ -16,6 +16,7 @@ from splatctrl_cli.control.standstill import (
     StopZone,
     Zone,
     monitored_standstill,
+    remembered,
     separation_of,
 )
 from splatctrl_cli.errors import NotEvaluableError, UsageError
@@ -73,7 +74,7 @@ def separations(
     if zone is None or trace is None:
         return {}
 
-    people, control = _people(request, inputs), config.control
+    people, control = _people(request, inputs, config.human.memory), config.control
     driven = separation_of(
         inputs.model,
         trace.stamp_ns,
@@ -113,8 +114,8 @@ def separation_figures(separation: "Separation", period: float) -> dict[str, flo
     return dict(zip(FIGURES, values, strict=True))
 
 
-def _people(request: ReplayRequest, inputs: "ReplayInputs") -> "DistanceToPeople":
-    """The people of the truth where it is given, else those that the scene labels human."""
+def _people(request: ReplayRequest, inputs: "ReplayInputs", memory: float) -> "DistanceToPeople":
+    """The people of the truth where it is given, else those that the scene labels human, for `memory` [s]."""
 
     scene = inputs.scene
     if inputs.truth is not None:
@@ -142,4 +143,4 @@ def _people(request: ReplayRequest, inputs: "ReplayInputs") -> "DistanceToPeople
         human = scene.at(stamp_ns).human
         return np.full(len(points), np.inf) if human is None else human.query(points)[0]
 
-    return distance
+    return remembered(distance, scene.age_s, memory)

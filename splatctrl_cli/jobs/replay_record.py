@@ -27,7 +27,7 @@ from splatctrl_cli.jobs.replay_store import BLOCK, Figures, StoredAudit, StoredO
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 
-SLIGHT = 1e-4  # [m] under a margin that solver and rounding may leave
+SLIGHT = 1e-3  # [m] under a margin that solver, rounding and a map that is still being fitted may leave
 
 
 class ReplayRecord:

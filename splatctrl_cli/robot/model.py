@@ -17,6 +17,7 @@ from splatctrl_cli.robot.coverage import CoverageReport, deficit_by_sphere
 from splatctrl_cli.robot.levers import lever_arms
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.spheres import RENAMED, are_links_renamed, matched_links, spheres_of
+from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 Index = NDArray[np.int64]
@@ -55,6 +56,7 @@ class RobotModel:
         self.coverage: CoverageReport | None = None
         self.coverage_unknown = "the collision geometry was not read"
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
+        self._surface: RobotSurface | None = None
         self._chosen_pairs: Index | None = None
         self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
         rows = [joint.idx_q for joint in model.joints][1:]
@@ -106,6 +108,13 @@ class RobotModel:
         if coverage is not None:
             deficit = deficit_by_sphere(self.urdf, self.sphere_set, coverage)
         return self._changed(coverage=coverage, coverage_unknown=unknown, sphere_deficit=deficit)
+
+    @property
+    def surface(self) -> RobotSurface:
+        """The collision geometry, read when first asked for; spheres for links without any that can be read."""
+        if self._surface is None:
+            self._surface = RobotSurface.of(self.urdf, self.sphere_set)
+        return self._surface
 
     def with_self_pairs(self, pairs: Index) -> "RobotModel":
         """The same robot, whose `self_pairs` are these (P, 2)."""

@@ -65,7 +65,7 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
         path = mesh_path(urdf.path, mesh, folders)
         if path not in meshes:
             meshes[path] = load_mesh(path)
-        found[mesh.link] += _pieces(mesh, meshes[path])
+        found[mesh.link] += mesh_pieces(mesh, meshes[path])
     return {link: tuple(solids) for link, solids in found.items()}
 
 
@@ -133,7 +133,7 @@ def _primitive(shape: Shape) -> Solid:
     return Solid(link=shape.link, surface=mesh, slack=float(slack), body=mesh, ball=ball)
 
 
-def _pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
+def mesh_pieces(shape: MeshShape, mesh: TriangleMesh) -> list[Solid]:
     """The mesh in the link's frame; an open one is taken apart into the pieces that are closed and the rest."""
     vertices = transform_points(shape.T_link_mesh, mesh.vertices * np.array(shape.scale))
     faces = mesh.faces if np.prod(shape.scale) > 0 else mesh.faces[:, ::-1]

@@ -86,8 +86,12 @@ class SplatBuffer:
         self.labels[slots] = Label.OBJECT
         self._reset(np.flatnonzero(slots))
 
-    def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0) -> Filled:
-        """Put seeds into dead slots, in slot order, with `opacity`; seeds beyond them are unmet.
+    def set_radius(self, slots: NDArray[np.intp], radius: float) -> None:
+        """Give the splats of slots (K,) a radius [m]."""
+        self.parameters[slots, LOG_RADIUS] = np.log(radius)
+
+    def fill(self, seeds: Seeds, opacity: float, keep_free: int = 0, label: Label = Label.OBJECT) -> Filled:
+        """Put seeds into dead slots, in slot order, with `opacity` and `label`; seeds beyond them are unmet.
 
         The last `keep_free` dead slots are left alone.
         """
@@ -101,7 +105,7 @@ class SplatBuffer:
         num_reused = int(self.was_used[slots].sum())
         self.is_alive[slots] = True
         self.was_used[slots] = True
-        self.labels[slots] = Label.OBJECT
+        self.labels[slots] = label
         self._reset(slots)
         return Filled(added=count - num_reused, relocated=num_reused, unmet=len(seeds) - count)
 

@@ -35,6 +35,7 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     arrays["step_stamps_ns"] = np.array(fitter.occupancy.step_stamps_ns, np.int64)
     arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
     arrays["counters"] = np.array([fitter.num_steps, fitter.num_iterations], np.int64)
+    arrays |= {"people/voxels": fitter.people.voxels, "people/stamps_ns": fitter.people.stamps_ns}
     arrays["refined"] = _refined_array(fitter.refined)
     arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
     if fitter.background is not None:
@@ -57,6 +58,8 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
         getattr(fitter.occupancy, name)[...] = arrays[name]
     fitter.occupancy.step_stamps_ns = [int(stamp) for stamp in arrays["step_stamps_ns"]]
     fitter.num_steps, fitter.num_iterations = (int(n) for n in arrays["counters"])
+    fitter.people.voxels = np.asarray(arrays["people/voxels"], np.int64)
+    fitter.people.stamps_ns = np.asarray(arrays["people/stamps_ns"], np.int64)
     fitter.refined = _refined(arrays["refined"])
     masks = {name.removeprefix("mounted/"): array for name, array in arrays.items() if name.startswith("mounted/")}
     fitter.mounted = {camera: np.asarray(mask, bool) for camera, mask in masks.items()}
@@ -67,7 +70,11 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
         edge, tolerance, num_candidates = (float(x) for x in arrays["density"])
         fitter.density = SeedDensity(edge=edge, tolerance=tolerance, num_candidates=int(num_candidates))
     if "posture/radii" in arrays:
-        fitter.posture = RobotPosture(**{n: np.asarray(arrays[f"posture/{n}"], float) for n in POSTURE_NAMES})
+        fitter.posture = RobotPosture(
+            centers=np.asarray(arrays["posture/centers"], float),
+            radii=np.asarray(arrays["posture/radii"], float),
+            T_world_link=np.asarray(arrays["posture/T_world_link"], float),
+        )
     fitter.window = Window(fitter.config)
     fitter.window.newest = [fitter.view(frame) for frame in _frames(arrays, "newest")]
     fitter.window.keyframes = [fitter.view(frame) for frame in _frames(arrays, "keyframe")]

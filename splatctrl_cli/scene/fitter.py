@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
-from splatctrl_cli.config import OccupancyConfig, SceneConfig, check_voxel
+from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.raster import (
     ImageLoss,
@@ -31,11 +32,13 @@ from splatctrl_cli.records import (
 )
 from splatctrl_cli.scene.audit import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
+from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
 from splatctrl_cli.scene.eviction import room_for
-from splatctrl_cli.scene.labels import relabel
+from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.objective import BLACK, Color, loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.occupancy import OccupancyMap
+from splatctrl_cli.scene.people import PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
 from splatctrl_cli.scene.relocation import Misfit, clone_shape, clone_sources, detail_seeds
 from splatctrl_cli.scene.removal import REASONS, removals, seen_through
@@ -50,6 +53,15 @@ from splatctrl_cli.scene.seeding import (
     inside_workspace,
     seeds_at,
     world_points,
+)
+from splatctrl_cli.scene.self_mask import (
+    PixelKind,
+    SelfMask,
+    audited,
+    object_mask,
+    of_label,
+    self_mask,
+    without_mixed,
 )
 from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
 from splatctrl_cli.scene.window import View, Window, halved, make_view
@@ -67,7 +79,14 @@ class SceneFitter:
     """
 
     def __init__(
-        self, config: SceneConfig, occupancy: OccupancyConfig, workspace: Box, *, seed: int = 0, threads: int = 0
+        self,
+        config: SceneConfig,
+        occupancy: OccupancyConfig,
+        workspace: Box,
+        *,
+        human: HumanConfig | None = None,
+        seed: int = 0,
+        threads: int = 0,
     ) -> None:
         check_voxel(config, occupancy)
         self.config = config
@@ -76,6 +95,7 @@ class SceneFitter:
         self.num_threads = num_threads(threads)
         self.buffer = SplatBuffer(config.max_splats)
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
+        self.people = PeopleMemory((human or HumanConfig()).memory)
         self.window = Window(config)
         self.num_steps = 0
         self.num_iterations = 0
@@ -96,26 +116,35 @@ class SceneFitter:
         rng = np.random.default_rng([self.seed, self.num_steps])
         self._find_mounted(frames)
         with ThreadPoolExecutor(self.num_threads) as pool:
+            masks = list(pool.map(lambda frame: self._mask(frame, robot), frames))
+            frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
             views = list(pool.map(self.view, frames))
+        seen = list(zip(frames, masks, strict=True))
         if self.background is None:
             self.background = self._behind(views)
-        self.occupancy.take_in(frames)
+        self.people.take_in(self.occupancy, frames)
         self._carry(robot)
-        is_trail = relabel(self.buffer, self.occupancy, robot)
+        if robot is not None:
+            pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]
+            self.occupancy.label_robot(robot.centers, robot.radii, pixels)
+            self.occupancy.forget_hidden(robot.centers, robot.radii, robot.distance)
+        is_trail = relabel(self.buffer, self.occupancy, robot, seen)
         removed = self._remove(is_trail, self._floating(views))
-        filled = self._seed(views)
-        relabel(self.buffer, self.occupancy, robot)  # a seed on the robot that drifts off it is known by this
+        filled = self._seed(views, masks)
         is_first = self.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
+        hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config)
+        as_they_were = self.buffer.parameters[hidden].copy()
         num_coarse = round(self.config.coarse_share * num_iterations) if is_first else 0
         self._optimise(num_coarse, rng, self._settings(), is_coarse=True)
         terms = self._optimise(num_iterations - num_coarse, rng, self._settings())
-        self._prune(robot, views, removed)
-        filled += self._fill_gaps(views, removed, half=self.num_steps % 2 if self.num_steps else None)
-        relabel(self.buffer, self.occupancy, robot)
+        self.buffer.parameters[hidden] = as_they_were
+        self._prune(robot, views, seen, removed)
+        filled += self._show_contact(robot, views, seen)
+        filled += self._fill_gaps(views, masks, removed, half=self.num_steps % 2 if self.num_steps else None)
         self.num_steps += 1
-        return self._audit(views, filled, removed, terms)
+        return replace(self._audit(views, filled, removed, terms), **audited(masks))
 
     def plant(self, cloud: PointCloud) -> Filled:
         """Start from coloured points instead of depth: seeds as dense as uses `fill` of the budget."""
@@ -136,7 +165,8 @@ class SceneFitter:
             self._refine_block(block, num_iterations, views)
             progress(num_iterations * (block + 1) // NUM_BLOCKS)
         removed = dict(self.refined.removed)
-        filled = self.refined.filled + self._fill_gaps(views, removed)
+        masks = [object_mask(view.frame) for view in views]
+        filled = self.refined.filled + self._fill_gaps(views, masks, removed)
         return self._audit(views, filled, removed, {})
 
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
@@ -149,7 +179,7 @@ class SceneFitter:
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
         if block < NUM_BLOCKS - 2:
-            filled += self._seed(views)
+            filled += self._seed(views, [object_mask(view.frame) for view in views])
             filled += self._use_idle(views, rng, removed)
         self.refined = Refined(
             num_blocks=block + 1,
@@ -180,6 +210,9 @@ class SceneFitter:
             step_stamps_ns=np.array(self.occupancy.step_stamps_ns, np.int64),
             unrepresented=self.unrepresented,
         )
+
+    def _mask(self, frame: RgbdFrame, robot: RobotPosture | None) -> SelfMask:
+        return object_mask(frame) if robot is None else self_mask(frame, robot, self.occupancy.config)
 
     def view(self, frame: RgbdFrame) -> View:
         """A frame as the optimiser takes it."""
@@ -224,9 +257,9 @@ class SceneFitter:
             is_floating |= seen_through(self.buffer.centers, view.frame, tolerance, view.nearest)
         return is_floating & self.buffer.is_alive
 
-    def _prune(self, robot: RobotPosture | None, views: Sequence[View], removed: dict[str, int]) -> None:
+    def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
-        drifted = relabel(self.buffer, self.occupancy, robot)
+        drifted = relabel(self.buffer, self.occupancy, robot, seen)
         self.buffer.kill(drifted)
         floating = self._floating(views)
         self.buffer.kill(floating)
@@ -252,47 +285,81 @@ class SceneFitter:
             self.buffer.kill(mask)
         return {reason: int(mask.sum()) for reason, mask in reasons.items()}
 
-    def _seed(self, views: Sequence[View]) -> Filled:
+    def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at the pixels of M_add, as densely as uses `fill` of the budget on the first full view."""
-        sources = []
-        for view in views:
-            mask = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
-            found = candidates(view.frame, mask)
-            sources.append(found.select(self._is_grounded(found.points, views)))
-        if not any(len(source) for source in sources):
+        found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
+        for view, mask in zip(views, masks, strict=True):
+            is_added = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
+            for label, sources in found.items():
+                source = candidates(view.frame, is_added & of_label(mask, label))
+                sources.append(source.select(self._is_grounded(source.points, views)))
+        everything = [source for sources in found.values() for source in sources]
+        num_candidates = sum(len(source) for source in everything)
+        if not num_candidates:
             return Filled(added=0, relocated=0, unmet=0)
-        num_candidates = sum(len(source) for source in sources)
         if self.density is None or num_candidates > MUCH_MORE * self.density.num_candidates:
             count = max(int(self.config.fill * self.config.max_splats), 1)
-            self.density = density_for(sources, count, self.config)
-        live = self.buffer.centers[self.buffer.is_alive]
-        seeds = seeds_at(sources, live, self.density, self.config)
+            self.density = density_for(everything, count, self.config)
         reserve = int(self.config.gap_reserve * self.config.max_splats)
-        return self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve)
+        filled = Filled(added=0, relocated=0, unmet=0)
+        for label, sources in found.items():
+            if not any(len(source) for source in sources):
+                continue
+            seeds = seeds_at(sources, self.buffer.centers[self._standing_for(label)], self.density, self.config)
+            filled += self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve, label=label)
+        return filled
 
-    def _fill_gaps(self, views: Sequence[View], removed: dict[str, int], half: int | None = None) -> Filled:
+    def _fill_gaps(
+        self,
+        views: Sequence[View],
+        masks: Sequence[SelfMask],
+        removed: dict[str, int],
+        half: int | None = None,
+    ) -> Filled:
         """Put splats where a measured surface is far from every sphere; half of it a time step, in turn.
 
-        Where slots are missing, splats are evicted for them every EVICT_EVERY time steps; counts in `removed`.
+        The robot's surface and everything else have spheres of their own. Where slots are missing, splats are evicted
+        for the latter every EVICT_EVERY time steps; counts in `removed`.
         """
-        splats = self.splats()
-        seeds = gap_seeds(
-            [(view.frame, view.mappable) for view in views],
-            bare_voxels(self.occupancy, splats, self.workspace, self.config, half),
-            self.occupancy.config.voxel,
-            splats,
-            self.config,
-            half=half,
-            num_threads=self.num_threads,
-        )
-        seeds = seeds.select(self._is_grounded(seeds.centers, views))
-        num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
-        if num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
-            shown = self._misfits(views)[1]
-            is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, self.config.max_gap)
-            self.buffer.kill(is_evicted)
-            removed["evicted"] += int(is_evicted.sum())
-        return self.buffer.fill(seeds, self.config.initial_opacity)
+        filled = Filled(added=0, relocated=0, unmet=0)
+        for label in (Label.OBJECT, Label.ROBOT):
+            splats = self.splats().select(self._standing_for(label)[self.buffer.is_alive])
+            bare = bare_voxels(self.occupancy, splats, self.workspace, self.config, half)
+            seeds = gap_seeds(
+                [(v.frame, v.mappable & of_label(m, label)) for v, m in zip(views, masks, strict=True)],
+                bare if label == Label.OBJECT else bare[:0],
+                self.occupancy.config.voxel,
+                splats,
+                self.config,
+                half=half,
+                num_threads=self.num_threads,
+            )
+            seeds = seeds.select(self._is_grounded(seeds.centers, views))
+            num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
+            if label == Label.OBJECT and num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
+                shown, gap = self._misfits(views)[1], self.config.max_gap
+                is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, gap)
+                self.buffer.kill(is_evicted)
+                removed["evicted"] += int(is_evicted.sum())
+            filled += self.buffer.fill(seeds, self.config.initial_opacity, label=label)
+        return filled
+
+    def _standing_for(self, label: Label) -> Bool:
+        """Slots (M,) of live splats that stand for the robot's surface, or for everything else."""
+        is_robot: Bool = self.buffer.labels == Label.ROBOT
+        return self.buffer.is_alive & (is_robot if label == Label.ROBOT else ~is_robot)
+
+    def _show_contact(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> Filled:
+        """Give objects beside the robot's moving links splats of one radius, no farther apart than it."""
+        if robot is None:
+            return Filled(added=0, relocated=0, unmet=0)
+        radius, is_object = self.config.contact_radius, self._standing_for(Label.OBJECT)
+        slots = np.flatnonzero(is_object)
+        self.buffer.set_radius(slots[is_in_contact(self.buffer.centers[slots], robot)], radius)
+        splats = self.splats().select(is_object[self.buffer.is_alive])
+        mappable = [view.mappable for view in views]
+        seeds = contact_seeds(seen, mappable, robot, splats, self.config, num_threads=self.num_threads)
+        return self.buffer.fill(seeds.select(self._is_grounded(seeds.centers, views)), self.config.initial_opacity)
 
     def _use_idle(self, views: Sequence[View], rng: np.random.Generator, removed: dict[str, int]) -> Filled:
         """Put dead slots, beyond the reserve for gaps, to use where nothing asks for them; counts in `removed`."""

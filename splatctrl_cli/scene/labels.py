@@ -1,35 +1,82 @@
 """Which splats are the robot's or a person's, and which only were (III-C)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from splatctrl_cli.records import Bool, Float32, Float64, Label
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.geometry import invert_transform, project, transform_points
+from splatctrl_cli.records import SOLID, Bool, Float32, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, tolerance_at
+
+Seen = Sequence[tuple[RgbdFrame, SelfMask]]
+WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be an object there is the robot's own
 
 
-def relabel(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | None) -> Bool:
+def relabel(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | None, seen: Seen = ()) -> Bool:
     """Label the splats anew; returns those (M,) that were robot or human and now are objects: trails.
 
-    Without a posture the robot's splats keep their label. A splat in the robot is the robot's, whatever a mask says.
+    Without a posture the robot's splats keep their label. A splat that the robot's pixels show is the robot's,
+    whatever a mask of people says. One of the robot's that measured depth shows to be an object stays: no trail.
     """
     labels = np.where(human_splats(buffer, occupancy), np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     if robot is None:
         labels[buffer.labels == Label.ROBOT] = Label.ROBOT
+        is_shown = np.zeros(len(labels), bool)
     else:
-        labels[robot_splats(buffer, occupancy, robot.centers, robot.radii)] = Label.ROBOT
-    is_trail: Bool = (buffer.labels != Label.OBJECT) & (labels == Label.OBJECT)
+        is_robot, is_shown = robot_splats(buffer, occupancy, robot, seen)
+        labels[is_robot] = Label.ROBOT
+    was_robot = buffer.labels == Label.ROBOT
+    is_trail: Bool = (buffer.labels != Label.OBJECT) & (labels == Label.OBJECT) & ~(was_robot & is_shown)
     buffer.labels[:] = labels
     return is_trail
 
 
-def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, centers: Float64, radii: Float64) -> Bool:
-    """Splats (M,) of the robot: those in voxels that its spheres meet, then within a margin of a sphere itself."""
-    margin = occupancy.config.robot_margin
-    occupancy.mark_robot(centers, radii + margin)
-    is_robot = buffer.is_alive & (occupancy.entity_at(buffer.centers) & Label.ROBOT > 0)
-    is_robot[is_robot] = inside_spheres(buffer.centers[is_robot], centers, radii, margin)
-    return is_robot
+def robot_splats(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture, seen: Seen) -> tuple[Bool, Bool]:
+    """Splats (M,) of the robot, and those that a pixel shows to be an object.
+
+    By the pixel whose depth a splat explains best: one of the robot makes it the robot's, one of an object takes it
+    from the robot. A splat that no pixel shows keeps its label: what the robot hides or touches is still there, and
+    the robot's own splats stay its own where they are within `see_through` of its body. Well inside the body, in a
+    voxel that no object's pixel has hit, a splat is the robot's.
+    """
+    alive, config = buffer.is_alive, occupancy.config
+    kind = shown_kinds(buffer.centers, seen, config)
+    was_robot = alive & (buffer.labels == Label.ROBOT)
+    is_solid = occupancy.entity_at(buffer.centers) & SOLID > 0
+    is_robot = alive & (kind == PixelKind.ROBOT)
+    unseen = np.flatnonzero(alive & (kind == PixelKind.NOTHING) & (was_robot | ~is_solid))
+    depth = -robot.distance(buffer.centers[unseen])
+    is_robot[unseen] = np.where(was_robot[unseen], depth > -config.see_through, depth > WELL_INSIDE)
+    return is_robot, np.asarray(alive & (kind == PixelKind.OBJECT))
+
+
+def shown_kinds(centers: Float32, seen: Seen, config: OccupancyConfig) -> UInt8:
+    """The kind (N,) of the pixel whose depth is nearest to each of centers (N, 3) [m], world: `PixelKind.OBJECT`,
+    `ROBOT`, or `NOTHING` where none is near: within `see_through` of an object's depth, and not nearer to the robot's
+    rendered surface; within the tolerance of the robot's depth, so that what it hides is not taken for it.
+    """
+    best = np.full(len(centers), np.inf, np.float32)
+    kinds = np.full(len(centers), PixelKind.NOTHING, np.uint8)
+    for frame, mask in seen:
+        k = frame.intrinsics
+        points = transform_points(invert_transform(frame.T_world_camera), centers)
+        z = points[:, 2].astype(np.float32)
+        is_ahead = z > 0
+        pixels = np.floor(project(k, np.where(is_ahead[:, None], points, 1.0)) + 0.5)
+        is_inside = is_ahead & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
+        u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
+        kind, measured, rendered = mask.kinds[v, u], frame.depth[v, u], mask.robot_depth[v, u]
+        gap = np.abs(z - measured)
+        is_hidden = (rendered > 0) & (np.abs(z - rendered) < gap)
+        is_object = (kind == PixelKind.OBJECT) & (gap <= config.see_through) & ~is_hidden
+        is_robot = (kind == PixelKind.ROBOT) & (gap <= tolerance_at(measured, config))
+        is_told = is_inside & (is_object | is_robot) & (gap < best)
+        best[is_told], kinds[is_told] = gap[is_told], kind[is_told]
+    return kinds
 
 
 def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
@@ -43,11 +90,3 @@ def human_splats(buffer: SplatBuffer, occupancy: OccupancyMap) -> Bool:
     is_near = was_human.copy()
     is_near[was_human] = occupancy.entity_around(buffer.centers[was_human]) & Label.HUMAN > 0
     return np.asarray(buffer.is_alive & (is_in | is_near))
-
-
-def inside_spheres(points: Float32, centers: Float64, radii: Float64, margin: float) -> Bool:
-    """Points (N, 3) within `margin` [m] of a sphere of (S, 3), (S,) [m]."""
-    inside = np.zeros(len(points), bool)
-    for center, radius in zip(centers, radii, strict=True):
-        inside |= np.sum((points - center) ** 2, axis=1) <= (radius + margin) ** 2
-    return inside

@@ -1,14 +1,15 @@
 """The occupancy grid of III-C: what the depth images have seen free, occupied, or never."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
-from splatctrl_cli.records import SWEPT, Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
+from splatctrl_cli.records import SOLID, SWEPT, Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
 
 MAX_VOXELS = 400_000_000
 MAX_STEPS = 65_535  # time steps that `last_seen` tells apart
@@ -41,16 +42,17 @@ class OccupancyMap:
         """Add the depth images of one time step, and set the human bit where human pixels of theirs hit.
 
         A voxel loses the bit when rays pass it, or when masked images hit it with other pixels alone. What nothing
-        passes and no masked image hits keeps it: who stands behind something is still there.
+        passes and no masked image hits keeps it: who stands behind something is still there. Rays that pass take the
+        solid bit, too.
         """
         self._begin_step(frames)
         masked = [(frame, frame.human) for frame in frames if frame.human is not None]
         entity, log_odds = self.entity.reshape(-1), self.log_odds.reshape(-1)
-        human = np.flatnonzero(entity & Label.HUMAN) if masked else np.zeros(0, np.int64)
-        before = log_odds[human]
+        known = np.flatnonzero(entity & (Label.HUMAN | SOLID))
+        before = log_odds[known]
         for frame in frames:
             self.integrate(frame)
-        entity[human[log_odds[human] < before]] &= np.uint8(~Label.HUMAN & 0xFF)
+        entity[known[log_odds[known] < before]] &= np.uint8(~(Label.HUMAN | SOLID) & 0xFF)
         for frame, mask in masked:
             self._label_hits(frame, mask == 0, clear_bits=Label.HUMAN)
         for frame, mask in masked:
@@ -90,6 +92,41 @@ class OccupancyMap:
             min_range=self.config.min_range,
             max_range=self.config.max_range,
         )
+
+    def label_robot(self, centers: Float64, radii: Float64, seen: Sequence[tuple[RgbdFrame, Bool, Bool]]) -> None:
+        """Set the robot bit where the robot is, by its spheres (S, 3), (S,) [m] and its pixels, and nowhere else.
+
+        seen: frames of one time step, their pixels (H, W) of the robot and of objects. A voxel that an object's pixel
+        hits is solid until a ray passes it or only the robot's pixels hit it: it is not the robot's, whatever else is
+        in it. The robot's voxels become swept.
+        """
+        self.mark_robot(centers, radii)
+        for frame, is_robot, _ in seen:
+            self._label_hits(frame, is_robot, set_bits=Label.ROBOT | SWEPT)
+            self._label_hits(frame, is_robot, clear_bits=SOLID)
+        for frame, _, is_object in seen:
+            self._label_hits(frame, is_object, set_bits=SOLID)
+        self.entity[self.entity & SOLID > 0] &= np.uint8(~Label.ROBOT & 0xFF)
+
+    def forget_hidden(self, centers: Float64, radii: Float64, distance: Callable[[Float32], Float64]) -> None:
+        """Take back that voxels within the robot are solid, where no solid voxel beside it is connected to them.
+
+        A robot and an object that left while it hid their contact: what else was solid there has been seen free.
+        centers (S, 3), radii (S,) [m] hold the robot; distance: points (Q, 3) -> signed distance (Q,) [m] to it.
+        """
+        reach = radii.max() + 2.0 * self.config.voxel
+        low, high = ((f - self.origin) / self.config.voxel for f in (centers.min(axis=0), centers.max(axis=0)))
+        pad = int(np.ceil(reach / self.config.voxel))
+        start = np.clip(np.floor(low).astype(int) - pad, 0, self.entity.shape)
+        stop = np.clip(np.ceil(high).astype(int) + pad, start, self.entity.shape)
+        crop = self.entity[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
+        is_solid = crop & SOLID > 0
+        cells = np.argwhere(is_solid)
+        points = (self.origin + self.config.voxel * (start + cells)).astype(np.float32)
+        is_met = distance(points) < 0.5 * np.sqrt(3.0) * self.config.voxel
+        groups = label(is_solid, np.ones((3, 3, 3)))[0][is_solid]
+        is_forgotten = is_met & ~np.isin(groups, groups[~is_met])
+        crop[tuple(cells[is_forgotten].T)] &= np.uint8(~SOLID & 0xFF)
 
     def mark_robot(self, centers: Float64, radii: Float64) -> None:
         """Set the robot bit in the voxels that spheres (S, 3), (S,) [m] meet, and in no other; mark them swept."""
@@ -147,8 +184,8 @@ class OccupancyMap:
         return voxels[~self._may_be_robot(voxels)]
 
     def _may_be_robot(self, voxels: NDArray[np.intp]) -> Bool:
-        """Which of flat indices (K,) the robot was ever in: what it left stays full for a while."""
-        return np.asarray(self.entity.reshape(-1)[voxels] & SWEPT > 0)
+        """Which of flat indices (K,) the robot was in, and no object since: what it left stays full for a while."""
+        return np.asarray(self.entity.reshape(-1)[voxels] & (SWEPT | SOLID) == SWEPT)
 
     def swept_box(self) -> Box | None:
         """The box around the voxels that the robot was in so far: around its path; None where it was in none."""

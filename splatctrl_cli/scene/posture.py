@@ -1,22 +1,77 @@
-"""The robot in the scene: where its spheres are, and how its splats move with them."""
+"""The robot in the scene: where its surface and its spheres are, and how its splats move with them."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from splatctrl_cli.records import Float32, Float64
+from splatctrl_cli.records import Box, Float32, Float64
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.surface import RobotSurface
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotPosture:
-    """Where the robot's spheres are: centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4)."""
+    """Where the robot's spheres are: centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4).
+
+    surface: the robot's collision geometry, None where its spheres are all that is known; T_world_surface: by frame
+    stamp [ns], the poses (L, 4, 4) of the surface's links.
+    """
 
     centers: Float64
     radii: Float64
     T_world_link: Float64
+    surface: RobotSurface | None = None
+    T_world_surface: Mapping[int, Float64] = field(default_factory=dict)
+
+    def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
+        """The surface and the poses (L, 4, 4) of its links at a frame's stamp; of the spheres where there is none."""
+        if self.surface is None:
+            return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
+        return self.surface, self.T_world_surface[stamp_ns]
+
+    def distance(self, points_world: NDArray[np.floating]) -> Float64:
+        """Signed distance (N,) [m] of points (N, 3) to the robot's solids at the newest stamp, negative inside; to
+        its spheres where it has triangles, which have no distance.
+        """
+        surface, T = self._solids()
+        return surface.distance(T, points_world)
+
+    def distance_to_moving(self, points_world: NDArray[np.floating]) -> Float64:
+        """The same to the solids of links that joints move."""
+        surface, T = self._solids()
+        return surface.distance(T, points_world, without=surface.fixed)
+
+    def _solids(self) -> tuple[RobotSurface, Float64]:
+        surface, T = self.seen_at(max(self.T_world_surface, default=0))
+        if not len(surface.triangles):
+            return surface, T
+        return RobotSurface.of_balls(self.centers, self.radii), np.eye(4)[None]
 
 
-POSTURE_NAMES = tuple(field.name for field in fields(RobotPosture))
+def posture_of(
+    robot: RobotModel, q: Float64, at_frames: Mapping[int, Float64], carried: Sequence[tuple[str, Box]] = ()
+) -> RobotPosture:
+    """The robot at joint positions q (J,), and at those of each frame's stamp [ns].
+
+    carried: boxes in the frames of links, which count as the robot's own surface.
+    """
+    spheres, surface = robot.sphere_set, robot.surface.with_boxes(carried)
+    pose = {link: robot.frame_pose(q, link) for link in set(spheres.links)}
+    return RobotPosture(
+        centers=robot.sphere_centers(q),
+        radii=spheres.radii,
+        T_world_link=np.array([pose[link] for link in spheres.links]),
+        surface=surface,
+        T_world_surface={
+            stamp_ns: surface.poses({link: robot.frame_pose(there, link) for link in surface.links})
+            for stamp_ns, there in at_frames.items()
+        },
+    )
+
+
+POSTURE_NAMES = ("centers", "radii", "T_world_link")  # what the next time step needs to know of the last
 
 
 def carried(points: Float32, before: RobotPosture, after: RobotPosture) -> Float32:

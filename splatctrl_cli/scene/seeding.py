@@ -139,22 +139,24 @@ def gap_seeds(
     config: SceneConfig,
     *,
     half: int | None = None,
+    stride: int | None = None,
     num_threads: int = 1,
 ) -> Seeds:
     """Seeds where a measured surface lies further than `max_gap` [m] from every splat's sphere.
 
     Blending can cover a pixel from splats that are not near its surface; a distance field cannot. Looked at are every
-    third pixel and row of the views (a frame and its mappable pixels (H, W)) or fewer, half of `max_gap` apart, and
-    the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows now; a centre may be half a
-    voxel off its surface. With `half` 0 or 1 only every second of the rows: the other half waits.
+    `stride`th pixel and row of the views (a frame and its mappable pixels (H, W)), by default every third or fewer,
+    half of `max_gap` apart, and the centres (K, 3) of occupied voxels, which remember surfaces that nothing shows
+    now; a centre may be half a voxel off its surface. With `half` 0 or 1 only every second of the rows: the other
+    half waits.
     """
     sources, spheres = [], SplatTree(splats, num_threads)
     for frame, mappable in views:
         mask = mappable.copy()
-        stride = _gap_stride(frame, config.max_gap)
+        step = _gap_stride(frame, config.max_gap) if stride is None else stride
         rows = np.arange(len(mask))
-        mask[(rows % stride != 0) | ((rows // stride) % 2 == (2 if half is None else 1 - half))] = False
-        mask[:, np.arange(mask.shape[1]) % stride != 0] = False
+        mask[(rows % step != 0) | ((rows // step) % 2 == (2 if half is None else 1 - half))] = False
+        mask[:, np.arange(mask.shape[1]) % step != 0] = False
         mask[mask] = spheres.are_further(world_points_at(frame, mask), config.max_gap)
         if mask.any():
             sources.append(candidates(frame, mask))

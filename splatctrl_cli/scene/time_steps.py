@@ -17,11 +17,23 @@ LARGEST_GAP_NS = 200_000_000  # a joint state older than this says nothing about
 class TimeStep:
     """Frames taken together, at most one per camera where there is a clock, and the joint positions then.
 
-    position (J,) float64, in the source's joint order; None where no joint state is near.
+    position (J,) float64 at the last frame, in the source's joint order; None where no joint state is near.
+    velocity (J,) [1/s] then.
     """
 
     frames: tuple[RgbdFrame, ...]
     position: Float64 | None
+    velocity: Float64 | None = None
+
+    @property
+    def positions(self) -> dict[int, Float64]:
+        """Joint positions (J,) at the stamp of each frame [ns]; none where no joint state is near."""
+        if self.position is None or self.velocity is None:
+            return {}
+        last_ns = self.frames[-1].stamp_ns
+        return {
+            frame.stamp_ns: self.position + 1e-9 * (frame.stamp_ns - last_ns) * self.velocity for frame in self.frames
+        }
 
     def without_depth(self) -> "TimeStep":
         """The same step as colour cameras would have seen it."""
@@ -70,11 +82,12 @@ def _is_complete(frames: Sequence[RgbdFrame], record: RgbdFrame, *, has_clock: b
 
 def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeStep:
     """Joint positions are carried to the frames' stamp by their velocities."""
-    position = None
+    position = velocity = None
     if joints is not None and abs(frames[-1].stamp_ns - joints.stamp_ns) <= LARGEST_GAP_NS:
         elapsed = (frames[-1].stamp_ns - joints.stamp_ns) * 1e-9
-        position = joints.position + elapsed * np.nan_to_num(joints.velocity)
-    return TimeStep(frames=tuple(frames), position=position)
+        velocity = np.nan_to_num(joints.velocity)
+        position = joints.position + elapsed * velocity
+    return TimeStep(frames=tuple(frames), position=position, velocity=velocity)
 
 
 def cloud_box(cloud: PointCloud) -> Box:

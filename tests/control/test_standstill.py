@@ -13,6 +13,7 @@ from splatctrl_cli.control.standstill import (
     Zone,
     is_anybody_in,
     monitored_standstill,
+    remembered,
     separation_of,
 )
 from splatctrl_cli.errors import UsageError
@@ -169,3 +170,20 @@ def test_the_box_is_left_later_than_it_is_entered_wherever_the_arm_is() -> None:
     assert run.is_complete
     with pytest.raises(UsageError, match="hysteresis of 0 or more"):
         BoxZone(box=BOX, hysteresis=-0.1)
+
+
+def test_people_of_the_last_map_hold_the_path_no_longer_than_they_are_remembered() -> None:
+    def people(points: Float64, _: int) -> Float64:
+        return np.full(len(points), 0.14)
+
+    def run(memory: float) -> Standstill:
+        seen = remembered(people, lambda stamp_ns: stamp_ns * 1e-9 - 0.5, memory)  # the last map is of 0.5 s
+        return monitored_standstill(PlanarArm(), motion(), seen, ZONE, start_ns=0, period=0.01, max_wait=30.0)
+
+    assert run(2.0).is_complete and run(2.0).duration_s == pytest.approx(2.5 + 1.0, abs=0.02)
+    assert not run(99.0).is_complete
+
+
+def test_people_of_a_map_without_a_time_stay() -> None:
+    people = remembered(lambda points, _: np.full(len(points), 0.14), lambda _: float("nan"), 1.0)
+    assert people(np.zeros((2, 3)), 9_000_000_000).tolist() == [0.14, 0.14]

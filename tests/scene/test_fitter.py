@@ -163,7 +163,14 @@ def test_a_robot_that_moves_keeps_its_splats_and_one_that_jumps_leaves_none() ->
     jumped = fitter()
     jumped.step([frame(0, block=0.2)], posture(0.0))
     away = RobotPosture(centers=np.array([[5.0, 0.0, 0.2]]), radii=np.array([0.12]), T_world_link=np.eye(4)[None])
-    row = jumped.step([frame(1, block=0.2)], away)  # the link did not move: its splats are a trail
+    row = jumped.step([frame(1, block=0.2)], away)  # the link did not move, and its splats are where depth is
+    assert row.removed["trail"] == row.robot == 0
+    assert on_top(jumped.splats()) > 30, "measured depth supports what was the robot"
+    hidden = fitter()
+    hidden.step([frame(0, block=0.2)], posture(0.0))
+    dark = frame(1)
+    dark.depth[:] = 0.0
+    row = hidden.step([dark], away)  # nothing shows them, and the robot is elsewhere: a trail
     assert row.removed["trail"] > 0
     assert row.robot == 0
 

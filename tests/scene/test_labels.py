@@ -6,12 +6,15 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.records import Label, RgbdFrame, SplatSet, UInt8
+from splatctrl_cli.records import SOLID, SWEPT, Label, RgbdFrame, SplatSet, UInt8
+from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.labels import human_splats, inside_spheres, relabel
+from splatctrl_cli.scene.labels import human_splats, relabel, shown_kinds
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.self_mask import PixelKind, self_mask
 from tests.scene.wall import WORKSPACE, frame
 
 VISITOR = 0.2  # [m] height of the block that stands for a person
@@ -136,14 +139,9 @@ def test_every_splat_in_a_sphere_lies_in_a_voxel_that_the_sphere_marks() -> None
     grid = OccupancyMap(WORKSPACE, OccupancyConfig(), 1)
     grid.mark_robot(spheres, radii)
     points = np.float32(rng.uniform(WORKSPACE.lower, WORKSPACE.upper, (20_000, 3)))
-    inside = inside_spheres(points, spheres, radii, 0.0)
+    inside = (np.linalg.norm(points[:, None] - spheres, axis=2) <= radii).any(axis=1)
     assert inside.sum() > 100
     assert (grid.entity_at(points[inside]) & Label.ROBOT > 0).all()
-
-
-def test_inside_spheres_counts_the_margin() -> None:
-    points = np.float32([[0.0, 0.0, 0.0], [0.11, 0.0, 0.0], [0.13, 0.0, 0.0]])
-    assert inside_spheres(points, np.zeros((1, 3)), np.array([0.1]), 0.02).tolist() == [True, True, False]
 
 
 def steps(target: SceneFitter, views: list[tuple[RgbdFrame, UInt8 | None]]) -> SplatSet:
@@ -195,3 +193,116 @@ def test_a_person_who_walks_leaves_no_trail() -> None:
         assert (splats.labels[is_up] == Label.HUMAN).all()
         assert np.abs(splats.centers[is_up, 0] - place).max() < 0.13
     assert not (steps(target, [(frame(), np.zeros((60, 80), np.uint8))]).centers[:, 2] > 0.1).any()
+
+
+def ball(z: float, radius: float = 0.1) -> RobotPosture:
+    """A robot that is one ball of collision geometry, above the middle of the floor."""
+    T = np.eye(4)
+    T[2, 3] = z
+    surface = RobotSurface.from_parts([Shape(link="arm", kind="sphere", size=(radius,), T_link_shape=np.eye(4))])
+    return RobotPosture(
+        centers=np.array([[0.0, 0.0, z]]),
+        radii=np.array([radius]),
+        T_world_link=T[None],
+        surface=surface,
+        T_world_surface={0: T[None]},
+    )
+
+
+def seen_with(robot: RobotPosture, block: float = 0.0, lift: float = 0.0, x: float = 0.0) -> RgbdFrame:
+    """The floor and a block, with the ball before them, its measured depth `lift` [m] nearer than it is."""
+    view = frame(block=block, x=x)
+    surface, T = robot.seen_at(0)
+    shown = surface.render(T, view.intrinsics, view.T_world_camera, view.depth).depth
+    nearer = (shown > 0) & ((shown < view.depth) | (lift > 0))
+    return replace(view, depth=np.where(nearer, shown - np.float32(lift), view.depth).astype(np.float32))
+
+
+def test_a_splat_is_what_the_pixel_shows_whose_depth_it_explains() -> None:
+    robot = ball(0.3)
+    view = seen_with(robot)
+    mask = self_mask(view, robot, OccupancyConfig())
+    points = np.float32([[0.0, 0.0, 0.4], [0.0, 0.0, 0.38], [0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [0.3, 0.2, 0.1]])
+    kinds = shown_kinds(points, [(view, mask)], OccupancyConfig())
+    assert kinds.tolist() == [PixelKind.ROBOT, *[PixelKind.NOTHING] * 2, PixelKind.OBJECT, PixelKind.NOTHING]
+
+
+def test_what_the_robot_hides_keeps_its_label_and_what_it_shows_is_its_own() -> None:
+    robot = ball(0.3)
+    view = seen_with(robot)
+    grid = grid_of(view)
+    slots = splats_at((0.0, 0.0, 0.4), (0.0, 0.0, 0.15), (0.3, 0.2, 0.0), (0.0, 0.0, 0.3))
+    is_trail = relabel(slots, grid, robot, [(view, self_mask(view, robot, OccupancyConfig()))])
+    assert not is_trail.any()
+    assert slots.labels[:4].tolist() == [Label.ROBOT, Label.OBJECT, Label.OBJECT, Label.ROBOT]
+
+
+def test_an_object_that_arrives_before_the_robot_takes_its_splats_with_measured_depth() -> None:
+    robot = ball(0.3)
+    view = seen_with(robot, lift=0.03)
+    slots = splats_at((0.0, 0.0, 0.43), (0.0, 0.0, 0.4))
+    slots.labels[:2] = Label.ROBOT
+    is_trail = relabel(slots, grid_of(view), robot, [(view, self_mask(view, robot, OccupancyConfig()))])
+    assert slots.labels[:2].tolist() == [Label.OBJECT, Label.ROBOT]
+    assert not is_trail.any()
+
+
+def labelled(grid: OccupancyMap, robot: RobotPosture, view: RgbdFrame) -> None:
+    """One time step of the voxels' labels."""
+    mask = self_mask(view, robot, grid.config)
+    grid.take_in([view])
+    pixels = [(view, mask.kinds == PixelKind.ROBOT, mask.kinds == PixelKind.OBJECT)]
+    grid.label_robot(robot.centers, robot.radii, pixels)
+    grid.forget_hidden(robot.centers, robot.radii, robot.distance)
+
+
+def bits(grid: OccupancyMap, *points: tuple[float, float, float]) -> list[int]:
+    return grid.entity_at(np.float32(points)).tolist()
+
+
+def test_the_voxels_of_the_robots_pixels_are_its_own_and_those_of_objects_are_solid() -> None:
+    grid, robot = grid_of(), ball(0.3)
+    labelled(grid, robot, seen_with(robot))
+    (top, floor) = bits(grid, (0.0, 0.0, 0.4), (0.3, 0.2, 0.0))
+    assert top & Label.ROBOT and top & SWEPT and not top & SOLID
+    assert floor & SOLID and not floor & Label.ROBOT
+
+
+def test_an_object_that_arrives_where_the_robot_was_is_occupied() -> None:
+    grid, robot, away = grid_of(), ball(0.2), ball(5.0)
+    labelled(grid, robot, seen_with(robot))
+    block = frame(block=VISITOR)
+    for _ in range(4):
+        labelled(grid, away, block)
+    centers = grid.occupied_centers()
+    on_top = (np.abs(centers[:, :2]).max(axis=1) < 0.08) & (np.abs(centers[:, 2] - VISITOR) < 0.02)
+    assert on_top.sum() > 30
+    assert bits(grid, (0.0, 0.0, VISITOR))[0] & (SWEPT | SOLID) == SWEPT | SOLID
+
+
+def test_a_voxel_that_the_robot_left_is_not_occupied() -> None:
+    grid, robot, away = grid_of(), ball(0.3), ball(5.0)
+    for _ in range(3):
+        labelled(grid, robot, seen_with(robot))
+    dark = replace(frame(), depth=np.zeros_like(frame().depth))
+    labelled(grid, away, dark)
+    assert not (np.linalg.norm(grid.occupied_centers() - [0.0, 0.0, 0.3], axis=1) < 0.15).any()
+
+
+def test_what_the_robot_hides_of_an_object_is_solid_as_long_as_the_rest_of_it_is_there() -> None:
+    grid, away, robot = grid_of(), ball(5.0), ball(0.22, 0.08)
+    for _ in range(3):
+        labelled(grid, away, frame(block=VISITOR))
+    hidden = (0.0, 0.0, VISITOR)
+    labelled(grid, robot, seen_with(robot, block=VISITOR))  # the ball stands in the block's top
+    assert bits(grid, hidden)[0] & SOLID
+    labelled(grid, robot, seen_with(robot))  # the block is gone
+    assert not bits(grid, hidden)[0] & SOLID
+
+
+def test_a_splat_on_the_robot_just_behind_an_object_is_not_taken_for_the_object() -> None:
+    robot = ball(0.3)
+    view = seen_with(robot, lift=0.012)  # nearer than `see_through`
+    mask = self_mask(view, robot, OccupancyConfig())
+    kinds = shown_kinds(np.float32([[0.0, 0.0, 0.4], [0.0, 0.0, 0.412]]), [(view, mask)], OccupancyConfig())
+    assert kinds.tolist() == [PixelKind.NOTHING, PixelKind.OBJECT]

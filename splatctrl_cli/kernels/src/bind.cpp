@@ -22,4 +22,5 @@ NB_MODULE(SPLATCTRL_MODULE, m) {
   splatctrl::bind_chain(m);
   splatctrl::bind_edges(m);
   splatctrl::bind_occupancy(m);
+  splatctrl::bind_surface(m);
 }

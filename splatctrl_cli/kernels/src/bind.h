@@ -42,5 +42,6 @@ void bind_field(nb::module_& m);
 void bind_occupancy(nb::module_& m);
 void bind_chain(nb::module_& m);
 void bind_edges(nb::module_& m);
+void bind_surface(nb::module_& m);
 
 }  // namespace splatctrl

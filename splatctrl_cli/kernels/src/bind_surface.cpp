@@ -1,0 +1,62 @@
+// Rendered surfaces of solids: see kernels/surface.py for shapes.
+#include <algorithm>
+#include <vector>
+
+#include "bind.h"
+#include "surface.h"
+
+namespace splatctrl {
+namespace {
+
+constexpr std::size_t kColumns = 16;  // kind, rotation (9), shift (3), size (3)
+
+std::vector<SurfaceSolid> solids_from(const Array<const double>& rows, const Array<const std::int16_t>& links) {
+  expect(rows.size() == kColumns * links.size(), "solids: expected (P, 16) and links (P,)");
+  std::vector<SurfaceSolid> solids(links.size());
+  for (std::size_t i = 0; i < solids.size(); ++i) {
+    const double* p = rows.data() + kColumns * i;
+    expect(p[0] >= 0 && p[0] <= 3, "solids: expected kinds 0 to 3");
+    solids[i].kind = static_cast<SolidKind>(static_cast<int>(p[0]));
+    std::copy(p + 1, p + 10, solids[i].turn);
+    std::copy(p + 10, p + 13, solids[i].shift);
+    std::copy(p + 13, p + 16, solids[i].size);
+    solids[i].link = links.data()[i];
+  }
+  return solids;
+}
+
+}  // namespace
+
+void bind_surface(nb::module_& m) {
+  m.def(
+      "render_surface",
+      [](const Array<const double>& intrinsics, const Array<const double>& solids,
+         const Array<const std::int16_t>& solid_links, const Array<const double>& triangles,
+         const Array<const std::int16_t>& triangle_links, const Array<const float>& measured, float tolerance,
+         float quadratic, const Array<float>& depth, const Array<std::int16_t>& link,
+         const Array<std::int16_t>& inside, int num_threads) {
+        expect(intrinsics.size() == 6, "intrinsics: expected 6 numbers");
+        const double* k = intrinsics.data();
+        const SurfaceCamera camera{k[0], k[1], k[2], k[3], static_cast<int>(k[4]), static_cast<int>(k[5])};
+        const std::size_t size = static_cast<std::size_t>(camera.width) * camera.height;
+        expect(measured.size() == size && depth.size() == size && link.size() == size && inside.size() == size,
+               "expected images (H, W)");
+        expect(triangles.size() == 9 * triangle_links.size(), "triangles: expected (F, 3, 3) and links (F,)");
+        const std::vector<SurfaceSolid> shapes = solids_from(solids, solid_links);
+        std::vector<SurfaceTriangle> faces(triangle_links.size());
+        for (std::size_t i = 0; i < faces.size(); ++i) {
+          const double* p = triangles.data() + 9 * i;
+          faces[i] = {{p, p + 3, p + 6}, triangle_links.data()[i]};
+        }
+        const nb::gil_scoped_release release;
+        render_surface(camera, shapes.data(), static_cast<int>(shapes.size()), faces.data(),
+                       static_cast<int>(faces.size()), {measured.data(), tolerance, quadratic},
+                       {depth.data(), link.data(), inside.data()}, num_threads);
+      },
+      nb::arg("intrinsics").noconvert(), nb::arg("solids").noconvert(), nb::arg("solid_links").noconvert(),
+      nb::arg("triangles").noconvert(), nb::arg("triangle_links").noconvert(), nb::arg("measured").noconvert(),
+      nb::arg("tolerance"), nb::arg("quadratic"), nb::arg("depth").noconvert(), nb::arg("link").noconvert(),
+      nb::arg("inside").noconvert(), nb::arg("num_threads"));
+}
+
+}  // namespace splatctrl

@@ -1,0 +1,65 @@
+"""The depth image that a camera would measure of solids and triangles; compiled."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.kernels import native
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int16 = NDArray[np.int16]
+
+BOX, CYLINDER, BALL, CAPSULE = 0.0, 1.0, 2.0, 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceScene:
+    """Solids (P) and triangles (F) in a camera's optical frame [m].
+
+    solids (P, 16) float64: kind, the rotation (9) and shift (3) from the optical frame to the solid's own, its size:
+    half edges of a box; radius, half length along z and 0 of a cylinder or a capsule; radius, 0, 0 of a ball.
+    triangles (F, 3, 3) float64: corners, counter-clockwise seen from outside. The links (P,) and (F,) are numbers
+    of at least 0.
+    """
+
+    solids: Float64
+    solid_links: Int16
+    triangles: Float64
+    triangle_links: Int16
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceImage:
+    """depth (H, W) float32 [m] of the nearest surface, 0 = none; link (H, W) int16 of that surface, -1 = none; inside
+    (H, W) int16: the link of the solid that holds the measured point, -1 = none.
+    """
+
+    depth: Float32
+    link: Int16
+    inside: Int16
+
+
+def render_surface(
+    scene: SurfaceScene,
+    intrinsics: Float64,
+    measured: Float32,
+    *,
+    tolerance: float,
+    quadratic: float,
+    num_threads: int = 1,
+) -> SurfaceImage:
+    """Cast a ray through every pixel's centre; intrinsics (6,): fx, fy, cx, cy, width, height.
+
+    measured (H, W) float32 [m], 0 = none: a measured point is inside a solid where it lies by more than `tolerance` +
+    `quadratic` depth^2 [m] behind its front and before its back along the ray; of triangles, inside closed surfaces.
+    A solid that holds the camera is not seen, nor is a triangle that reaches behind the camera.
+    """
+    shape = (int(intrinsics[5]), int(intrinsics[4]))
+    depth, link, inside = np.empty(shape, np.float32), np.empty(shape, np.int16), np.empty(shape, np.int16)
+    native.render_surface(
+        intrinsics, scene.solids, scene.solid_links, scene.triangles, scene.triangle_links, measured, tolerance,
+        quadratic, depth, link, inside, num_threads,
+    )  # fmt: skip
+    return SurfaceImage(depth=depth, link=link, inside=inside)

@@ -1,0 +1,152 @@
+"""Contact that is meant: what a robot carries and what it touches on purpose, from a TOML file (`--declare`)."""
+
+import tomllib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Bool, Box
+
+REMEDY = "see docs/formats.md for the keys of a declaration"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Carried:
+    """A box in the frame of `link` [m] that belongs to the robot from `start` to `end` [s after the first state]."""
+
+    link: str
+    box: Box
+    start: float
+    end: float
+
+    def is_active(self, time_s: float) -> bool:
+        """Whether the robot carries it then."""
+        return self.start <= time_s <= self.end
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectedContact:
+    """A contact of `link` within a box of the world [m], from `start` to `end` [s after the first state], and why."""
+
+    link: str
+    box: Box
+    start: float
+    end: float
+    reason: str
+
+    def covers(self, link: str, point_world: NDArray[np.floating], time_s: float) -> bool:
+        """Whether a contact of a link at a point (3,) [m] and time was declared."""
+        return link == self.link and self.start <= time_s <= self.end and bool(self.box.contains(point_world))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declarations:
+    """What a file declares, entry by entry in its order; empty without one.
+
+    num_uses counts by (table, index) how often an entry changed a label or excused a contact: an entry that nothing
+    used is stale, or names the wrong link, box or time.
+    """
+
+    carried: tuple[Carried, ...] = ()
+    expected_contact: tuple[ExpectedContact, ...] = ()
+    num_uses: dict[tuple[str, int], int] = field(default_factory=dict)
+
+    def carried_at(self, time_s: float) -> list[tuple[str, Box]]:
+        """Link and box in its frame of what the robot carries at a time."""
+        return [(entry.link, entry.box) for entry in self.carried if entry.is_active(time_s)]
+
+    def is_carried(self, link: str, points_link: NDArray[np.floating], time_s: float) -> Bool:
+        """Points (N, 3) [m] in the frame of a link -> (N,) whether they lie in something it carries; counts uses."""
+        inside = np.zeros(len(points_link), bool)
+        for index, entry in enumerate(self.carried):
+            if entry.link == link and entry.is_active(time_s):
+                its = entry.box.contains(points_link)
+                self.used("carried", index, int(its.sum()))
+                inside |= its
+        return inside
+
+    def expects(self, link: str, point_world: NDArray[np.floating], time_s: float) -> ExpectedContact | None:
+        """The first entry that covers a contact at a point (3,) [m]; counts its use."""
+        for index, entry in enumerate(self.expected_contact):
+            if entry.covers(link, point_world, time_s):
+                self.used("expected_contact", index, 1)
+                return entry
+        return None
+
+    def used(self, table: str, index: int, count: int) -> None:
+        """Count uses of an entry."""
+        if count:
+            self.num_uses[table, index] = self.num_uses.get((table, index), 0) + count
+
+    def unused(self) -> list[tuple[str, int]]:
+        """(table, index) of the entries that nothing used."""
+        counts = {"carried": len(self.carried), "expected_contact": len(self.expected_contact)}
+        entries = [(table, index) for table, count in counts.items() for index in range(count)]
+        return [entry for entry in entries if not self.num_uses.get(entry)]
+
+
+def read_declarations(path: Path, links: Collection[str] | None = None) -> Declarations:
+    """The declarations of a TOML file; `links`: of the robot, None where it is not known.
+
+    Raises InputError for a file that cannot be read, unknown tables or keys, a link the robot does not have, a box
+    that is none, or a time that ends before it starts.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give --declare a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}", remedy=REMEDY) from None
+    unknown = sorted(set(document) - {"carried", "expected_contact"})
+    if unknown:
+        raise InputError(f"{path}: expected [[carried]] and [[expected_contact]], got {unknown[0]}", remedy=REMEDY)
+    carried = [Carried(**entry) for entry in _entries(path, document, "carried", links)]
+    expected = [ExpectedContact(**entry) for entry in _entries(path, document, "expected_contact", links)]
+    return Declarations(carried=tuple(carried), expected_contact=tuple(expected))
+
+
+def _entries(
+    path: Path, document: dict[str, Any], table: str, links: Collection[str] | None
+) -> Iterator[dict[str, Any]]:
+    entries = document.get(table, [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: {table}: expected entries, got one table", remedy=f"write [[{table}]]")
+    kinds: dict[str, type] = {"link": str, "box": list, "start": float, "end": float}
+    kinds |= {"reason": str} if table == "expected_contact" else {}
+    for index, entry in enumerate(entries):
+        where = f"{path}: {table} {index + 1}"
+        for key in sorted(set(entry) ^ set(kinds)):
+            raise InputError(f"{where}: {'unknown' if key in entry else 'missing'} key '{key}'", remedy=REMEDY)
+        if links is not None and entry["link"] not in links:
+            raise InputError(
+                f"{where}: link: expected a link of the robot, got {entry['link']!r}",
+                remedy=f"its links: {', '.join(links)}",
+            )
+        if kinds.get("reason") and not (isinstance(entry["reason"], str) and entry["reason"].strip()):
+            raise InputError(
+                f"{where}: reason: expected words, got {entry['reason']!r}", remedy="say why it is meant"
+            )
+        start, end = (_number(where, key, entry[key]) for key in ("start", "end"))
+        if not start < end:
+            raise InputError(f"{where}: expected start < end, got {start:g} and {end:g} s", remedy=REMEDY)
+        yield {**entry, "box": _box(where, entry["box"]), "start": start, "end": end}
+
+
+def _box(where: str, values: object) -> Box:
+    if not isinstance(values, list) or len(values) != 6:
+        raise InputError(f"{where}: box: expected [lx, ly, lz, ux, uy, uz] [m], got {values!r}", remedy=REMEDY)
+    numbers = np.array([_number(where, "box", value) for value in values])
+    if not np.all(numbers[:3] < numbers[3:]):
+        raise InputError(f"{where}: box: expected its lower corner below its upper one, got {values}", remedy=REMEDY)
+    return Box(lower=numbers[:3], upper=numbers[3:])
+
+
+def _number(where: str, key: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise InputError(f"{where}: {key}: expected a finite number, got {value!r}", remedy=REMEDY)
+    return float(value)

@@ -1,0 +1,222 @@
+"""The robot's own surface: its collision geometry as a camera sees it, and how far points lie from it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.kernels.surface import BALL, BOX, CAPSULE, CYLINDER, SurfaceImage, SurfaceScene, render_surface
+from splatctrl_cli.mesh_distance import TriangleMesh, load_mesh
+from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, SphereSet
+from splatctrl_cli.robot.solids import mesh_path, mesh_pieces
+from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
+
+Int16 = NDArray[np.int16]
+KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSurface:
+    """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
+
+    kinds (P,) as `kernels.surface` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
+    T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,).
+    by_spheres: links that collision spheres stand for, because their geometry is missing or cannot be read. fixed:
+    links that no joint moves.
+    """
+
+    links: tuple[str, ...]
+    kinds: Float64
+    sizes: Float64
+    T_link_solid: Float64
+    solid_links: Int16
+    triangles: Float64
+    triangle_links: Int16
+    by_spheres: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, urdf: UrdfFile, spheres: SphereSet, folders: Sequence[Path] = ()) -> "RobotSurface":
+        """The collision geometry of a URDF; the spheres of links that have none that can be read.
+
+        folders: where ``package://`` paths are looked for, before the folders above the URDF.
+        """
+        unread = {link for link, _ in urdf.other_shapes}
+        pieces = []
+        for mesh in urdf.meshes:
+            try:
+                pieces.append((mesh.link, _triangles(urdf, mesh, folders)))
+            except InputError:
+                unread.add(mesh.link)
+        by_spheres = tuple(
+            link for link in dict.fromkeys(spheres.links) if link in unread or link not in urdf.collision_links
+        )
+        left_out = set(by_spheres)
+        shapes = [shape for shape in urdf.shapes if shape.link not in left_out]
+        is_ball = [link in left_out for link in spheres.links]
+        balls = [
+            _ball(link, center, radius)
+            for link, center, radius, chosen in zip(
+                spheres.links, spheres.centers, spheres.radii, is_ball, strict=True
+            )
+            if chosen
+        ]
+        kept = [(link, corners) for link, corners in pieces if link not in left_out]
+        bodies = urdf.rigid_bodies()
+        children = {child for _, child in urdf.parents}
+        fixed = tuple(link for link in urdf.links if bodies[link][0] not in children)
+        return cls.from_parts([*shapes, *balls], kept, by_spheres=by_spheres, fixed=fixed)
+
+    @classmethod
+    def from_parts(
+        cls,
+        shapes: Sequence[Shape],
+        triangles: Sequence[tuple[str, Float64]] = (),
+        *,
+        by_spheres: tuple[str, ...] = (),
+        fixed: tuple[str, ...] = (),
+    ) -> "RobotSurface":
+        """Primitives, and triangles (F, 3, 3) in the frame of a link each."""
+        links = tuple(dict.fromkeys([*(s.link for s in shapes), *(link for link, _ in triangles)]))
+        number = {link: index for index, link in enumerate(links)}
+        corners = [part for _, part in triangles]
+        return cls(
+            links=links,
+            kinds=np.array([KINDS[s.kind] for s in shapes], np.float64),
+            sizes=np.array([_sizes(s) for s in shapes], np.float64).reshape(-1, 3),
+            T_link_solid=np.array([s.T_link_shape for s in shapes], np.float64).reshape(-1, 4, 4),
+            solid_links=np.array([number[s.link] for s in shapes], np.int16),
+            triangles=np.concatenate([np.zeros((0, 3, 3)), *corners]),
+            triangle_links=np.repeat([number[link] for link, _ in triangles], [len(part) for part in corners]).astype(
+                np.int16
+            ),
+            by_spheres=by_spheres,
+            fixed=fixed,
+        )
+
+    @classmethod
+    def of_balls(cls, centers_world: Float64, radii: Float64) -> "RobotSurface":
+        """Balls (S, 3), (S,) [m] of one link, whose frame is the world."""
+        balls = [_ball("spheres", c, r) for c, r in zip(centers_world, radii, strict=True)]
+        return cls.from_parts(balls, by_spheres=("spheres",))
+
+    def with_boxes(self, boxes: Sequence[tuple[str, Box]]) -> "RobotSurface":
+        """The same with more boxes, each fixed to a link that has geometry, in its frame: what the robot carries."""
+        shapes = [
+            Shape(link=link, kind="box", size=tuple(box.upper - box.lower), T_link_shape=_shifted(box))
+            for link, box in boxes
+        ]
+        links = tuple(dict.fromkeys([*self.links, *(s.link for s in shapes)]))
+        added = [links.index(s.link) for s in shapes]
+        return RobotSurface(
+            links=links,
+            kinds=np.append(self.kinds, [BOX] * len(shapes)),
+            sizes=np.concatenate([self.sizes, np.array([_sizes(s) for s in shapes]).reshape(-1, 3)]),
+            T_link_solid=np.concatenate(
+                [self.T_link_solid, np.array([s.T_link_shape for s in shapes]).reshape(-1, 4, 4)]
+            ),
+            solid_links=np.append(self.solid_links, added).astype(np.int16),
+            triangles=self.triangles,
+            triangle_links=self.triangle_links,
+            by_spheres=self.by_spheres,
+            fixed=self.fixed,
+        )
+
+    def poses(self, T_world_link: Mapping[str, Float64]) -> Float64:
+        """(L, 4, 4) of `links`, from poses by name."""
+        return np.array([T_world_link[link] for link in self.links], np.float64).reshape(-1, 4, 4)
+
+    def render(
+        self,
+        T_world_link: Float64,
+        intrinsics: Intrinsics,
+        T_world_camera: Float64,
+        measured: Float32,
+        *,
+        tolerance: float = 0.0,
+        quadratic: float = 0.0,
+    ) -> SurfaceImage:
+        """What a camera sees of the robot alone with its links at T_world_link (L, 4, 4), and which points of
+        `measured` (H, W) float32 [m] lie inside it; see `kernels.surface.render_surface`.
+        """
+        k = intrinsics
+        T_camera_link = invert_transform(T_world_camera) @ T_world_link
+        T_solid_camera = np.linalg.inv(T_camera_link[self.solid_links] @ self.T_link_solid)
+        T = T_camera_link[self.triangle_links]
+        corners = np.einsum("fij,fkj->fki", T[:, :3, :3], self.triangles) + T[:, None, :3, 3]
+        scene = SurfaceScene(
+            solids=np.ascontiguousarray(
+                np.column_stack(
+                    [self.kinds, T_solid_camera[:, :3, :3].reshape(-1, 9), T_solid_camera[:, :3, 3], self.sizes]
+                )
+            ),
+            solid_links=self.solid_links,
+            triangles=np.ascontiguousarray(corners),
+            triangle_links=self.triangle_links,
+        )
+        packed = np.array([k.fx, k.fy, k.cx, k.cy, k.width, k.height], np.float64)
+        depth = np.ascontiguousarray(measured, np.float32)
+        return render_surface(scene, packed, depth, tolerance=tolerance, quadratic=quadratic)
+
+    def distance(
+        self, T_world_link: Float64, points_world: NDArray[np.floating], *, without: Sequence[str] = ()
+    ) -> Float64:
+        """Signed distance (Q,) [m] of points (Q, 3) to the nearest solid, negative inside; neither triangles nor the
+        links `without` count.
+        """
+        least = np.full(len(points_world), np.inf)
+        T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
+        for kind, size, T, link in zip(self.kinds, self.sizes, T_solid_world, self.solid_links, strict=True):
+            if self.links[link] not in without:
+                np.minimum(least, _distance(kind, size, transform_points(T, points_world)), out=least)
+        return least
+
+
+def _distance(kind: float, size: Float64, points: Float64) -> Float64:
+    """Signed distance (Q,) of points (Q, 3) in the solid's own frame."""
+    if kind == BALL:
+        return np.asarray(np.linalg.norm(points, axis=1) - size[0])
+    if kind == BOX:
+        beyond = np.abs(points) - size
+    else:
+        across = np.hypot(points[:, 0], points[:, 1])
+        along = np.abs(points[:, 2]) - size[1]
+        if kind == CAPSULE:
+            return np.asarray(np.hypot(across, np.maximum(along, 0.0)) - size[0])
+        beyond = np.stack([across - size[0], along], axis=1)
+    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
+
+
+def _triangles(urdf: UrdfFile, mesh: MeshShape, folders: Sequence[Path]) -> Float64:
+    """(F, 3, 3) in the link's frame. An open surface comes twice, turned: it is seen, and nothing is inside it."""
+    parts = [solid.surface for solid in mesh_pieces(mesh, load_mesh(mesh_path(urdf.path, mesh, folders)))]
+    return np.concatenate([corners for part in parts for corners in _sides(part)])
+
+
+def _sides(mesh: TriangleMesh) -> list[Float64]:
+    return [mesh.corners] if mesh.is_closed else [mesh.corners, mesh.corners[:, ::-1]]
+
+
+def _sizes(shape: Shape) -> tuple[float, float, float]:
+    if shape.kind == "box":
+        x, y, z = shape.size
+        return x / 2, y / 2, z / 2
+    if shape.kind == "sphere":
+        return shape.size[0], 0.0, 0.0
+    return shape.size[0], shape.size[1] / 2, 0.0
+
+
+def _ball(link: str, center: Float64, radius: float) -> Shape:
+    T = np.eye(4)
+    T[:3, 3] = center
+    return Shape(link=link, kind="sphere", size=(float(radius),), T_link_shape=T)
+
+
+def _shifted(box: Box) -> Float64:
+    T = np.eye(4)
+    T[:3, 3] = (box.lower + box.upper) / 2
+    return T

@@ -1,0 +1,99 @@
+"""Objects beside the robot, where a camera sees least and the distance matters most."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.records import Bool, Label, RgbdFrame, SplatSet
+from splatctrl_cli.robot.declared import Declarations
+from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
+from splatctrl_cli.scene.labels import Seen, shown_kinds
+from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.seeding import gap_seeds, world_points_at
+from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, farthest_within, nearest_within, pixels_of
+
+THICKNESS = 0.2  # [m] of a link at most: so far behind what a camera sees of it something may touch it
+CONTACT = 0.02  # [m] an object so near to the robot may touch it where the robot hides it
+
+
+def is_in_contact(points_world: NDArray[np.floating], robot: RobotPosture) -> Bool:
+    """Points (N, 3) [m] within `CONTACT` of the robot's moving links."""
+    return np.asarray(robot.distance_to_moving(points_world) < CONTACT)
+
+
+def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
+    """Pixels (H, W) of objects within `CONTACT` of the robot's moving links."""
+    is_robot: Bool = mask.robot_depth > 0
+    chosen: Bool = mask.kinds == PixelKind.OBJECT
+    if not is_robot.any():
+        return np.zeros_like(chosen)
+    shown, reach = mask.robot_depth, pixels_of(CONTACT, frame, mask.robot_depth)
+    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT  # few, and all that may be
+    chosen &= frame.depth < farthest_within(shown, is_robot, reach) + CONTACT + THICKNESS
+    chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
+    return chosen
+
+
+def count_carried(
+    declared: Declarations, frame: RgbdFrame, mask: SelfMask, robot: RobotPosture, bare: RobotSurface, time_s: float
+) -> None:
+    """Count the declared boxes that pixels of the robot needed: those that its `bare` surface, without what it
+    carries, does not explain. time_s: of the frame, from the first joint state.
+    """
+    surface, T_world_link = robot.seen_at(frame.stamp_ns)
+    poses = dict(zip(surface.links, T_world_link, strict=True))
+    points = world_points_at(frame, mask.kinds == PixelKind.ROBOT)
+    is_own = bare.distance(bare.poses(poses), points) < CONTACT / 2
+    for link in dict.fromkeys(link for link, _ in declared.carried_at(time_s)):
+        declared.is_carried(link, transform_points(invert_transform(poses[link]), points[~is_own]), time_s)
+
+
+def contact_seeds(
+    seen: Seen,
+    mappable: Sequence[Bool],
+    robot: RobotPosture,
+    objects: SplatSet,
+    config: SceneConfig,
+    *,
+    num_threads: int = 1,
+) -> Seeds:
+    """Seeds of `contact_radius` wherever an object beside the robot has no splat's centre so near; mappable: pixels
+    (H, W) of each frame.
+
+    The robot hides where the two meet, and a camera returns no depth at a step: so much of the surface beyond what is
+    measured is taken to be there.
+    """
+    radius = config.contact_radius
+    views = [
+        (frame, contact_pixels(frame, mask, robot) & pixels)
+        for (frame, mask), pixels in zip(seen, mappable, strict=True)
+    ]
+    return gap_seeds(
+        views,
+        np.zeros((0, 3), np.float32),
+        radius,
+        replace(objects, radii=np.full(len(objects), radius, np.float32)),
+        replace(config, max_gap=0.0, max_radius=radius, radius_per_edge=1.0),
+        stride=1,
+        num_threads=num_threads,
+    )
+
+
+def hidden_objects(
+    buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
+) -> NDArray[np.intp]:
+    """Slots (K,) of objects within `CONTACT` of the moving robot that no pixel shows.
+
+    What an image shows there is the robot; fitting them to it would pull them out of their object.
+    """
+    if robot is None:
+        return np.zeros(0, np.intp)
+    slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
+    slots = slots[is_in_contact(buffer.centers[slots], robot)]
+    is_hidden = shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT
+    return np.asarray(slots[is_hidden], np.intp)

@@ -1,0 +1,239 @@
+"""Which pixels of a depth image show the robot: those whose depth its own rendered surface explains (III-C)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
+from splatctrl_cli.scene.audit import AuditRow
+from splatctrl_cli.scene.posture import RobotPosture
+
+SIGMAS = 2.0  # of the sensor's error that the robot's surface may explain
+FAR_OFF = 0.10  # [m] a residual beyond it is something else, before or behind the robot
+MIN_PIXELS = 100  # of a link, fewer say nothing of its residual
+
+
+class PixelKind(IntEnum):
+    """What a depth pixel shows. MIXED: at the robot's outline, a depth of neither the robot nor what is beside it."""
+
+    NOTHING = 0
+    OBJECT = 1
+    ROBOT = 2
+    MIXED = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfMask:
+    """kinds (H, W) uint8 of a frame's pixels (`PixelKind`); robot_depth (H, W) float32 [m] of the rendered robot, 0 =
+    none; residuals: by link, measured less rendered depth
+    (K,) [m] of pixels inside the robot's outline, up to `FAR_OFF`; num_inside: by link, measured points inside its
+    body that its surface does not explain.
+    """
+
+    kinds: UInt8
+    robot_depth: Float32
+    residuals: Mapping[str, Float32]
+    num_inside: Mapping[str, int]
+
+
+def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) -> SelfMask:
+    """The pixels of a frame by what they show, with the robot as it was at the frame's stamp.
+
+    A pixel is robot where its depth z lies within `self_mask_tolerance` + 2 `depth_error` z^2 of the depths that the
+    rendered robot has within a few pixels: as many as the tolerance is wide at the robot's depth, so that a slanted
+    surface and an outline that is off by the calibration are explained too. Spheres that stand for a link enclose its
+    surface and are not it: what lies inside them is robot. At the outline, what is behind the robot and before
+    everything that is seen beside it is mixed: the pixel sees both. Everything else with a depth is an object.
+    """
+    surface, T_world_link = robot.seen_at(frame.stamp_ns)
+    shown = surface.render(
+        T_world_link,
+        frame.intrinsics,
+        frame.T_world_camera,
+        frame.depth,
+        tolerance=config.self_mask_tolerance,
+        quadratic=SIGMAS * config.depth_error,
+    )
+    kinds = object_mask(frame).kinds
+    mask = SelfMask(kinds=kinds, robot_depth=shown.depth, residuals={}, num_inside={})
+    box = _outline(shown.depth > 0)
+    if box is None:
+        return mask
+    reach = pixels_of(config.self_mask_tolerance, frame, shown.depth)
+    part = _grown(box, 3 * reach + 3, frame.depth.shape)  # beyond it nothing is explained, mixed or inside
+    depth, rendered, kinds = frame.depth[part], shown.depth[part], kinds[part]
+    link, inside = shown.link[part], shown.inside[part]
+    has_depth, is_robot = depth > 0, rendered > 0
+    tolerance = tolerance_at(depth, config)
+    nearest = nearest_within(rendered, is_robot, reach) - tolerance
+    is_explained = has_depth & (depth >= nearest)
+    is_explained &= depth <= farthest_within(rendered, is_robot, reach) + tolerance
+    vague = [number for number, name in enumerate(surface.links) if name in surface.by_spheres]
+    if vague:
+        is_explained |= np.isin(inside, vague)
+    kinds[is_explained] = PixelKind.ROBOT
+    core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
+    kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
+    offset = depth - rendered
+    is_told = core & has_depth & (np.abs(offset) <= FAR_OFF)
+    is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
+    return replace(
+        mask,
+        residuals=_by_link(offset[is_told], link[is_told], surface.links),
+        num_inside={
+            name: len(found) for name, found in _by_link(inside[is_inside], inside[is_inside], surface.links).items()
+        },
+    )
+
+
+def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Values (K,) by the name of the link that each belongs to, without links that have none."""
+    order = np.argsort(links, kind="stable")
+    ends = np.searchsorted(links[order], np.arange(len(names) + 1))
+    parts = {name: values[order[first:end]] for name, first, end in zip(names, ends, ends[1:], strict=False)}
+    return {name: part for name, part in parts.items() if len(part)}
+
+
+def _outline(is_robot: Bool) -> tuple[slice, slice] | None:
+    """The rows and columns that hold every true pixel; None where there is none."""
+    left, top, width, height = cv2.boundingRect(is_robot.view(np.uint8))
+    return (slice(top, top + height), slice(left, left + width)) if width else None
+
+
+def _grown(box: tuple[slice, slice], pixels: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    rows, columns = (
+        slice(max(part.start - pixels, 0), min(part.stop + pixels, size))
+        for part, size in zip(box, shape, strict=True)
+    )
+    return rows, columns
+
+
+def object_mask(frame: RgbdFrame) -> SelfMask:
+    """Of a frame that nobody knows the robot's place in: all its depth is of objects."""
+    return SelfMask(
+        kinds=(frame.depth > 0).view(np.uint8),
+        robot_depth=np.zeros(frame.depth.shape, np.float32),
+        residuals={},
+        num_inside={},
+    )
+
+
+def of_label(mask: SelfMask, label: Label) -> Bool:
+    """Pixels (H, W) of the robot, or of everything that is not."""
+    return np.asarray(mask.kinds == (PixelKind.ROBOT if label == Label.ROBOT else PixelKind.OBJECT))
+
+
+def without_mixed(frame: RgbdFrame, mask: SelfMask) -> RgbdFrame:
+    """The frame without the depth of its mixed pixels, which lies on no surface."""
+    is_mixed = mask.kinds == PixelKind.MIXED
+    return replace(frame, depth=np.where(is_mixed, np.float32(0.0), frame.depth)) if is_mixed.any() else frame
+
+
+def tolerance_at(depth: Float32, config: OccupancyConfig) -> Float32:
+    """By how much [m] a measured depth (...) [m] of the robot may differ from its rendered depth."""
+    return np.asarray(config.self_mask_tolerance + SIGMAS * config.depth_error * depth * depth, np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkResidual:
+    """Of one link: the median [m] of measured less rendered depth and the number of pixels that it rests on, and how
+    many measured points lie inside the link unexplained.
+    """
+
+    median: float | None
+    num_pixels: int
+    num_inside: int
+
+    @property
+    def sign(self) -> int:
+        """1 where the robot is measured behind its rendered surface, -1 before it."""
+        return 0 if self.median is None else int(np.sign(self.median))
+
+
+def link_residuals(masks: Sequence[SelfMask]) -> dict[str, LinkResidual]:
+    """Of the links that any of the masks saw, over all of them."""
+    links = dict.fromkeys(link for mask in masks for link in [*mask.residuals, *mask.num_inside])
+    found = {}
+    for link in links:
+        parts = [mask.residuals[link] for mask in masks if link in mask.residuals]
+        joined = np.concatenate(parts) if parts else np.zeros(0)
+        found[link] = LinkResidual(
+            median=float(np.median(joined)) if len(joined) else None,
+            num_pixels=len(joined),
+            num_inside=sum(mask.num_inside.get(link, 0) for mask in masks),
+        )
+    return found
+
+
+def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
+    """`link_residuals` as `AuditRow` has them, of the links that were seen or hold points."""
+    found = link_residuals(masks)
+    rows = {
+        link: {"median_mm": round(1e3 * r.median, 2), "sign": r.sign, "num_pixels": r.num_pixels}
+        for link, r in found.items()
+        if r.median is not None
+    }
+    return {"self_mask": rows, "inside_robot": {link: r.num_inside for link, r in found.items() if r.num_inside}}
+
+
+def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
+    """For ``run.json``, over the time steps: by link the median of its steps' residuals [mm] and its pixels
+    (`self_mask`); the largest of them by size where it rests on `MIN_PIXELS` (`self_mask_residual_mm`, None without
+    any); points inside the robot (`inside_robot_points`), and the first step and link that had one.
+    """
+    links = dict.fromkeys(link for row in rows for link in row.self_mask)
+    found = {}
+    for link in links:
+        of_link = [row.self_mask[link] for row in rows if link in row.self_mask]
+        medians, counts = [r["median_mm"] for r in of_link], [r["num_pixels"] for r in of_link]
+        order = np.argsort(medians)
+        middle = np.searchsorted(np.cumsum(np.array(counts)[order]), 0.5 * sum(counts))
+        median = float(medians[order[middle]])
+        found[link] = {"median_mm": median, "sign": int(np.sign(median)), "num_pixels": int(sum(counts))}
+    enough = [row["median_mm"] for row in found.values() if row["num_pixels"] >= MIN_PIXELS]
+    first = next(((row.stamp_ns, link) for row in rows for link in row.inside_robot), (None, None))
+    return {
+        "self_mask": found,
+        "self_mask_residual_mm": max(map(abs, enough), default=None),
+        "inside_robot_points": sum(sum(row.inside_robot.values()) for row in rows),
+        "inside_robot_first_ns": first[0],
+        "inside_robot_first_link": first[1],
+    }
+
+
+def _mixed(depth: Float32, candidate: Bool, front: Float32, core: Bool, tolerance: Float32, reach: int) -> Bool:
+    """Candidates beside or at the outline (`front` is finite there, `core` is not) that lie behind the robot's front
+    and before all that is measured a little farther out.
+    """
+    at_edge = candidate & ~core & np.isfinite(front) & (depth > front)
+    beside = candidate & ~np.isfinite(front)
+    nearest_beside = nearest_within(depth, beside, 2 * reach + 2)
+    return np.asarray(at_edge & np.isfinite(nearest_beside) & (depth < nearest_beside - tolerance))
+
+
+def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
+    """Least depth (H, W) of the chosen pixels within `reach` pixels; inf where there are none."""
+    kept = np.where(chosen, depth, np.float32(np.inf))
+    return np.asarray(cv2.erode(kept, _window(reach)), np.float32)
+
+
+def farthest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
+    """Greatest depth (H, W) of the chosen pixels within `reach` pixels; -inf where there are none."""
+    return -nearest_within(-depth, chosen, reach)
+
+
+def _window(reach: int) -> UInt8:
+    return np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+
+
+def pixels_of(length: float, frame: RgbdFrame, rendered: Float32) -> int:
+    """Pixels that a length [m] spans at the median depth of the rendered robot, at least 1."""
+    some = rendered[::4, ::4]
+    depths = some[some > 0] if some.any() else rendered[rendered > 0]
+    return max(1, int(np.ceil(length * frame.intrinsics.fx / float(np.median(depths)))))

@@ -1,0 +1,150 @@
+"""Which depth pixels are the robot's, on a ball (the robot) above a floor, beside, before and behind blocks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.robot.surface import RobotSurface
+from splatctrl_cli.robot.urdf import Shape
+from splatctrl_cli.scene.posture import RobotPosture
+from splatctrl_cli.scene.self_mask import PixelKind, link_residuals, self_mask, without_mixed
+
+K = Intrinsics(fx=160.0, fy=160.0, cx=79.5, cy=59.5, width=160, height=120)
+FLOOR, CENTER, RADIUS = 1.2, np.array([0.0, 0.0, 0.9]), 0.1
+CONFIG = OccupancyConfig()
+TOLERANCE = CONFIG.self_mask_tolerance
+
+
+def ball_depth(center: Float64 = CENTER, radius: float = RADIUS) -> Float64:
+    """Depth (H, W) of a ball, inf where there is none; the camera is the world."""
+    v, u = np.mgrid[: K.height, : K.width]
+    d = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(u.shape)], axis=-1)
+    a, b, c = np.sum(d * d, axis=-1), d @ center, center @ center - radius**2
+    root = b * b - a * c
+    return np.where(root > 0, (b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
+
+
+def frame(depth: Float64) -> RgbdFrame:
+    return RgbdFrame(
+        stamp_ns=5,
+        camera="cam0",
+        color=np.zeros((K.height, K.width, 3), np.uint8),
+        depth=np.minimum(depth, FLOOR).astype(np.float32),
+        intrinsics=K,
+        T_world_camera=np.eye(4),
+    )
+
+
+def robot(*, by_spheres: bool = False, extra: float = 0.0) -> RobotPosture:
+    """A ball as collision geometry, or as the collision sphere of a robot without."""
+    T = np.eye(4)
+    T[:3, 3] = CENTER
+    surface = RobotSurface.from_parts([Shape(link="arm", kind="sphere", size=(RADIUS,), T_link_shape=T)])
+    return RobotPosture(
+        centers=CENTER[None],
+        radii=np.array([RADIUS + extra]),
+        T_world_link=np.eye(4)[None],
+        surface=None if by_spheres else surface,
+        T_world_surface={} if by_spheres else {5: np.eye(4)[None]},
+    )
+
+
+def kinds(depth: Float64, posture: RobotPosture | None = None) -> np.ndarray:
+    return self_mask(frame(depth), posture or robot(), CONFIG).kinds
+
+
+SHOWN = np.isfinite(ball_depth())
+
+
+def test_the_robot_is_what_its_surface_explains_and_the_floor_is_not() -> None:
+    found = kinds(ball_depth())
+    assert (found[SHOWN] == PixelKind.ROBOT).all()
+    assert (found[~SHOWN] == PixelKind.OBJECT).all()
+
+
+def test_noise_and_calibration_within_the_stated_tolerance_are_still_the_robot() -> None:
+    noise = np.random.default_rng(0).normal(0.0, CONFIG.depth_error, SHOWN.shape)
+    for offset in (-TOLERANCE, TOLERANCE):
+        found = kinds(ball_depth() + 0.9 * offset + noise)
+        assert (found[SHOWN] == PixelKind.ROBOT).mean() > 0.98
+
+
+@pytest.mark.parametrize("gap", [0.012, 0.03, 0.2])
+def test_what_stands_before_the_robot_is_an_object_however_near(gap: float) -> None:
+    depth = ball_depth()
+    depth[54:66, 74:86] -= gap
+    assert (kinds(depth)[54:66, 74:86] == PixelKind.OBJECT).all()
+
+
+def test_what_touches_the_robot_from_the_side_is_an_object() -> None:
+    beside = ball_depth(CENTER + np.array([0.15, 0.0, 0.0]), 0.05)
+    found = kinds(np.minimum(ball_depth(), beside))
+    is_beside = np.isfinite(beside) & ~SHOWN
+    assert is_beside.sum() > 150
+    assert (found[is_beside] == PixelKind.OBJECT).mean() > 0.9
+
+
+def test_an_outline_that_is_off_by_the_tolerance_leaves_no_rim_of_objects() -> None:
+    shifted = ball_depth(CENTER + np.array([0.8 * TOLERANCE, 0.0, 0.0]))
+    found = kinds(shifted)
+    assert not (found[np.isfinite(shifted)] == PixelKind.OBJECT).any()
+    assert (found[np.isfinite(shifted)] == PixelKind.ROBOT).mean() > 0.98
+
+
+def test_a_depth_between_the_robot_and_the_floor_at_its_outline_is_mixed_and_left_out() -> None:
+    depth = np.minimum(ball_depth(), FLOOR)
+    edge = SHOWN & ~np.roll(SHOWN, 1, axis=1)  # the left rim
+    depth[edge] = 1.08
+    view = frame(depth)
+    mask = self_mask(view, robot(), CONFIG)
+    assert (mask.kinds[edge] == PixelKind.MIXED).all()
+    assert not without_mixed(view, mask).depth[edge].any()
+    assert without_mixed(view, mask).depth[~SHOWN].all()
+
+
+def test_points_inside_the_robot_are_counted_by_link_and_are_no_robot() -> None:
+    depth = ball_depth()
+    depth[55:65, 75:85] += 0.05
+    mask = self_mask(frame(depth), robot(), CONFIG)
+    assert (mask.kinds[55:65, 75:85] == PixelKind.OBJECT).all()
+    assert mask.num_inside == {"arm": 100}
+
+
+def test_what_is_seen_behind_the_robot_is_not_inside_it() -> None:
+    depth = np.full(SHOWN.shape, FLOOR)
+    mask = self_mask(frame(depth), robot(), CONFIG)
+    assert mask.num_inside == {}
+    assert (mask.kinds == PixelKind.OBJECT).all()
+
+
+@pytest.mark.parametrize("offset", [-0.02, -0.004, 0.004, 0.02])
+def test_the_residual_has_the_median_and_sign_of_the_offset(offset: float) -> None:
+    found = link_residuals([self_mask(frame(ball_depth() + offset), robot(), CONFIG)] * 2)["arm"]
+    assert found.median == pytest.approx(offset, abs=2e-4)
+    assert found.sign == np.sign(offset)
+    assert found.num_pixels > 2 * 500
+
+
+def test_spheres_that_stand_for_a_link_enclose_it() -> None:
+    """They may be larger than the link by any amount: what lies inside them is the robot."""
+    for extra in (0.0, 0.05):
+        found = kinds(ball_depth(), robot(by_spheres=True, extra=extra))
+        core = np.isfinite(ball_depth(radius=0.09))
+        assert (found[core] == PixelKind.ROBOT).all()
+    before = ball_depth()
+    before[50:70, 70:90] -= 0.1
+    assert (kinds(before, robot(by_spheres=True))[50:70, 70:90] == PixelKind.OBJECT).all()
+
+
+def test_a_carried_box_is_the_robots() -> None:
+    depth: Float32 = np.minimum(ball_depth(), FLOOR).astype(np.float32)
+    depth[100:110, 70:90] = 1.0
+    posture = robot()
+    assert posture.surface is not None
+    assert (kinds(depth)[100:110, 70:90] == PixelKind.OBJECT).all()
+    held = Box(lower=np.array([-0.1, 0.2, 1.0]), upper=np.array([0.1, 0.4, 1.1]))
+    holding = replace(posture, surface=posture.surface.with_boxes([("arm", held)]))
+    assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()
