@@ -5,23 +5,19 @@ question is put to points on shells: each moving sphere's radius and the margin 
 other spheres of the arm.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Bool, Float64, KnownVoxels
 
-EVERY_NS = 50_000_000  # between states that are looked at: neither map nor evidence changes faster
+EVERY_NS = 200_000_000  # between states that are looked at: cameras that stop are stale five times as late
 APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
 NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
-FRESH_SHARE = 0.9  # of the points that were seen, whose age is the oldest of this share
-MIN_POINTS = 8  # fewer say nothing
-
-LastSeen = Callable[[Float64], NDArray[np.int64]]
-"""points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera last returned depth through or on them, -1 never."""
+FRESH_SHARE = 0.5  # of the seen points; the arm itself hides up to a third of its shell for seconds
+LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,54 +31,52 @@ class NearFigures:
 
 
 class NearSpace:
-    """Asks for the shells of states, at most one every `EVERY_NS`."""
+    """Asks for the shells of the states of a motion that are far enough apart."""
 
     def __init__(self, model: ArmModel, margin: float) -> None:
-        self._model, self._margin = model, margin
+        self._model = model
         self._moving = np.flatnonzero(model.moving_spheres)
         self._radii = np.asarray(model.sphere_set.radii, np.float64)
+        self._offsets = (self._radii[self._moving] + margin)[:, None, None] * DIRECTIONS
+        self._owners = np.repeat(self._moving, len(DIRECTIONS))
         self._first: Float64 | None = None  # centres (S, 3) of the first state
         self._next_ns = -(2**63)
 
     def due(self, stamps: NDArray[np.int64]) -> list[int]:
-        """Of states (T,) [ns] that do not go back, those to look at."""
+        """Of states at stamps (T,) [ns] that do not go back, those to look at."""
         chosen = []
-        for index, stamp in enumerate(stamps.tolist()):
-            if stamp >= self._next_ns:
+        for index, stamp_ns in enumerate(stamps.tolist()):
+            if stamp_ns >= self._next_ns:
                 chosen.append(index)
-                self._next_ns = stamp + EVERY_NS
+                self._next_ns = stamp_ns + EVERY_NS
         return chosen
 
-    def look(self, stamp_ns: int, q: Float64, last_seen: LastSeen) -> NearFigures:
+    def look(self, stamp_ns: int, q: Float64, known: KnownVoxels) -> NearFigures:
         """What was known about the posture q (J,) at a stamp."""
         centers = self._model.sphere_centers(q)
         if self._first is None:
             self._first = centers
-        points = self._shell(centers)
-        if len(points) < MIN_POINTS:
-            return NearFigures(unseen=np.nan, age=np.nan)
-        seen = last_seen(points)
+        points = (centers[self._moving][:, None] + self._offsets).reshape(-1, 3)
+        points = points[_is_outside(points, centers, self._radii + APART, self._owners)]
+        fewest = LEAST_SHARE * len(self._owners)
+        seen = known.last_seen_ns(points)
         is_never = seen < 0
-        is_new = _gap(points, self._first, self._radii) > NEW
-        unseen = float(is_never[is_new].mean()) if is_new.sum() >= MIN_POINTS else np.nan
-        age = np.nan
-        if (~is_never).sum() >= MIN_POINTS:
+        is_new = _is_outside(points, self._first, self._radii + NEW)
+        unseen = age = np.nan
+        if is_new.sum() >= fewest:
+            unseen = float(is_never[is_new].mean())
+        if (~is_never).sum() >= fewest:
             age = float(np.quantile((stamp_ns - seen[~is_never]) * 1e-9, FRESH_SHARE))
         return NearFigures(unseen=unseen, age=age)
 
-    def _shell(self, centers: Float64) -> Float64:
-        """Points (Q, 3) [m] on the shells, outside of the other spheres."""
-        reach = self._radii[self._moving] + self._margin
-        points = centers[self._moving][:, None] + reach[:, None, None] * DIRECTIONS
-        flat = points.reshape(-1, 3)
-        own = np.repeat(self._moving, len(DIRECTIONS))
-        distance = np.linalg.norm(flat[:, None] - centers, axis=2) - self._radii
-        distance[np.arange(len(flat)), own] = np.inf
-        return np.asarray(flat[distance.min(axis=1) > APART])
 
-
-def _gap(points: Float64, centers: Float64, radii: Float64) -> Float64:
-    return np.asarray((np.linalg.norm(points[:, None] - centers, axis=2) - radii).min(axis=1))
+def _is_outside(points: Float64, centers: Float64, radii: Float64, owners: NDArray[np.integer] | None = None) -> Bool:
+    """Points (Q, 3) outside of all spheres (S, 3), (S,) [m] but their owner (Q,)."""
+    squared = np.sum(points**2, axis=1)[:, None] + np.sum(centers**2, axis=1) - 2.0 * points @ centers.T
+    beyond = squared - radii**2
+    if owners is not None:
+        beyond[np.arange(len(points)), owners] = np.inf
+    return np.asarray(beyond.min(axis=1) > 0)
 
 
 def _directions() -> Float64:
