@@ -32,7 +32,7 @@ DECIDING_OPTIONS = (
     *("cameras", "camera", "camera_pose", "world_frame", "depth_scale", "pairing_tolerance", "joint_topic"),
     *("holdout", "scan", "box"),
 )  # what decides the bytes of a scene, beside the configuration
-PASSED_ON = ("urdf", "spheres", "points", "allow_disagreement", "force", "resume", "seed", "threads")
+PASSED_ON = ("urdf", "spheres", "points", "declare", "allow_disagreement", "force", "resume", "seed", "threads")
 GATED = (
     *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet", "evicted"),
     *("unrepresented_voxels", "unrepresented_volume", "max_unrepresented_voxels"),
@@ -71,6 +71,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="FILE.ply",
         help="coloured points to start from; depth is then not looked at (colour cameras alone: no occupancy)",
     )
+    add_declare(parser)
     add_disagreement(parser)
     parser.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted, to the same bytes"
@@ -78,6 +79,16 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     add_config(parser)
     add_gates(parser)
+
+
+def add_declare(parser: argparse.ArgumentParser) -> None:
+    """``--declare``."""
+    parser.add_argument(
+        "--declare",
+        type=Path,
+        metavar="FILE.toml",
+        help="what the robot carries, and contact that is meant (docs/formats.md)",
+    )
 
 
 def add_disagreement(parser: argparse._ActionsContainer) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
 from splatctrl_cli.cli.numbers import MAX_SECONDS, real
+from splatctrl_cli.cli.reconstruct import add_declare
 from splatctrl_cli.cli.replay_options import (
     MODES,
     POSE,
@@ -68,6 +69,7 @@ def register(subparsers: Subparsers) -> None:
     add_golden(parser)
     add_baseline(parser)
     add_worst_frames(parser)
+    add_declare(parser)
     parser.add_argument(
         "--report-only", action="store_true", help="exit 0 whatever the verdict; a --require or --golden still counts"
     )

@@ -40,7 +40,7 @@ def replay_request(args: argparse.Namespace) -> "ReplayRequest":
             "twist_frame",
         ),
         *("start_time", "re_anchor", "truth", "max_unknown", "max_map_age", "golden", "golden_tolerance", "zone"),
-        *("zone_box", "worst_frames", "force", "seed", "threads"),
+        *("zone_box", "worst_frames", "declare", "force", "seed", "threads"),
     )
     return ReplayRequest(
         out=args.out or Path("replay"),

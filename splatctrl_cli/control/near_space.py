@@ -16,7 +16,7 @@ from splatctrl_cli.records import Bool, Float64, KnownVoxels
 EVERY_NS = 200_000_000  # between states that are looked at: cameras that stop are stale five times as late
 APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
 NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
-FRESH_SHARE = 0.5  # of the seen points; the arm itself hides up to a third of its shell for seconds
+FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
 LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,8 +78,9 @@ class KnownScene:
     after the other (so far, where they are made on the way: `advance` to a stamp makes those known then), empty for
     one scene for all times; each is known `latency_ns` after its stamp. finish: to be called when the replay is done.
     box: of the centres of a grid's cells, None for splats. moment_ns: the one time that a baked field is of, None
-    where it has none. voxels_at: what was known of voxels at a stamp, None where that is not
-    recorded. has_people_margin: whether people are kept at another distance than things.
+    where it has none. voxels_at: what was known of voxels at a stamp, None where that is not recorded. figures: what
+    the reconstruction reported of itself, once the replay is done. has_people_margin: whether people are kept at
+    another distance than things.
     """
 
     at: Callable[[int], KnownFields]
@@ -94,6 +95,7 @@ class KnownScene:
     box: "Box | None" = None
     moment_ns: int | None = None
     voxels_at: Callable[[int], KnownVoxels | None] = _nothing_known
+    figures: Callable[[], Mapping[str, Any]] = dict
     has_people_margin: bool = False
 
     def age_s(self, stamp_ns: int) -> float:
@@ -206,6 +208,7 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         stamps_ns=tuple(stamps) if has_times else (),
         latency_ns=latency_ns,
         voxels_at=voxels_at,
+        figures=lambda: scene.run.get("metrics", {}),
         has_people_margin=config.control.human_margin > config.control.margin,
     )
 

@@ -30,6 +30,7 @@ from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruct import check_pose_jumps
 from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP, ReplayRequest
 from splatctrl_cli.records import Float64, KnownVoxels, UInt8
+from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 
 if TYPE_CHECKING:
@@ -47,7 +48,12 @@ def check_lockstep(request: ReplayRequest) -> None:
 
 
 def opened_scene(
-    request: ReplayRequest, config: "Config", model: "RobotModel", folder: Path, console: Progress
+    request: ReplayRequest,
+    config: Config,
+    model: RobotModel,
+    declared: Declarations,
+    folder: Path,
+    console: Progress,
 ) -> KnownScene:
     """The scene that the options of a replay name; what --lockstep reconstructs goes into `folder`."""
     if request.field is not None:
@@ -58,7 +64,7 @@ def opened_scene(
         return from_grid(request.field)
     if request.scene is not None:
         return from_splats(request.scene, config, request.threads, latency_ns=_latency_ns(request))
-    return from_log(request, config, model, folder, console)
+    return from_log(request, config, model, folder, console, declared)
 
 
 def _latency_ns(request: ReplayRequest) -> int:
@@ -66,7 +72,12 @@ def _latency_ns(request: ReplayRequest) -> int:
 
 
 def from_log(
-    request: ReplayRequest, config: "Config", model: "RobotModel", folder: Path, console: Progress
+    request: ReplayRequest,
+    config: Config,
+    model: RobotModel,
+    folder: Path,
+    console: Progress,
+    declared: Declarations | None = None,
 ) -> KnownScene:
     """The scene that a log's own cameras give as it goes; what is reconstructed is left in `folder`/scene.
 
@@ -88,6 +99,7 @@ def from_log(
         threads=request.threads,
         identity={"command": "replay --lockstep"},
         allow_disagreement=request.allow_disagreement,
+        declared=declared,
     )
     lockstep = Lockstep(fitted, config, _latency_ns(request), console, ends_with_log=request.mode != "closed-loop")
     return lockstep.scene()
@@ -138,6 +150,7 @@ class Lockstep:
         return KnownScene(
             at=at,
             voxels_at=voxels_at,
+            figures=self._fitted.metrics,
             observed=self._observed,
             first_ns=self._stamps_ns[0] + self._latency_ns,
             cameras=tuple(self._fitted.cameras),

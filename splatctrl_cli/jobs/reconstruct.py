@@ -15,6 +15,7 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruction import Reconstruction, training_cameras
 from splatctrl_cli.jobs.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
 from splatctrl_cli.records import Box, LossReport, RecordSource
+from splatctrl_cli.robot.declared import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.consistency import largest_jump
 
@@ -24,8 +25,9 @@ class ReconstructRequest:
     """One reconstruction of `source` into the folder `out`.
 
     urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given.
-    points: a coloured cloud to start from, instead of depth. resume: go on with what an interrupted run left.
-    options: what else decides the bytes, by the names of the options: a run that is resumed must have the same.
+    points: a coloured cloud to start from, instead of depth. declare: a TOML of what the robot carries. resume: go on
+    with what an interrupted run left. options: what else decides the bytes, by the names of the options: a run that
+    is resumed must have the same.
     """
 
     source: RecordSource
@@ -35,6 +37,7 @@ class ReconstructRequest:
     spheres: Path | None = None
     box: Box | None = None
     points: Path | None = None
+    declare: Path | None = None
     allow_disagreement: bool = False
     force: bool = False
     resume: bool = False
@@ -66,6 +69,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
     robot = _robot(request)
     for doubt in () if robot is None else robot.doubts:
         progress.log(f"warning: {doubt}")
+    declared = declarations_of(request.declare, robot)
     stopwatch = Stopwatch()
     checkpoint_file = partial_path(request.out) / CHECKPOINT
     goes_on = _goes_on(request, checkpoint_file, progress)
@@ -76,7 +80,12 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         ) as partial,
     ):
         inputs = source.digests()
-        files = {"urdf": request.urdf, "spheres": request.spheres, "points": request.points}
+        files = {
+            "urdf": request.urdf,
+            "spheres": request.spheres,
+            "points": request.points,
+            "declare": request.declare,
+        }
         run_identity = identity({"seed": request.seed, **request.options}, files, config, inputs)
         fitted = Reconstruction(
             source,
@@ -89,6 +98,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
             threads=request.threads,
             identity=run_identity,
             allow_disagreement=request.allow_disagreement,
+            declared=declared,
             checkpoint=checkpoint_to_go_on_from(partial, run_identity) if goes_on else None,
         )
         if goes_on:
@@ -98,6 +108,9 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         with stopwatch.stage("write"):
             fitted.finish()
         metrics = fitted.metrics()
+        for table, index in declared.unused():
+            if table == "carried":
+                progress.log(f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it")
         write_run(
             partial,
             command="reconstruct",
@@ -114,6 +127,15 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         loss=source.loss,
         seconds=sum(stopwatch.seconds.values()),
     )
+
+
+def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations:
+    """What a file declares; nothing without one. Raises UsageError where there is no robot that it could be of."""
+    if path is None:
+        return Declarations()
+    if robot is None:
+        raise UsageError(f"--declare {path}: belongs to a robot", remedy="give its --urdf as well")
+    return read_declarations(path, robot.frame_names)
 
 
 def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progress) -> bool:

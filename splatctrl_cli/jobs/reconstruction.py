@@ -15,13 +15,16 @@ from splatctrl_cli.evaluate.recording import first_frame
 from splatctrl_cli.io.scene_folder import FORMAT
 from splatctrl_cli.io.scene_writer import Checkpoint, SceneWriter
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.records import Box, PointCloud, RecordSource
+from splatctrl_cli.records import Box, JointState, PointCloud, RecordSource
+from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.audit import AuditRow
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspace_of
 from splatctrl_cli.scene.consistency import agreements
+from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
+from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
@@ -39,7 +42,7 @@ def training_cameras(source: "RecordSource") -> list[str]:
 class Reconstruction:
     """One run over `source` into `folder`; with `checkpoint` it goes on where that was written.
 
-    cloud: points to start from instead of depth, which is then not looked at.
+    cloud: points to start from instead of depth, which is then not looked at. declared: what the robot carries.
     identity: plain values that a run which goes on must have in common with this one.
     """
 
@@ -56,6 +59,7 @@ class Reconstruction:
         threads: int,
         identity: Mapping[str, Any],
         allow_disagreement: bool = False,
+        declared: Declarations | None = None,
         checkpoint: "Checkpoint | None" = None,
     ) -> None:
 
@@ -68,6 +72,8 @@ class Reconstruction:
         self.threads = threads
         self.identity = identity
         self.allow_disagreement = allow_disagreement
+        self.declared = declared or Declarations()
+        self._first_state_ns: int | None = None  # from which declared times count
         self.cameras = training_cameras(source)
         comments = {"format": FORMAT, "frame": "world", "units": "m", "source": source.name}
         self.writer = SceneWriter(folder, comments, checkpoint)
@@ -141,7 +147,9 @@ class Reconstruction:
             console.log("warning: more views than fit in one time step; the last ones are refined on, the rest seed")
         self._check_cameras(step, console)
         self._keep_first_frames(step)
-        row = self.fitter.step(step.frames, self._posture(step))
+        posture = self._posture(step)
+        row = self.fitter.step(step.frames, posture)
+        self._count_carried(step, posture)
         self.stamps.extend(frame.stamp_ns for frame in step.frames)
         self._record(row)
         if self.fitter.num_steps == 1:
@@ -211,8 +219,6 @@ class Reconstruction:
 
     def metrics(self) -> dict[str, object]:
         """For ``run.json`` and gates."""
-        from splatctrl_cli.scene.self_mask import self_mask_metrics
-
         assert self.fitter is not None
         last = self.rows[-1]
         return {
@@ -331,4 +337,22 @@ class Reconstruction:
             return None
         order = self.robot.joint_order(self.source.joint_names)
         at_frames = {stamp_ns: q[order] for stamp_ns, q in step.positions.items()}
-        return posture_of(self.robot, step.position[order], at_frames)
+        carried = self.declared.carried_at(self._seconds(step.stamp_ns)) if self.declared.carried else ()
+        return posture_of(self.robot, step.position[order], at_frames, carried)
+
+    def _seconds(self, stamp_ns: int) -> float:
+        """Since the first joint state."""
+        if self._first_state_ns is None:
+            states = (record for record in self.source.records() if isinstance(record, JointState))
+            self._first_state_ns = next(states).stamp_ns
+        return (stamp_ns - self._first_state_ns) * 1e-9
+
+    def _count_carried(self, step: TimeStep, posture: RobotPosture | None) -> None:
+        """Count which declared boxes the frames needed."""
+        if posture is None or not self.declared.carried or self.robot is None:
+            return
+        seconds = self._seconds(step.stamp_ns)
+        if self.declared.carried_at(seconds):
+            for frame in step.frames:
+                mask = self_mask(frame, posture, self.config.occupancy)
+                count_carried(self.declared, frame, mask, posture, self.robot.surface, seconds)

@@ -11,6 +11,7 @@ from splatctrl_cli.io.scene_folder import open_scene
 from splatctrl_cli.jobs.evidence import Mismatch, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.lockstep import check_lockstep, opened_scene
 from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.reconstruct import declarations_of
 from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone
 from splatctrl_cli.jobs.replay_files import write_replay
 from splatctrl_cli.jobs.replay_goal import check_goal
@@ -106,9 +107,11 @@ def _read(request: ReplayRequest, folder: Path, progress: Progress) -> tuple[Rep
     logged = read_states(request, model)
     if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
         raise InputError(other.sentence, remedy=other.remedy)
-    scene = opened_scene(request, request.config, model, folder, progress)
+    declared = declarations_of(request.declare, model)
+    scene = opened_scene(request, request.config, model, declared, folder, progress)
     source = logged.source
-    files = [path for path in (request.urdf, request.spheres, request.srdf, request.truth) if path is not None]
+    given = (request.urdf, request.spheres, request.srdf, request.truth, request.declare)
+    files = [path for path in given if path is not None]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}
     inputs = ReplayInputs(
         source=source,
@@ -118,6 +121,7 @@ def _read(request: ReplayRequest, folder: Path, progress: Progress) -> tuple[Rep
         truth=truth,
         digests=digests,
         mismatches=_mismatches(request, logged, model),
+        declared=declared,
     )
     return inputs, logged
 

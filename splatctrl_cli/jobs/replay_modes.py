@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
@@ -122,8 +123,9 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
         stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
         for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
             distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
-            nearest = int(np.argmin(distance - radii))
-            clearance[index], surface[index] = distance[nearest] - radii[nearest], points[nearest]
+            gap = _unexpected(inputs, moving, distance - radii, points, stamp, replay.margin)
+            nearest = int(np.argmin(gap))
+            clearance[index], surface[index] = gap[nearest], points[nearest]
             spheres[index] = moving[nearest]
         clearances.append(clearance)
         nearest_spheres.append(spheres)
@@ -139,6 +141,20 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
     }
     merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
     return replace(replay, true_clearance=truth, agreement=agreement, events=merged)
+
+
+def _unexpected(
+    inputs: ReplayInputs, moving: NDArray[np.intp], gap: Float64, points: Float64, stamp_ns: int, margin: float
+) -> Float64:
+    """True clearances (M,) of the moving spheres to points (M, 3), infinite where the contact is declared."""
+    if not inputs.declared.expected_contact:
+        return gap
+    links, seconds = inputs.model.sphere_set.links, (stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
+    is_meant = [
+        bool(gap[k] < margin and inputs.declared.expects(links[sphere], points[k], seconds))
+        for k, sphere in enumerate(moving)
+    ]
+    return np.where(is_meant, np.inf, gap)
 
 
 def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spheres: Rows) -> tuple[Event, ...]:
@@ -248,6 +264,8 @@ def _record(request: ReplayRequest, inputs: ReplayInputs, config: "Config") -> R
         config=config,
         max_map_age=request.max_map_age,
         is_continuous=request.re_anchor is None,
+        declared=inputs.declared,
+        first_state_ns=int(inputs.states.stamp_ns[0]),
     )
 
 

@@ -1,12 +1,13 @@
 """States of a replay as they come, block by block: measured, explained, and kept in files."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.audit import AuditTrace, Stamps, audited, moving_clearance
+from splatctrl_cli.control.audit import AuditTrace, Clearance, Stamps, audited, moving_clearance
 from splatctrl_cli.control.checks import static_clearance
 from splatctrl_cli.control.explain import (
     EventFold,
@@ -25,6 +26,7 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replay_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 
 SLIGHT = 1e-3  # [m] under a margin that solver, rounding and a map that is still being fitted may leave
@@ -49,8 +51,13 @@ class ReplayRecord:
         config: Config,
         max_map_age: float,
         is_continuous: bool = True,
+        declared: Declarations | None = None,
+        first_state_ns: int = 0,
     ) -> None:
-        """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states."""
+        """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states.
+        declared: contact that is meant, at times that count from `first_state_ns`.
+        """
+        self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
         self.between, self.strain = Figures(), Figures()
         self.statics: dict[str, tuple[float, float]] = {}
@@ -87,6 +94,7 @@ class ReplayRecord:
         part = audited(
             self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed
         )
+        part = self._without_expected(part)
         self.audit.add(part)
         self.obstacles.extend(["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)])
         self.ages.append(map_age_s=np.array([scene.age_s(stamp) for stamp in stamps.tolist()]))
@@ -117,6 +125,25 @@ class ReplayRecord:
 
         self.events.add(part.stamp_ns, signals, near)
 
+    def _without_expected(self, part: AuditTrace) -> AuditTrace:
+        """The audit without the spheres whose contact is declared, where they would break the margin."""
+        if not self._declared.expected_contact:
+            return part
+        links, moving = self._model.sphere_set.links, self._reach.moving
+        clearance, of_spheres = dict(part.clearance), dict(part.of_spheres)
+        for name, each in part.of_spheres.items():
+            kept = each.copy()
+            for state, column in zip(*np.nonzero(each < self._margin), strict=True):
+                stamp, sphere = int(part.stamp_ns[state]), int(moving[column])
+                center = self._model.sphere_centers(part.position[state])[[sphere]]
+                place = np.array(self._scene.at(stamp).obstacles(center)[0].position)
+                if self._declared.expects(links[sphere], place, (stamp - self._first_state_ns) * 1e-9):
+                    kept[state, column] = np.inf
+            nearest = kept.argmin(axis=1)
+            of_spheres[name] = kept
+            clearance[name] = Clearance(distance=kept[np.arange(len(kept)), nearest], sphere=moving[nearest])
+        return replace(part, clearance=clearance, of_spheres=of_spheres)
+
     def _bound(self, part: AuditTrace, velocities: Float64) -> None:
         """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
         known = self._scene.at(int(part.stamp_ns[0])).distances
@@ -126,6 +153,7 @@ class ReplayRecord:
         if self._before is not None:
             stamp, q, velocity = self._before
             earlier = clearances(self._model, self._reach, q[None], known[name])
+            earlier[:, np.isinf(at_states[0])] = np.inf  # what is meant now was meant on the way
             stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
             velocities = np.concatenate([velocity[None], velocities])
             at_states = np.concatenate([earlier, at_states])

@@ -12,6 +12,7 @@ from splatctrl_cli.io.state_columns import StateColumns
 from splatctrl_cli.jobs.evidence import Mismatch
 from splatctrl_cli.jobs.known_scene import KnownScene
 from splatctrl_cli.records import RecordSource
+from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import Truth
 
@@ -66,6 +67,7 @@ class ReplayRequest:
     zone_box: str | None = None
     human: tuple[str, ...] = ()
     worst_frames: int = 3
+    declare: Path | None = None
     require: tuple[str, ...] = ()
     report_only: bool = False
     force: bool = False
@@ -84,6 +86,7 @@ class ReplayInputs:
     truth: Truth | None
     digests: dict[str, str]
     mismatches: tuple[Mismatch, ...] = ()
+    declared: Declarations = made_by(default_factory=Declarations)
 
     def motion(self) -> LoggedMotion:
         """Every logged state, whether a scene was known or not."""

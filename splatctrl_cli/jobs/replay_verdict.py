@@ -21,6 +21,7 @@ STATIC_CHANGE = 0.01  # [m] by which a fixed sphere must come nearer to count: s
 MOUNTED = 0.03  # [m] the same of one that stands within the margin of its mount, whose map grows in the first frames
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
 UNSEEN = 0.5  # of the points about the arm: three cameras about a table leave 0.02 to 0.3
+MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a calibrated rig
 TOO_MUCH = 1.01  # of a velocity or acceleration limit
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
 SLOW = "log joint states more often"
@@ -560,6 +561,31 @@ def _evidence(judged: Judged) -> Iterator[Reason]:
         )
 
 
+def _calibration(judged: Judged) -> Iterator[Reason]:
+    """Whether the cameras see the robot where its joints put it: what is off there is off for everything."""
+    figures = judged.inputs.scene.figures()
+    residual, by_link = figures.get("self_mask_residual_mm"), figures.get("self_mask")
+    if residual is None or not isinstance(by_link, dict):
+        return
+    value = 1e-3 * float(residual)
+    if value <= MISPLACED:
+        yield _passed("calibration", f"the robot is seen within {_mm(value)}", value, MISPLACED, "m", len(by_link))
+        return
+    link, worst = max(by_link.items(), key=lambda item: abs(float(item[1]["median_mm"])))
+    yield Reason(
+        criterion="calibration",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"the cameras see {link} {_mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its joints "
+        f"put it, allowed {_mm(MISPLACED)}",
+        value=value,
+        threshold=MISPLACED,
+        unit="m",
+        who=str(link),
+        remedy="calibrate the cameras ('splatctrl check'), or correct URDF, joint zeros or depth scale",
+        count=int(worst["num_pixels"]),
+    )
+
+
 CRITERIA = (
     _clearance,
     _self,
@@ -568,6 +594,7 @@ CRITERIA = (
     _controller,
     _surface,
     _evidence,
+    _calibration,
     _unjudged,
     _unknown,
     _age,
@@ -583,9 +610,26 @@ def _notes(judged: Judged) -> tuple[str, ...]:
         notes.append(f"{len(close)} fixed spheres stand within the margin of their surroundings")
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         notes.append(f"{judged.replay.lead_in_s:.2f} s before the first map are left out")
+    notes += _declared_notes(judged)
+    inside = judged.inputs.scene.figures().get("inside_robot_points")
+    if inside:
+        notes.append(f"{inside} measured points lie inside the robot: contact, a carried object, or calibration")
     if judged.request.re_anchor is not None:
         notes.append("the arm is put back into the log's posture on the way: nothing is said between states")
     return tuple(notes)
+
+
+def _declared_notes(judged: Judged) -> list[str]:
+    """Every contact that was declared, and entries that nothing used."""
+    declared, notes = judged.inputs.declared, []
+    for index, entry in enumerate(declared.expected_contact):
+        num = declared.num_uses.get(("expected_contact", index), 0)
+        used = f"{num} times" if num else "warning: not used by any state"
+        notes.append(f"contact of {entry.link} declared ({entry.reason}): {used}")
+    for index, carried in enumerate(declared.carried):
+        is_used = declared.num_uses.get(("carried", index)) or not judged.request.lockstep
+        notes.append(f"{carried.link} carries a box" + ("" if is_used else ": warning: no pixel needed it"))
+    return notes
 
 
 def _bare_moving_links(judged: Judged) -> list[str]:
