@@ -575,8 +575,8 @@ def _calibration(judged: Judged) -> Iterator[Reason]:
     yield Reason(
         criterion="calibration",
         outcome=Outcome.NOT_EVALUABLE,
-        sentence=f"the cameras see {link} {_mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its joints "
-        f"put it, allowed {_mm(MISPLACED)}",
+        sentence=f"the cameras see {link} {_mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
+        f"joints put it, allowed {_mm(MISPLACED)}",
         value=value,
         threshold=MISPLACED,
         unit="m",
