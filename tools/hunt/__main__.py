@@ -59,7 +59,7 @@ def _caught(seed: int, index: int) -> Row:
         traceback.print_exc()
         return Row(
             seed=seed, index=index, family=family_of(index), kind="", strength=0.0, mode="", outcome="crash",
-            clearance=0.0, observable=True, rule="", reason=f"{type(error).__name__}: {error}"[:60],
+            clearance=0.0, observable=True, rule="", reason=f"{type(error).__name__}: {error}"[:90],
         )  # fmt: skip
 
 

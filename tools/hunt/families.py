@@ -151,7 +151,7 @@ def holes(rng: np.random.Generator) -> Draft:
         reach = float(rng.uniform(0.7, 1.3))
         return Draft(kind=kind, strength=reach, make=make, fault=Fault(max_range=reach))
     edge = float(np.exp(rng.uniform(np.log(0.012), np.log(0.06))))
-    return Draft(kind=kind, strength=edge, make=make, fault=Fault(edge=edge))
+    return Draft(kind=kind, strength=edge, make=make, fault=Fault(edge=edge, edge_share=1.0))
 
 
 def depth(rng: np.random.Generator) -> Draft:

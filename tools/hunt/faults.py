@@ -19,7 +19,7 @@ class Fault:
 
     lost, blind: (camera, frame) whose images are missing, or hold no depth; lost_states: from, to [s] without joint
     states; dark: share of the target's pixels without depth; speckle: that share is lost pixel by pixel; max_range
-    [m] and edge [m] of the depth camera; latency [s] of the map; order, offset [rad], in_degrees: how joint
+    [m] of the depth camera; edge [m]: steps of depth beside which that share of the pixels is lost; latency [s] of the map; order, offset [rad], in_degrees: how joint
     positions are logged. spheres_kept, spheres_shrunk [m], longer: joint and by how much [m] the model's link
     differs; max_splats.
     """
@@ -35,6 +35,7 @@ class Fault:
     speckle: bool = False
     max_range: float = 3.0
     edge: float = 0.10
+    edge_share: float = 0.35  # a pixel of these images is a centimetre: most edges run beside its middle
     latency: float = 0.0
     order: tuple[int, ...] = tuple(range(NUM_JOINTS))
     offset: tuple[float, ...] = (0.0,) * NUM_JOINTS

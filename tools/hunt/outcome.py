@@ -2,36 +2,30 @@
 
 from dataclasses import dataclass
 
-from splatctrl_cli.errors import NotEvaluableError, SplatCtrlError
-from splatctrl_cli.jobs.replay import ReplayResult, check_result
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.evaluate.verdict import Outcome, Verdict
 
-WORDS = ("safe", "margin broken", "contact", "not evaluable", "refused")
+WORDS = ("safe", "failed", "contact", "not evaluable", "refused")
+LONGEST = 90  # characters of a reason
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """One of `WORDS`, and the first reason."""
+class Word:
+    """One of `WORDS`, and the first reason: its criterion, then a colon and a sentence."""
 
     word: str
     reason: str
 
 
-def outcome_of(request: ReplayRequest, result: ReplayResult) -> Outcome:
-    """What a replay says."""
-    metrics = result.metrics
-    try:
-        check_result(request, result)
-    except NotEvaluableError as error:
-        return Outcome(word="not evaluable", reason=error.message[:60])
-    clearance = metrics["min_clearance"]
-    if clearance is not None and clearance < request.config.control.margin:
-        return Outcome(word="contact" if clearance < 0 else "margin broken", reason=f"min_clearance {clearance:.3f}")
-    if metrics.get("goal_reached") == 0:
-        return Outcome(word="margin broken", reason="goal_reached")
-    return Outcome(word="safe", reason="")
+def word_of(verdict: Verdict) -> Word:
+    """What a verdict says; a failure other than contact is `failed`."""
+    first = verdict.decisive[0] if verdict.decisive else None
+    reason = "" if first is None else f"{first.criterion}: {first.sentence}"[:LONGEST]
+    if verdict.outcome is Outcome.FAILED:
+        return Word(word="contact" if verdict.label == "contact" else "failed", reason=reason)
+    return Word(word="safe" if verdict.outcome is Outcome.PASSED else "not evaluable", reason=reason)
 
 
-def refused(error: SplatCtrlError) -> Outcome:
+def refused(error: SplatCtrlError) -> Word:
     """What a refusal says."""
-    return Outcome(word="refused", reason=error.message[:60])
+    return Word(word="refused", reason=f"{type(error).__name__}: {error.message}"[:LONGEST])

@@ -99,12 +99,16 @@ class Recorder:
         self, number: int, renderer: Renderer, index: int, arm: list[Primitive], targets: list[Primitive]
     ) -> RgbdFrame:
         fault, camera = self._fault, renderer.camera
-        rng = np.random.default_rng([*self._seed, number, index])
+        rng = np.random.default_rng([*self._seed, number, index, 1])
         color, exact = renderer.image([*arm, *targets])
         without_target, without_arm = renderer.depth(arm), renderer.depth(targets)
         is_target, is_arm = _nearer(exact, without_target), _nearer(exact, without_arm)
-        noise = DepthNoise(patch=PATCH, edge=fault.edge, max_range=fault.max_range)
-        measured = noise.applied(exact, rng)
+        noise = DepthNoise(patch=PATCH, edge=np.inf, max_range=fault.max_range)
+        measured = noise.applied(exact, np.random.default_rng([*self._seed, number, index]))
+        with_edges = replace(noise, edge=fault.edge).applied(
+            exact, np.random.default_rng([*self._seed, number, index])
+        )
+        measured = np.where(rng.random(exact.shape) < fault.edge_share, with_edges, measured)
         measured = np.where(is_target & _lost(fault, exact.shape, rng), 0, measured)
         if (camera.name, index) in fault.blind:
             measured = np.zeros_like(measured)

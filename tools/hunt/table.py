@@ -9,10 +9,11 @@ from pathlib import Path
 from scipy.stats import beta
 
 from tools.hunt.observability import MARGIN
+from tools.hunt.outcome import WORDS
 from tools.hunt.trial import Row
 
 COLUMNS = tuple(field.name for field in fields(Row))
-OUTCOMES = ("safe", "margin broken", "contact", "not evaluable", "refused", "crash")
+OUTCOMES = (*WORDS, "crash")
 TRUTHS = ("clear", "margin", "contact")
 NUM_NEAREST = 10
 ALPHA = 0.05
@@ -100,8 +101,8 @@ def _why(rows: Sequence[Row]) -> list[str]:
 
 
 def _criterion(row: Row) -> str:
-    """The first word of the reason, which names the criterion."""
-    return row.reason.split(" ")[0] if row.reason else "none"
+    """What stands before the reason's colon."""
+    return row.reason.partition(":")[0] or "none"
 
 
 def _told(row: Row) -> str:

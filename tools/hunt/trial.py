@@ -29,7 +29,7 @@ from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, le
 from tools.hunt.families import FAMILIES, ORDER, Draft
 from tools.hunt.faults import spheres_yaml
 from tools.hunt.observability import MARGIN, TOLERATED, Observable, observable
-from tools.hunt.outcome import Outcome, outcome_of, refused
+from tools.hunt.outcome import Word, refused, word_of
 from tools.hunt.recording import Recorder, Shown
 from tools.hunt.world import (
     BOX,
@@ -188,7 +188,7 @@ def config_of(trial: Trial) -> Config:
     return replace(config, scene=scene, control=control)
 
 
-def _judged(trial: Trial, folder: Path) -> tuple[Outcome, ReplayResult | None]:
+def _judged(trial: Trial, folder: Path) -> tuple[Word, ReplayResult | None]:
     """The chain's own word; None beside a refusal."""
     config, log, robot = config_of(trial), folder / "log.mcap", (folder / "robot.urdf", folder / "robot.yaml")
     try:
@@ -218,7 +218,7 @@ def _judged(trial: Trial, folder: Path) -> tuple[Outcome, ReplayResult | None]:
                 threads=1,
             )
             result = replay(request)
-        return outcome_of(request, result), result
+        return word_of(result.verdict), result
     except SplatCtrlError as error:
         return refused(error), None
 

@@ -21,7 +21,7 @@ BOX = Box(lower=np.array([-0.30, -0.70, -0.06]), upper=np.array([0.95, 0.70, 1.0
 DURATION_S = 3.2
 FPS = 5.0
 NUM_FRAMES = round(DURATION_S * FPS)
-WIDTH, HEIGHT = 72, 54
+WIDTH, HEIGHT = 96, 72
 CENTRE = np.array([-0.1, 0.1, 0.0, -1.9, 0.0, 2.1, 0.4])  # [rad] about which starts are drawn
 SPREAD = np.array([0.9, 0.35, 0.4, 0.4, 0.5, 0.4, 0.8])
 TURN = np.array([0.8, 0.35, 0.3, 0.35, 0.4, 0.4, 0.6])  # [rad] from start to end at most
@@ -98,7 +98,7 @@ def draw_motion(rng: np.random.Generator, model: RobotModel, arm: TrueArm) -> Mo
 
 def draw_cameras(rng: np.random.Generator) -> tuple[Camera, ...]:
     """Three cameras about the table, none where another draw has it."""
-    focal = 0.92 * WIDTH
+    focal = 1.15 * WIDTH
     k = Intrinsics(
         fx=focal, fy=focal, cx=(WIDTH - 1) / 2 + 0.7, cy=(HEIGHT - 1) / 2 - 0.6, width=WIDTH, height=HEIGHT
     )
