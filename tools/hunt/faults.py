@@ -19,9 +19,9 @@ class Fault:
 
     lost, blind: (camera, frame) whose images are missing, or hold no depth; lost_states: from, to [s] without joint
     states; dark: share of the target's pixels without depth; speckle: that share is lost pixel by pixel; max_range
-    [m] of the depth camera; edge [m]: steps of depth beside which that share of the pixels is lost; latency [s] of the map; order, offset [rad], in_degrees: how joint
-    positions are logged. spheres_kept, spheres_shrunk [m], longer: joint and by how much [m] the model's link
-    differs; max_splats.
+    [m] of the depth camera; edge [m]: steps of depth beside which edge_share of the pixels are lost; latency [s] of
+    the map; order, offset [rad], in_degrees: how joint positions are logged. spheres_kept, spheres_shrunk [m],
+    longer: joint and by how much [m] the model's link differs; max_splats.
     """
 
     depth_scale: Mapping[str, float] = field(default_factory=dict)

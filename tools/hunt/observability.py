@@ -78,8 +78,9 @@ def _of_target(world: World, shown: Shown, frame_clearance: np.ndarray, least_ns
     is_before = shown.stamps <= least_ns if is_audit else np.ones(len(pixels), dtype=bool)
     seen = (pixels >= NUM_PIXELS) & is_before
     first_ns = max(target.from_ns for target in world.targets)
+    num_enough = min(2, int(np.count_nonzero(is_before)))
     if all(target.track is None for target in world.targets) and first_ns <= shown.stamps[0]:
-        if np.count_nonzero(seen) >= min(2, np.count_nonzero(is_before)):
+        if np.count_nonzero(seen) >= num_enough:
             return Observable(holds=True, rule="seen before")
         is_wide = min(min(_widths(target.kind, target.size)) for target in world.targets) >= WIDE
         return Observable(holds=is_wide, rule="space never seen" if is_wide else "no depth from it")

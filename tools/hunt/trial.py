@@ -104,8 +104,9 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
     for _ in range(60):
         draft = FAMILIES[family](rng)
         arm = TrueArm(model, draft.tool)
-        motion = draw_motion(rng, model, arm)
-        cameras = tuple(camera for camera in draw_cameras(rng) if camera.name in draft.cameras)
+        everywhere = draw_cameras(rng)
+        motion = draw_motion(rng, model, arm, everywhere)
+        cameras = tuple(camera for camera in everywhere if camera.name in draft.cameras)
         if wish < contact:
             clearance = -float(rng.uniform(0.001, 0.025))
         else:

@@ -76,8 +76,10 @@ def table() -> Primitive:
     return _solid("table", "box", (1.5, 1.5, 0.05), np.array([0.35, 0.0, -0.025]), np.random.default_rng(1))
 
 
-def draw_motion(rng: np.random.Generator, model: RobotModel, arm: TrueArm) -> Motion:
-    """One stroke, at rest at first and at the end, that keeps off the table, itself, the limits and the borders."""
+def draw_motion(rng: np.random.Generator, model: RobotModel, arm: TrueArm, cameras: Sequence[Camera]) -> Motion:
+    """One stroke, at rest at first and at the end, that keeps off the table, itself, the limits and the borders, the
+    hand in view of two cameras.
+    """
     pairs, radii = model.self_pairs(), model.sphere_set.radii
     for _ in range(400):
         start = CENTRE + rng.uniform(-1, 1, 7) * SPREAD
@@ -91,6 +93,9 @@ def draw_motion(rng: np.random.Generator, model: RobotModel, arm: TrueArm) -> Mo
         gaps = np.linalg.norm(centers[:, pairs[:, 0]] - centers[:, pairs[:, 1]], axis=2)
         if np.min(gaps - radii[pairs].sum(axis=1)) < 0.04 or not BOX.contains(centers[:, model.moving_spheres]).all():
             continue
+        hands = [model.frame_pose(position, "hand")[:3, 3] for position in q[::3]]
+        if min(sum(_shows(camera, hand) for camera in cameras) for hand in hands) < 2:
+            continue
         if arm.clearances([table()], samples()[::2], q).min() > 0.08:
             return motion
     raise RuntimeError("no motion found")
@@ -98,7 +103,7 @@ def draw_motion(rng: np.random.Generator, model: RobotModel, arm: TrueArm) -> Mo
 
 def draw_cameras(rng: np.random.Generator) -> tuple[Camera, ...]:
     """Three cameras about the table, none where another draw has it."""
-    focal = 1.15 * WIDTH
+    focal = 1.0 * WIDTH
     k = Intrinsics(
         fx=focal, fy=focal, cx=(WIDTH - 1) / 2 + 0.7, cy=(HEIGHT - 1) / 2 - 0.6, width=WIDTH, height=HEIGHT
     )
@@ -109,7 +114,7 @@ def draw_cameras(rng: np.random.Generator) -> tuple[Camera, ...]:
             intrinsics=k,
             T_world_camera=look_at(
                 np.array(eye) + rng.uniform(-spread, spread, 3),
-                np.array([0.35, 0.0, 0.18]) + rng.uniform(-0.05, 0.05, 3),
+                np.array([0.32, 0.0, 0.27]) + rng.uniform(-0.05, 0.05, 3),
             ),
             is_training=True,
         )
