@@ -183,7 +183,12 @@ def config_of(trial: Trial) -> Config:
     config = Config()
     splats = trial.draft.fault.max_splats or SPLATS
     scene = replace(
-        config.scene, max_splats=splats, first_iterations=50, iterations_per_step=8, window=4, checkpoint_period=1e6
+        config.scene,
+        max_splats=splats,
+        first_iterations=50,
+        iterations_per_step=8,
+        window=4,
+        checkpoint_period=86400.0,
     )
     control = replace(config.control, solver="daqp", pose_gain=4.0, max_time=DURATION_S)
     return replace(config, scene=scene, control=control)
