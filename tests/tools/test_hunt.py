@@ -18,7 +18,7 @@ from tools.hunt.families import CAMERAS, FAMILIES, ORDER, Draft
 from tools.hunt.faults import Fault
 from tools.hunt.observability import observable
 from tools.hunt.recording import Recorder, Shown
-from tools.hunt.table import Row, append_rows, read_rows, report, upper_limit
+from tools.hunt.table import Row, append_rows, border_of, read_rows, report, upper_limit
 from tools.hunt.trial import Trial, draw, record, run, true_robot
 from tools.hunt.world import DURATION_S, World, at_s, draw_cameras, during, moving, positions_of, table
 
@@ -328,6 +328,13 @@ def test_the_report_names_false_greens_and_counts_the_benign() -> None:
     assert "false green, contact, observable: 1 of 3 runs" in text
     assert "0/2 benign" in text
     assert "1 of 2 safe (50.0 %)" in text
+
+
+def test_the_border_is_safe_by_least_and_broken_by_least() -> None:
+    safe = [row(index=i, clearance=0.02 + 0.01 * i) for i in range(30)]
+    broken = [row(index=100 + i, outcome="failed", clearance=0.014 - 0.001 * i) for i in range(30)]
+    chosen = border_of([*safe, *broken, row(index=200, clearance=0.0), row(index=201, observable=False)])
+    assert [r.index for r in chosen] == [*range(12), *range(100, 112)]
 
 
 # --- the chain ---

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from tools.hunt.table import append_rows, read_rows, report
+from tools.hunt.table import append_rows, border_of, read_rows, report
 from tools.hunt.trial import Row, family_of, run
 
 TABLE = Path(__file__).parent / "campaigns.csv"
@@ -24,6 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         done = [index for seed, index in known if seed == args.seed]
         first = max(done, default=-1) + 1 if args.goes_on else args.first
         wanted = [(args.seed, index) for index in range(first, first + args.runs)]
+    if args.border:
+        print("\n".join(f"{row.name}  {row.family}, {row.kind}" for row in border_of(list(known.values()))))
+        return 0
     rows: list[Row] = []
     try:
         for row in _rows(wanted, args.jobs):
@@ -89,6 +92,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
     parser.add_argument(
         "--continue", dest="goes_on", action="store_true", help="go on where the table ends, and add to it"
+    )
+    parser.add_argument(
+        "--border", action="store_true", help="print the runs of the table for tests/tools/border.txt"
     )
     parser.add_argument("--table", type=Path, default=TABLE, metavar="FILE.csv", help=f"(default: {TABLE.name})")
     return parser

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from scipy.stats import beta
 
-from tools.hunt.observability import MARGIN
+from tools.hunt.observability import MARGIN, TOLERATED
 from tools.hunt.outcome import WORDS
 from tools.hunt.trial import Row
 
@@ -16,6 +16,7 @@ COLUMNS = tuple(field.name for field in fields(Row))
 OUTCOMES = (*WORDS, "crash")
 TRUTHS = ("clear", "margin", "contact")
 NUM_NEAREST = 10
+NUM_BORDER = 24
 ALPHA = 0.05
 
 
@@ -58,6 +59,16 @@ def report(rows: Sequence[Row]) -> list[str]:
             head = f"{family:10s} {len(mine):5d}" if truth == TRUTHS[0] else " " * 16
             lines.append(f"{head} {truth:>8s} " + " ".join(f"{there[word]:13d}" for word in OUTCOMES))
     return [*lines, "", *_greens(rows), "", *_nearest(rows), "", *_benign(rows), "", *_why(rows)]
+
+
+def border_of(rows: Sequence[Row]) -> list[Row]:
+    """The runs nearest to the border: half of them safe with the least true clearance, half truly broken by least."""
+    mine = [row for row in rows if row.observable and row.outcome != "crash" and not row.is_false_green]
+    safe = sorted((row for row in mine if row.outcome == "safe"), key=lambda row: row.clearance)
+    limit = MARGIN - TOLERATED
+    broken = sorted((row for row in mine if row.clearance < limit), key=lambda row: -row.clearance)
+    half = NUM_BORDER // 2
+    return sorted([*safe[:half], *broken[:half]], key=lambda row: (row.seed, row.index))
 
 
 def _greens(rows: Sequence[Row]) -> list[str]:
