@@ -284,11 +284,20 @@ def test_a_target_between_two_frame_sets_is_not_observable(model: RobotModel, tm
     assert judged(draft_of(Fault()), brief, shown, model) == (False, "between two frame sets")
 
 
-def test_a_thin_target_without_depth_is_not_observable_and_a_wide_one_is(model: RobotModel, tmp_path: Path) -> None:
+def test_a_thin_target_that_no_image_shows_is_not_observable_and_a_wide_one_is(
+    model: RobotModel, tmp_path: Path
+) -> None:
     for radius, expected in ((0.01, (False, "no depth from it")), (0.05, (True, "space never seen"))):
         world = world_of(ball(np.array([0.55, 0.1, 0.05]), radius))
         shown = shown_of(world, Fault(dark=1.0), model, tmp_path)
-        assert judged(draft_of(Fault()), world, shown, model) == expected
+        unseen = replace(shown, target_outline=np.zeros_like(shown.target_outline))
+        assert judged(draft_of(Fault()), world, unseen, model) == expected
+
+
+def test_a_target_that_images_show_and_that_returns_no_depth_is_disclaimed(model: RobotModel, tmp_path: Path) -> None:
+    world = world_of(in_view())
+    shown = shown_of(world, Fault(dark=1.0), model, tmp_path)
+    assert judged(draft_of(Fault()), world, shown, model) == (False, "returns no depth")
 
 
 # --- the table ---

@@ -6,9 +6,10 @@
 3. The robot's model: too few or too small spheres always (the URDF has the surface); what else is wrong with the
    model or the joints only where images show the arm.
 4. The target: what stands there from the beginning has returned depth in two frame sets (or the only one)
-   before the arm came nearest, or is wide enough (4 cm) that the space without depth about it is unknown space. What
-   comes later has returned depth in a frame set taken while the arm was inside the margin; or it stood there for
-   `STALE_S` without returning any, or no camera returned any depth for as long: then the map is too old.
+   before the arm came nearest; or no image shows it, and it is so wide (4 cm) that it stands in unknown space: what
+   images show and what returns no depth is disclaimed. What comes later has returned depth in a frame set taken while
+   the arm was inside the margin; or it stood there for `STALE_S` without returning any, or no camera returned any
+   depth for as long: then the map is too old.
 """
 
 from dataclasses import dataclass
@@ -82,6 +83,8 @@ def _of_target(world: World, shown: Shown, frame_clearance: np.ndarray, least_ns
     if all(target.track is None for target in world.targets) and first_ns <= shown.stamps[0]:
         if np.count_nonzero(seen) >= num_enough:
             return Observable(holds=True, rule="seen before")
+        if shown.target_outline[:, is_before].sum() >= NUM_PIXELS:
+            return Observable(holds=False, rule="returns no depth")
         is_wide = min(min(_widths(target.kind, target.size)) for target in world.targets) >= WIDE
         return Observable(holds=is_wide, rule="space never seen" if is_wide else "no depth from it")
     if not is_audit:
