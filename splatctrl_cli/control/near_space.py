@@ -17,7 +17,7 @@ from splatctrl_cli.records import Float64
 EVERY_NS = 50_000_000  # between states that are looked at: neither map nor evidence changes faster
 APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
 NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
-FRESH_SHARE = 0.9  # of the points that were seen, whose age is the oldest of this share
+FRESH_SHARE = 0.75  # of the points that were seen: the age of the oldest of these; an arm shadows the others
 MIN_POINTS = 8  # fewer say nothing
 
 LastSeen = Callable[[Float64], NDArray[np.int64]]
