@@ -284,6 +284,15 @@ def test_a_target_between_two_frame_sets_is_not_observable(model: RobotModel, tm
     assert judged(draft_of(Fault()), brief, shown, model) == (False, "between two frame sets")
 
 
+def test_what_moves_is_disclaimed_in_closed_loop_alone(model: RobotModel, tmp_path: Path) -> None:
+    hand = model.frame_pose(START, "hand")[:3, 3] + [0.09, 0.0, 0.0]
+    world = world_of(moving(ball(hand), [0.2, 1.0], np.array([[0.4, 0.0, 0.1], [0.0, 0.0, 0.0]])))
+    shown = shown_of(world, Fault(), model, tmp_path)
+    assert judged(draft_of(Fault()), world, shown, model) == (True, "seen inside the margin")
+    driven = judged(draft_of(Fault()), world, shown, model, is_audit=False)
+    assert driven == (False, "moves between two frame sets")
+
+
 def test_a_thin_target_that_no_image_shows_is_not_observable_and_a_wide_one_is(
     model: RobotModel, tmp_path: Path
 ) -> None:
@@ -352,6 +361,19 @@ def test_the_border_is_safe_by_least_and_broken_by_least() -> None:
 def border() -> list[tuple[int, int]]:
     names = [line.split()[0] for line in BORDER.read_text().splitlines() if line and not line.startswith("#")]
     return [(int(seed), int(index)) for seed, index in (name.split("/") for name in names)]
+
+
+FOUND = {  # runs that were once called safe, by what was wrong with that
+    "an-object-in-space-that-no-camera-saw": (0, 57),
+    "a-map-of-82-splats": (0, 76),
+    "a-rod-whose-splats-were-labelled-robot": (0, 2),
+}
+
+
+@pytest.mark.parametrize(("seed", "index"), FOUND.values(), ids=FOUND)
+def test_what_was_once_a_false_green_is_none(seed: int, index: int) -> None:
+    found = run(seed, index)
+    assert not found.is_false_green, found
 
 
 @pytest.mark.parametrize(("seed", "index"), border())
