@@ -1,0 +1,387 @@
+"""The hunt's generator, its truth and its rules; and the runs nearest to the border, once each."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.io.source import open_source
+from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.arm import Capsule
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.primitives import Primitive, signed_distance
+from splatctrl_cli.simulate.textures import Texture
+from tools.hunt.clearance import TrueArm, interpolated, least_clearance
+from tools.hunt.families import CAMERAS, FAMILIES, ORDER, Draft
+from tools.hunt.faults import Fault
+from tools.hunt.observability import observable
+from tools.hunt.recording import Recorder, Shown
+from tools.hunt.table import Row, append_rows, border_of, read_rows, report, upper_limit
+from tools.hunt.trial import Trial, draw, record, run, true_robot
+from tools.hunt.world import DURATION_S, World, at_s, draw_cameras, during, moving, positions_of, table
+
+BORDER = Path(__file__).with_name("border.txt")
+START = np.array([-0.1, 0.1, 0.0, -1.9, 0.0, 2.1, 0.4])
+GREY = Texture(pattern="checks", feature=0.05, dark=(0.1, 0.1, 0.1), bright=(0.9, 0.9, 0.9))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    return true_robot(tmp_path_factory.mktemp("robot"))
+
+
+def ball(place: np.ndarray, radius: float = 0.05, name: str = "target") -> Primitive:
+    T = np.eye(4)
+    T[:3, 3] = place
+    return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=T, texture=GREY)
+
+
+def world_of(target: Primitive, motion: Motion | None = None) -> World:
+    still = Motion(times=np.array([0.0, 0.6, 2.5]), waypoints=np.array([START, START, START + 0.2]))
+    cameras = draw_cameras(np.random.default_rng(0))
+    return World(motion=motion or still, things=(table(),), targets=(target,), cameras=cameras)
+
+
+def in_view() -> Primitive:
+    return ball(np.array([0.55, 0.1, 0.05]))
+
+
+def shown_of(world: World, fault: Fault, model: RobotModel, folder: Path) -> Shown:
+    return Recorder(world, fault, model, (0, 0)).write(folder / "log.mcap")
+
+
+def read(folder: Path) -> tuple[list[JointState], list[RgbdFrame]]:
+    records = list(open_source(folder / "log.mcap").records())
+    return (
+        [record for record in records if isinstance(record, JointState)],
+        [record for record in records if isinstance(record, RgbdFrame)],
+    )
+
+
+# --- the truth ---
+
+
+def test_the_clearance_of_a_ball_beside_the_hand_is_the_distance_to_its_palm(model: RobotModel) -> None:
+    T = model.frame_pose(START, "hand")
+    for gap in (0.04, 0.003, -0.01):
+        place = (T @ [0.025 + 0.05 + gap, 0.0, 0.033, 1.0])[:3]
+        found = TrueArm(model).clearances([ball(place)], np.array([at_s(0)]), START[None])[0]
+        assert abs(found - gap) < 1e-6
+
+
+def test_the_clearance_of_a_ball_beside_a_capsule_is_exact_between_its_ends(model: RobotModel) -> None:
+    T = model.frame_pose(START, "link5")  # a capsule of 52 mm from z = -0.25 to -0.19
+    place = (T @ [-0.052 - 0.05 - 0.02, 0.0, -0.25, 1.0])[:3]
+    found = TrueArm(model).clearances([ball(place)], np.array([at_s(0)]), START[None])[0]
+    assert abs(found - 0.02) < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "sphere"])
+def test_the_clearance_is_no_more_than_that_of_any_point_of_the_surface(model: RobotModel, kind: str) -> None:
+    rng = np.random.default_rng(5)
+    size = {"box": (0.1, 0.2, 0.06), "cylinder": (0.05, 0.2), "capsule": (0.03, 0.2), "sphere": (0.06,)}[kind]
+    arm, hand = TrueArm(model), model.frame_pose(START, "hand")
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 41)] * 3), -1).reshape(-1, 3)
+    points = grid * [0.05, 0.18, 0.066] + [0, 0, 0.033]
+    world_points = points @ hand[:3, :3].T + hand[:3, 3]
+    for _ in range(6):
+        T = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        pose = np.eye(4)
+        pose[:3, :3] = T * np.sign(np.linalg.det(T))
+        pose[:3, 3] = hand[:3, 3] + hand[:3, :3] @ [*rng.uniform(0.05, 0.2, 1), *rng.uniform(-0.2, 0.2, 1), 0.033]
+        solid = replace(ball(np.zeros(3)), kind=kind, size=size, T_world_shape=pose)
+        found = arm.clearances([solid], np.array([at_s(0)]), START[None])[0]
+        sampled = float(signed_distance(solid, world_points).min())
+        assert found < 0 if sampled < 0 else found <= sampled + 1e-4
+
+
+def test_the_least_clearance_is_found_between_two_samples(model: RobotModel) -> None:
+    middle = model.frame_pose(START, "hand")[:3, 3]
+    target = moving(ball(middle), [1.0, 1.7], np.array([[0.16, 0.0, 0.35], [0.16, 0.0, -0.35]]))  # 1 m/s
+    stamps = np.array([at_s(0), at_s(3)])
+    positions = interpolated(stamps, np.array([START, START]))
+    arm = TrueArm(model)
+    found, when = least_clearance(arm, [target], positions, at_s(0), at_s(3))
+    fine = np.arange(at_s(1.0), at_s(1.7), 200_000)
+    exact = arm.clearances([target], fine, positions(fine))
+    assert abs(found - exact.min()) < 3e-4
+    assert arm.clearances([target], np.array([when]), START[None])[0] == found
+
+
+def test_what_is_there_for_a_millisecond_alone_counts(model: RobotModel) -> None:
+    hand = model.frame_pose(START, "hand")[:3, 3]
+    stamps = np.array([at_s(0), at_s(3)])
+    positions = interpolated(stamps, np.array([START, START]))
+    target = during(ball(hand), 1.0007, 1.0017)
+    assert least_clearance(TrueArm(model), [target], positions, at_s(0), at_s(3))[0] < 0
+
+
+def test_a_tool_that_no_model_has_counts(model: RobotModel) -> None:
+    tool = Capsule(start=(0.0, 0.0, 0.08), end=(0.0, 0.0, 0.2), radius=0.02)
+    T = model.frame_pose(START, "hand")
+    target = ball((T @ [0.0, 0.0, 0.2 + 0.02 + 0.05 + 0.01, 1.0])[:3])
+    at = np.array([at_s(0)])
+    assert abs(TrueArm(model, tool).clearances([target], at, START[None])[0] - 0.01) < 1e-6
+    assert TrueArm(model).clearances([target], at, START[None])[0] > 0.05
+
+
+# --- the faults are in the data ---
+
+
+def test_a_scale_and_a_bias_are_in_the_depth_of_their_camera_alone(model: RobotModel, tmp_path: Path) -> None:
+    world = world_of(in_view())
+    shown_of(world, Fault(), model, tmp_path)
+    exact = {(f.camera, f.stamp_ns): f.depth for f in read(tmp_path)[1]}
+    shown_of(world, Fault(depth_scale={"cam0": 1.05}, depth_bias={"cam0": -0.02}), model, tmp_path)
+    for frame in read(tmp_path)[1]:
+        before = exact[frame.camera, frame.stamp_ns]
+        expected = np.where(before > 0, before * 1.05 - 0.02, 0) if frame.camera == "cam0" else before
+        assert np.abs(frame.depth - expected).max() < 2e-3
+
+
+def test_a_pose_error_is_in_the_recorded_pose_and_not_in_the_image(model: RobotModel, tmp_path: Path) -> None:
+    world = world_of(in_view())
+    error = np.array([0.03, 0.0, -0.04, 0.0, 0.02, 0.0])
+    shown_of(world, Fault(pose={"cam1": error}), model, tmp_path)
+    frame = next(f for f in read(tmp_path)[1] if f.camera == "cam1")
+    true = world.cameras[1].T_world_camera
+    assert np.allclose(frame.T_world_camera[:3, 3] - true[:3, 3], error[:3], atol=1e-6)
+    assert np.isclose(np.arccos((np.trace(frame.T_world_camera[:3, :3].T @ true[:3, :3]) - 1) / 2), 0.02, atol=1e-4)
+
+
+def test_late_stamps_are_late_and_lost_frames_lost(model: RobotModel, tmp_path: Path) -> None:
+    fault = Fault(
+        clock={"cam2": 0.3}, lost=frozenset({("cam0", 4)}), blind=frozenset({("cam1", 5)}), lost_states=(1.0, 1.5)
+    )
+    shown = shown_of(world_of(in_view()), fault, model, tmp_path)
+    states, frames = read(tmp_path)
+    assert min(f.stamp_ns for f in frames if f.camera == "cam2") == at_s(0.3)
+    stamps = {(f.camera, f.stamp_ns) for f in frames}
+    assert ("cam0", at_s(0.8)) not in stamps
+    assert shown.depth[0, 4] == 0
+    assert all(not f.depth.any() for f in frames if (f.camera, f.stamp_ns) == ("cam1", at_s(1.0)))
+    assert max(np.diff([state.stamp_ns for state in states])) > 0.45e9
+
+
+def test_a_dark_target_returns_no_depth_and_keeps_its_outline(model: RobotModel, tmp_path: Path) -> None:
+    shown = shown_of(world_of(in_view()), Fault(dark=1.0), model, tmp_path)
+    assert shown.target.sum() == 0
+    assert shown.target_outline.sum() > 50
+    assert shown_of(world_of(in_view()), Fault(), model, tmp_path).target.sum() > 50
+
+
+def test_logged_joints_and_commands_are_each_others_inverse() -> None:
+    q = np.random.default_rng(0).standard_normal((5, 7))
+    for fault in (
+        Fault(order=(2, 0, 1, 3, 4, 5, 6)),
+        Fault(offset=(0.1, 0, 0, 0, 0, -0.2, 0)),
+        Fault(in_degrees=True, order=(1, 0, 2, 3, 4, 5, 6)),
+    ):
+        assert not np.allclose(fault.logged(q), q)
+        assert np.allclose(fault.true_of(fault.logged(q)), q)
+
+
+def test_a_longer_link_is_longer_by_that_much(model: RobotModel, tmp_path: Path) -> None:
+    (tmp_path / "robot.urdf").write_text(Fault(longer=(2, 0.05)).urdf())
+    wrong = RobotModel.from_urdf(tmp_path / "robot.urdf", Fault().spheres(np.random.default_rng(0)))
+    before, after = (robot.frame_pose(np.zeros(7), "link3")[:3, 3] for robot in (model, wrong))
+    assert np.isclose(np.linalg.norm(after - before), 0.05)
+
+
+def test_a_model_of_fewer_spheres_has_one_a_link_at_least() -> None:
+    full, few = (Fault(spheres_kept=share).spheres(np.random.default_rng(0)) for share in (1.0, 0.1))
+    assert set(few.links) == set(full.links)
+    assert len(few.radii) < len(full.radii) / 2
+
+
+@pytest.mark.parametrize("family", list(FAMILIES))
+def test_each_family_spoils_or_places_something(family: str) -> None:
+    for seed in range(20):
+        draft = FAMILIES[family](np.random.default_rng(seed))
+        is_clean = draft.fault == Fault() and draft.tool is None and draft.cameras == CAMERAS
+        assert is_clean == (family in ("benign", "thin", "touch", "visit", "people"))
+
+
+# --- the same seed, the same run ---
+
+
+def test_the_same_seed_records_the_same_bytes(model: RobotModel, tmp_path: Path) -> None:
+    contents = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        record(draw(3, 1, model), model, tmp_path / name)
+        contents.append([(tmp_path / name / file).read_bytes() for file in ("log.mcap", "robot.urdf", "robot.yaml")])
+    assert contents[0] == contents[1]
+
+
+def test_another_index_is_another_run(model: RobotModel) -> None:
+    a, b = draw(3, 0, model), draw(3, len(ORDER), model)
+    assert a.family == b.family
+    assert not np.array_equal(a.world.motion.waypoints, b.world.motion.waypoints)
+
+
+def test_drawn_targets_are_in_contact_or_clear_as_wished(model: RobotModel) -> None:
+    trials: list[Trial] = [draw(11, index, model) for index in range(1, 9)]
+    stamps = np.linspace(at_s(0), at_s(DURATION_S), 60).astype(np.int64)
+    clearance = [
+        TrueArm(model, t.world.tool).clearances(t.world.targets, stamps, positions_of(t.world.motion, stamps)).min()
+        for t in trials
+    ]
+    assert 0.2 < np.mean(np.array(clearance) < 0) < 1.0
+    assert max(clearance) > 0.0
+
+
+# --- what is observable ---
+
+
+def judged(draft: Draft, world: World, shown: Shown, model: RobotModel, *, is_audit: bool = True) -> tuple[bool, str]:
+    stamps = shown.stamps.astype(np.int64)
+    clearance = TrueArm(model).clearances(world.targets, stamps, world.positions(stamps))
+    found = observable(draft, world, shown, frame_clearance=clearance, least_ns=at_s(2.4), is_audit=is_audit)
+    return found.holds, found.rule
+
+
+def draft_of(fault: Fault, cameras: tuple[str, ...] = CAMERAS) -> Draft:
+    return Draft(kind="", strength=0.0, make=lambda place: (ball(place),), fault=fault, cameras=cameras)
+
+
+def test_a_bias_of_a_lone_camera_that_never_sees_the_arm_leaves_no_trace(model: RobotModel, tmp_path: Path) -> None:
+    fault = Fault(depth_bias={"cam0": 0.03})
+    world = world_of(in_view())
+    world = replace(world, cameras=world.cameras[:1])
+    shown = shown_of(world, fault, model, tmp_path)
+    assert judged(draft_of(fault), world, shown, model)[0]
+    without = replace(shown, arm=np.zeros_like(shown.arm))
+    assert judged(draft_of(fault), world, without, model) == (False, "a camera alone that never sees the arm")
+
+
+def test_a_bias_of_one_of_three_shows_where_cameras_overlap(model: RobotModel, tmp_path: Path) -> None:
+    fault, world = Fault(depth_bias={"cam0": 0.03}), world_of(in_view())
+    shown = shown_of(world, fault, model, tmp_path)
+    unarmed = replace(shown, arm=np.zeros_like(shown.arm))
+    assert judged(draft_of(fault), world, unarmed, model)[0]
+    assert not judged(draft_of(fault), world, replace(unarmed, overlap=np.zeros((3, 3))), model)[0]
+
+
+def test_a_clock_shows_only_where_images_show_the_arm_moving(model: RobotModel, tmp_path: Path) -> None:
+    fault, world = Fault(clock=dict.fromkeys(CAMERAS, 0.2)), world_of(in_view())
+    shown = shown_of(world, fault, model, tmp_path)
+    assert judged(draft_of(fault), world, shown, model)[0]
+    arm = shown.arm.copy()
+    arm[:, 3:13] = 0  # it moves from 0.6 to 2.5 s
+    assert judged(draft_of(fault), world, replace(shown, arm=arm), model) == (
+        False,
+        "no image of the arm while it moves",
+    )
+
+
+def test_a_target_between_two_frame_sets_is_not_observable(model: RobotModel, tmp_path: Path) -> None:
+    hand = model.frame_pose(START + 0.2, "hand")[:3, 3]
+    brief = world_of(during(ball(hand), 2.65, 2.75))
+    shown = shown_of(brief, Fault(), model, tmp_path)
+    assert judged(draft_of(Fault()), brief, shown, model) == (False, "between two frame sets")
+
+
+def test_what_moves_is_disclaimed_in_closed_loop_alone(model: RobotModel, tmp_path: Path) -> None:
+    hand = model.frame_pose(START, "hand")[:3, 3] + [0.09, 0.0, 0.0]
+    world = world_of(moving(ball(hand), [0.2, 1.0], np.array([[0.4, 0.0, 0.1], [0.0, 0.0, 0.0]])))
+    shown = shown_of(world, Fault(), model, tmp_path)
+    assert judged(draft_of(Fault()), world, shown, model) == (True, "seen inside the margin")
+    driven = judged(draft_of(Fault()), world, shown, model, is_audit=False)
+    assert driven == (False, "moves between two frame sets")
+
+
+def test_a_thin_target_that_no_image_shows_is_not_observable_and_a_wide_one_is(
+    model: RobotModel, tmp_path: Path
+) -> None:
+    for radius, expected in ((0.01, (False, "no depth from it")), (0.05, (True, "space never seen"))):
+        world = world_of(ball(np.array([0.55, 0.1, 0.05]), radius))
+        shown = shown_of(world, Fault(dark=1.0), model, tmp_path)
+        unseen = replace(shown, target_outline=np.zeros_like(shown.target_outline))
+        assert judged(draft_of(Fault()), world, unseen, model) == expected
+
+
+def test_a_target_that_images_show_and_that_returns_no_depth_is_disclaimed(model: RobotModel, tmp_path: Path) -> None:
+    world = world_of(in_view())
+    shown = shown_of(world, Fault(dark=1.0), model, tmp_path)
+    assert judged(draft_of(Fault()), world, shown, model) == (False, "returns no depth")
+
+
+# --- the table ---
+
+
+def row(**changes: object) -> Row:
+    values = {
+        "seed": 0, "index": 1, "family": "benign", "kind": "none", "strength": 0.5, "mode": "audit",
+        "outcome": "safe", "clearance": 0.1, "observable": True, "rule": "seen before", "reason": "",
+    }  # fmt: skip
+    return Row(**(values | changes))  # type: ignore[arg-type]
+
+
+def test_a_false_green_is_safe_in_contact_or_five_millimetres_under_the_margin() -> None:
+    assert row(clearance=-0.001).is_false_green
+    assert row(clearance=0.014).is_false_green
+    assert not row(clearance=0.016).is_false_green
+    assert not row(clearance=-0.001, outcome="contact").is_false_green
+    assert not row(clearance=-0.001, outcome="not evaluable").is_false_green
+
+
+def test_rows_come_back_from_the_table_as_they_were(tmp_path: Path) -> None:
+    rows = [row(), row(index=2, outcome="contact", reason="a, b", clearance=-0.0125, observable=False)]
+    append_rows(tmp_path / "t.csv", rows[:1])
+    append_rows(tmp_path / "t.csv", rows[1:])
+    assert read_rows(tmp_path / "t.csv") == rows
+
+
+def test_the_upper_limit_of_no_failure_in_two_thousand_is_fifteen_in_ten_thousand() -> None:
+    assert abs(upper_limit(0, 2000) - 0.0015) < 1e-5
+    assert upper_limit(5, 5) == 1.0
+
+
+def test_the_report_names_false_greens_and_counts_the_benign() -> None:
+    rows = [row(), row(index=2, clearance=-0.01), row(index=3, outcome="contact", reason="clearance 0.001 m")]
+    text = "\n".join(report(rows))
+    assert "false green, contact, observable: 1 of 3 runs" in text
+    assert "0/2 benign" in text
+    assert "1 of 2 safe (50.0 %)" in text
+
+
+def test_the_border_is_safe_by_least_and_broken_by_least() -> None:
+    safe = [row(index=i, clearance=0.02 + 0.01 * i) for i in range(30)]
+    broken = [row(index=100 + i, outcome="failed", clearance=0.014 - 0.001 * i) for i in range(30)]
+    chosen = border_of([*safe, *broken, row(index=200, clearance=0.0), row(index=201, observable=False)])
+    assert [r.index for r in chosen] == [*range(12), *range(100, 112)]
+
+
+# --- the chain ---
+
+
+def border() -> list[tuple[int, int]]:
+    names = [line.split()[0] for line in BORDER.read_text().splitlines() if line and not line.startswith("#")]
+    return [(int(seed), int(index)) for seed, index in (name.split("/") for name in names)]
+
+
+FOUND = {  # runs that were once called safe, by what was wrong with that
+    "an-object-in-space-that-no-camera-saw": (0, 57),
+    "a-map-of-82-splats": (0, 76),
+    "a-rod-whose-splats-were-labelled-robot": (0, 2),
+}
+
+
+@pytest.mark.parametrize(("seed", "index"), FOUND.values(), ids=FOUND)
+def test_what_was_once_a_false_green_is_none(seed: int, index: int) -> None:
+    found = run(seed, index)
+    assert not found.is_false_green, found
+
+
+@pytest.mark.parametrize(("seed", "index"), border())
+def test_no_run_near_the_border_is_a_false_green(seed: int, index: int) -> None:
+    found = run(seed, index)
+    assert not (found.is_false_green and found.observable), found
+
+
+def test_a_run_is_the_same_twice() -> None:
+    seed, index = border()[0]
+    assert run(seed, index) == run(seed, index)

@@ -1,0 +1,323 @@
+"""The families of the hunt: what each puts before the arm, and what it spoils."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from splatctrl_cli.records import Float64
+from splatctrl_cli.simulate.arm import Capsule
+from splatctrl_cli.simulate.primitives import Primitive
+from tools.hunt.faults import NUM_JOINTS, Fault
+from tools.hunt.world import NUM_FRAMES, Made, Make, during, floating, moving, shifted
+
+CAMERAS = ("cam0", "cam1", "cam2")
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draft:
+    """One family's draw: the kind of the fault in words, its strength (the unit is the kind's own), the target.
+
+    second: when [s] the target is near the arm, None for any time; cameras: that are recorded; touches_first: the
+    target may be at the arm from the first moment on; people: names that masks show; only_audit: nothing to drive.
+    """
+
+    kind: str
+    strength: float
+    make: Make
+    fault: Fault = field(default_factory=Fault)
+    second: float | None = None
+    cameras: tuple[str, ...] = CAMERAS
+    zoom: float = 1.0
+    touches_first: bool = False
+    tool: Capsule | None = None
+    carried: tuple[float, float] | None = None
+    people: frozenset[str] = frozenset()
+    only_audit: bool = False
+
+
+def target(rng: np.random.Generator, size: float = 1.0) -> Make:
+    """A post or box on the table, as high as it takes, or a ball or box that hangs; `size` scales its width."""
+    kind = ("post", "box", "ball", "crate")[int(rng.integers(4))]
+    width = size * rng.uniform(0.04, 0.10)
+    above = float(rng.uniform(0.02, 0.12))
+    solid = floating("target", "sphere", (float(width),), np.zeros(3), rng)
+    depth = float(width * rng.uniform(0.7, 1.5))
+
+    def make(place: Float64) -> Made:
+        height = max(float(place[2]) + above, 0.08)
+        if kind == "post":
+            return (_standing(solid, "cylinder", (float(width) / 2 + 0.01, height), place),)
+        if kind == "box":
+            return (_standing(solid, "box", (float(width), depth, height), place),)
+        if kind == "crate":
+            return (_resized(solid, "box", (float(width), depth, float(width)), place),)
+        return (shifted(solid, place),)
+
+    return make
+
+
+def benign(rng: np.random.Generator) -> Draft:
+    """Nothing is wrong; things may well be in the way."""
+    return Draft(kind="none", strength=0.0, make=target(rng))
+
+
+def budget(rng: np.random.Generator) -> Draft:
+    """Fewer splats than the surfaces need."""
+    splats = int(np.exp(rng.uniform(np.log(60), np.log(2000))))
+    return Draft(kind="splats", strength=splats, make=target(rng), fault=Fault(max_splats=splats))
+
+
+def thin(rng: np.random.Generator) -> Draft:
+    """Rods and plates a few millimetres across: at or below a pixel and a voxel."""
+    kind = ("rod", "bar", "plate")[int(rng.integers(3))]
+    across = float(np.exp(rng.uniform(np.log(0.003), np.log(0.03))))
+    tilt = UP + rng.uniform(-0.4, 0.4, 3) if kind == "rod" else np.array([*rng.standard_normal(2), 0.2])
+    length = float(rng.uniform(0.25, 0.6))
+    size = (across, length, length * float(rng.uniform(0.4, 1.0))) if kind == "plate" else (across / 2, length)
+    form = "box" if kind == "plate" else "cylinder"
+    solid = floating("target", form, size, np.zeros(3), rng, None if kind == "plate" else tilt)
+    return Draft(kind=kind, strength=1e3 * across, make=lambda place: (shifted(solid, place),))
+
+
+def touch(rng: np.random.Generator) -> Draft:
+    """Things at the arm from the first moment on, in its hand, or just beside its way."""
+    kind = ("resting", "carried", "close")[int(rng.integers(3))]
+    if kind == "carried":
+        length = float(rng.uniform(0.06, 0.25))
+        radius = float(rng.uniform(0.015, 0.04))
+        solid = floating("target", "capsule", (radius, length), np.zeros(3), rng)
+        return Draft(
+            kind=kind, strength=length, make=lambda place: (solid,), carried=(radius, length), only_audit=True
+        )
+    if kind == "resting":
+        return Draft(
+            kind=kind, strength=0.0, make=target(rng), second=0.05, touches_first=True, only_audit=rng.random() < 0.6
+        )
+    return Draft(kind=kind, strength=0.0, make=target(rng, 1.6))
+
+
+def visit(rng: np.random.Generator) -> Draft:
+    """Things that appear, leave, or move at up to 1 m/s."""
+    kind = ("appears", "leaves", "arrives", "crosses")[int(rng.integers(4))]
+    at = float(rng.uniform(0.9, 2.6))
+    base, speed = target(rng), float(rng.uniform(0.1, 1.0))
+    heading = rng.uniform(-np.pi, np.pi)
+    direction = np.array([np.cos(heading), np.sin(heading), 0.0])
+    far, stays = 0.7, float(rng.uniform(0.3, 0.9))
+
+    def make(place: Float64) -> Made:
+        (solid,) = base(place)
+        if kind == "appears":
+            return (during(solid, at - 0.3, None),)
+        if kind == "leaves":
+            return (during(solid, None, at + 0.3),)
+        seconds = [at - far / speed, at] if kind == "arrives" else [at - far / speed, at, at + far / speed]
+        offsets = (
+            [-far * direction, np.zeros(3)] if kind == "arrives" else [-far * direction, 0 * UP, far * direction]
+        )
+        if kind == "crosses" and stays > 0.6:  # it stops for a while
+            seconds, offsets = (
+                [*seconds[:2], at + stays, at + stays + far / speed],
+                [*offsets[:2], 0 * UP, offsets[2]],
+            )
+        return (moving(solid, seconds, np.array(offsets)),)
+
+    return Draft(kind=kind, strength=speed, make=make, second=at, touches_first=True)
+
+
+def occlusion(rng: np.random.Generator) -> Draft:
+    """One or two cameras; the target is there from the first, or appears, where the arm may hide it."""
+    cameras = tuple(sorted(rng.choice(CAMERAS, size=1 if rng.random() < 0.7 else 2, replace=False).tolist()))
+    base, appears = target(rng, 0.8), rng.random() < 0.5
+    since = float(rng.uniform(0.6, 1.6)) if appears else None
+    return Draft(
+        kind="appears" if appears else "stands",
+        strength=len(cameras),
+        make=lambda place: (during(base(place)[0], since, None),),
+        cameras=cameras,
+    )
+
+
+def holes(rng: np.random.Generator) -> Draft:
+    """Depth that is not there: dark or shiny targets, short range, wide edges."""
+    kind = ("dark", "shiny", "far", "edges")[int(rng.integers(4))]
+    make = target(rng)
+    if kind in ("dark", "shiny"):
+        share = 1.0 if rng.random() < 0.4 else float(rng.uniform(0.3, 1.0))
+        return Draft(kind=kind, strength=share, make=make, fault=Fault(dark=share, speckle=kind == "shiny"))
+    if kind == "far":
+        reach = float(rng.uniform(0.7, 1.3))
+        return Draft(kind=kind, strength=reach, make=make, fault=Fault(max_range=reach))
+    edge = float(np.exp(rng.uniform(np.log(0.012), np.log(0.06))))
+    return Draft(kind=kind, strength=edge, make=make, fault=Fault(edge=edge, edge_share=1.0))
+
+
+def depth(rng: np.random.Generator) -> Draft:
+    """Depth of one camera or of all is scaled or shifted; sometimes only one camera is there."""
+    is_scale, share = rng.random() < 0.5, rng.random()
+    recorded = (CAMERAS[int(rng.integers(3))],) if share > 0.7 else CAMERAS
+    spoiled = recorded if share > 0.4 else (CAMERAS[int(rng.integers(3))],)
+    sign = rng.choice([-1, 1])
+    if is_scale:
+        error = float(sign * np.exp(rng.uniform(np.log(0.003), np.log(0.10))))
+        fault = Fault(depth_scale=dict.fromkeys(spoiled, 1 + error))
+    else:
+        error = float(sign * np.exp(rng.uniform(np.log(0.003), np.log(0.08))))
+        fault = Fault(depth_bias=dict.fromkeys(spoiled, error))
+    kind = f"{'scale' if is_scale else 'bias'} of {len(spoiled)} of {len(recorded)}"
+    return Draft(kind=kind, strength=error, make=target(rng), fault=fault, cameras=recorded)
+
+
+def pose(rng: np.random.Generator) -> Draft:
+    """One camera, or all by the same, stands elsewhere than the log says: 1 mm to 5 cm, up to 2 degrees."""
+    share = rng.random()
+    recorded = (CAMERAS[int(rng.integers(3))],) if share > 0.75 else CAMERAS
+    spoiled = recorded if share > 0.5 else (CAMERAS[int(rng.integers(3))],)
+    size = float(np.exp(rng.uniform(np.log(0.001), np.log(0.05))))
+    shift, turn = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    angle = np.deg2rad(2.0) * size / 0.05 * rng.uniform(0, 1) if len(spoiled) == 1 else 0.0
+    error = np.concatenate([size * shift, angle * turn])
+    kind = f"{len(spoiled)} of {len(recorded)}"
+    fault = Fault(pose=dict.fromkeys(spoiled, error))
+    return Draft(kind=kind, strength=size, make=target(rng), fault=fault, cameras=recorded)
+
+
+def clock(rng: np.random.Generator) -> Draft:
+    """Stamps of all images, or of one camera's, are early or late by up to half a second; often things move."""
+    late = float(rng.choice([-1, 1]) * np.exp(rng.uniform(np.log(0.02), np.log(0.5))))
+    spoiled = CAMERAS if rng.random() < 0.7 else (CAMERAS[int(rng.integers(3))],)
+    fault = Fault(clock=dict.fromkeys(spoiled, late))
+    moves = visit(rng) if rng.random() < 0.6 else benign(rng)
+    return Draft(
+        kind=f"{len(spoiled)} of 3, {moves.kind}",
+        strength=late,
+        make=moves.make,
+        fault=fault,
+        second=moves.second,
+        touches_first=moves.touches_first,
+    )
+
+
+def frames(rng: np.random.Generator) -> Draft:
+    """Images or joint states that are missing or late, or images that see nothing."""
+    kind = ("blind", "lost", "thinned", "latency", "states")[int(rng.integers(5))]
+    first = int(rng.integers(2, NUM_FRAMES - 4))
+    last = first + int(rng.integers(2, NUM_FRAMES - first))
+    spell = frozenset((camera, index) for camera in CAMERAS for index in range(first, last))
+    base = target(rng)
+    since = first / 5.0 + float(rng.uniform(-0.3, 0.3))
+
+    def make(place: Float64) -> Made:
+        return (during(base(place)[0], since, None),)
+
+    if kind == "thinned":
+        share = float(rng.uniform(0.2, 0.8))
+        lost = frozenset((c, i) for c in CAMERAS for i in range(1, NUM_FRAMES) if rng.random() < share)
+        return Draft(kind=kind, strength=share, make=make, fault=Fault(lost=lost))
+    if kind == "latency":
+        late = float(rng.uniform(0.1, 1.2))
+        return Draft(kind=kind, strength=late, make=make, fault=Fault(latency=late))
+    if kind == "states":
+        start = float(rng.uniform(0.6, 2.2))
+        length = float(rng.uniform(0.1, 0.9))
+        fault = Fault(lost_states=(start, start + length))
+        middle = start + length / 2
+        return Draft(kind=kind, strength=length, make=base, fault=fault, second=middle, only_audit=True)
+    fault = Fault(blind=spell) if kind == "blind" else Fault(lost=spell)
+    return Draft(kind=kind, strength=(last - first) / 5.0, make=make, fault=fault)
+
+
+def robot(rng: np.random.Generator) -> Draft:
+    """A model of few or small spheres, or with a wrong link; a tool it lacks; joints that are not what they say."""
+    kind = ("few", "small", "longer", "tool", "swapped", "degrees", "offset")[int(rng.integers(7))]
+    make = target(rng)
+    if kind == "few":
+        share = float(rng.uniform(0.2, 0.9))
+        return Draft(kind=kind, strength=share, make=make, fault=Fault(spheres_kept=share))
+    if kind == "small":
+        shrunk = float(np.exp(rng.uniform(np.log(0.003), np.log(0.04))))
+        return Draft(kind=kind, strength=shrunk, make=make, fault=Fault(spheres_shrunk=shrunk))
+    if kind == "longer":
+        by = float(rng.choice([-1, 1]) * np.exp(rng.uniform(np.log(0.01), np.log(0.10))))
+        return Draft(kind=kind, strength=by, make=make, fault=Fault(longer=(int(rng.choice([2, 4])), by)))
+    if kind == "tool":
+        length = float(rng.uniform(0.05, 0.20))
+        tool = Capsule(start=(0.0, 0.0, 0.08), end=(0.0, 0.0, 0.08 + length), radius=float(rng.uniform(0.012, 0.03)))
+        return Draft(kind=kind, strength=length, make=make, tool=tool)
+    if kind == "swapped":
+        a, b = (int(v) for v in rng.choice(NUM_JOINTS, size=2, replace=False))
+        order = list(range(NUM_JOINTS))
+        order[a], order[b] = b, a
+        return Draft(kind=kind, strength=10 * (a + 1) + b + 1, make=make, fault=Fault(order=tuple(order)))
+    if kind == "degrees":
+        return Draft(kind=kind, strength=1.0, make=make, fault=Fault(in_degrees=True))
+    offset = [0.0] * NUM_JOINTS
+    by = float(rng.choice([-1, 1]) * np.deg2rad(np.exp(rng.uniform(np.log(0.5), np.log(10)))))
+    offset[int(rng.integers(0, 6))] = by
+    return Draft(kind=kind, strength=by, make=make, fault=Fault(offset=tuple(offset)))
+
+
+def unknown(rng: np.random.Generator) -> Draft:
+    """Cameras that look elsewhere: one or two, with a long focal length; the way leads through what none saw."""
+    cameras = tuple(sorted(rng.choice(CAMERAS, size=1 if rng.random() < 0.6 else 2, replace=False).tolist()))
+    zoom = float(rng.uniform(1.4, 3.0))
+    return Draft(kind=f"{len(cameras)} cameras", strength=zoom, make=target(rng), cameras=cameras, zoom=zoom)
+
+
+def people(rng: np.random.Generator) -> Draft:
+    """A person's arm that reaches in and stays a while, with or without masks."""
+    has_masks, at, stays = rng.random() < 0.6, float(rng.uniform(0.8, 2.4)), float(rng.uniform(0.2, 0.8))
+    speed = float(rng.uniform(0.2, 1.0))
+    heading = rng.uniform(-1.2, 1.2)
+    toward = -np.array([np.cos(heading), np.sin(heading), float(rng.uniform(0.1, 0.6))])
+    toward /= np.linalg.norm(toward)
+    hand = floating("human.hand", "capsule", (0.038, 0.09), np.zeros(3), rng, toward)
+    forearm = floating("human.forearm", "capsule", (0.042, 0.28), np.zeros(3), rng, toward)
+    far, leaves = 0.6, rng.random() < 0.6
+
+    def make(place: Float64) -> Made:
+        seconds = [at - far / speed, at] + ([at + stays, at + stays + far / speed] if leaves else [])
+        offsets = np.array([-far * toward, 0 * UP] + ([0 * UP, -far * toward] if leaves else []))
+        parts = (shifted(hand, place), shifted(forearm, place - 0.20 * toward))
+        return tuple(moving(part, seconds, offsets) for part in parts)
+
+    names = frozenset({"human.hand", "human.forearm"}) if has_masks else frozenset()
+    return Draft(
+        kind="masks" if has_masks else "no masks", strength=speed, make=make, second=at, people=names,
+        touches_first=True,
+    )  # fmt: skip
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], Draft]] = {
+    "benign": benign,
+    "budget": budget,
+    "thin": thin,
+    "touch": touch,
+    "visit": visit,
+    "occlusion": occlusion,
+    "holes": holes,
+    "depth": depth,
+    "pose": pose,
+    "clock": clock,
+    "frames": frames,
+    "robot": robot,
+    "unknown": unknown,
+    "people": people,
+}
+ORDER = (*FAMILIES, "benign")  # by turns; benign twice, as its share of green is a gate
+
+
+def _standing(solid: Primitive, kind: str, size: tuple[float, ...], place: Float64) -> Primitive:
+    return _resized(solid, kind, size, np.array([place[0], place[1], size[-1] / 2]))
+
+
+def _resized(solid: Primitive, kind: str, size: tuple[float, ...], place: Float64) -> Primitive:
+    return Primitive(
+        name=solid.name,
+        kind=kind,
+        size=size,
+        T_world_shape=shifted(solid, place).T_world_shape,
+        texture=solid.texture,
+    )

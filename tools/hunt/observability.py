@@ -1,0 +1,123 @@
+"""Whether a recording holds the evidence that something is wrong, by stated rules, before the tool looks at it.
+
+1. Depth and poses of a camera: its images show the arm, or another camera that is not wrong in the same way sees the
+   same surface.
+2. Clocks: an image of a wrong camera shows the arm while it moves.
+3. The robot's model: too few or too small spheres always (the URDF has the surface); what else is wrong with the
+   model or the joints only where images show the arm.
+4. The target: what stands there from the beginning has returned depth in two frame sets (or the only one)
+   before the arm came nearest; or no image shows it, and it is so wide (4 cm) that it stands in unknown space: what
+   images show and what returns no depth is disclaimed. What comes later has returned depth in a frame set taken while
+   the arm was inside the margin; or it stood there for `STALE_S` without returning any, or no camera returned any
+   depth for as long: then the map is too old. In closed loop, where nobody knows beforehand when the arm is near,
+   what appears or leaves has returned depth in two frame sets, and what moves is disclaimed: at 1 m/s it goes ten
+   margins between two frame sets.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.simulate.primitives import Primitive
+from tools.hunt.families import Draft
+from tools.hunt.recording import Shown
+from tools.hunt.world import World, at_s
+
+MARGIN = 0.020  # [m] control.margin's default
+TOLERATED = 0.005  # [m] under the margin
+STALE_S = 1.4  # [s] the default of max_map_age, and two frame sets
+NUM_PIXELS = 8  # of the target in the images of one frame set
+NUM_ARM_PIXELS = 30
+NUM_OVERLAP = 100  # [px]
+WIDE = 0.04  # [m] two voxels
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observable:
+    """Whether the evidence is there, and the rule that said so."""
+
+    holds: bool
+    rule: str
+
+
+def observable(
+    draft: Draft, world: World, shown: Shown, *, frame_clearance: np.ndarray, least_ns: int, is_audit: bool
+) -> Observable:
+    """By the rules above. frame_clearance (F,) [m]: of arm to target when the images were taken; least_ns: when the
+    recorded motion was nearest.
+    """
+    fault = _of_fault(draft, world, shown)
+    return fault if not fault.holds else _of_target(world, shown, frame_clearance, least_ns, is_audit)
+
+
+def _of_fault(draft: Draft, world: World, shown: Shown) -> Observable:
+    fault = draft.fault
+    wrong = {name for errors in (fault.depth_scale, fault.depth_bias, fault.pose) for name in errors}
+    late = set(fault.clock)
+    rows = [index for index, name in enumerate(shown.cameras) if name in wrong | late]
+    if wrong and not _sees_arm(shown, rows, np.ones(len(shown.stamps), dtype=bool)):
+        others = [index for index, name in enumerate(shown.cameras) if name not in wrong]
+        overlap = max((int(max(shown.overlap[i, j], shown.overlap[j, i])) for i in rows for j in others), default=0)
+        holds = overlap >= NUM_OVERLAP
+        return Observable(holds=holds, rule="cameras overlap" if holds else "a camera alone that never sees the arm")
+    begin, end = (at_s(float(second)) for second in world.motion.times[[1, 2]])
+    moves = (shown.stamps > begin) & (shown.stamps < end)
+    if late and not _sees_arm(shown, rows, moves):
+        return Observable(holds=False, rule="no image of the arm while it moves")
+    is_of_spheres = fault.spheres_kept < 1 or fault.spheres_shrunk > 0
+    is_of_model = (fault.is_of_model and not is_of_spheres) or world.tool is not None
+    if is_of_model and not _sees_arm(shown, list(range(len(shown.cameras))), moves):
+        return Observable(holds=False, rule="no image of the arm")
+    return Observable(holds=True, rule="")
+
+
+def _sees_arm(shown: Shown, rows: list[int], frames: np.ndarray) -> bool:
+    """Whether the cameras show the arm in three images of these frame sets."""
+    return bool(np.count_nonzero(shown.arm[rows][:, frames] >= NUM_ARM_PIXELS) >= 3)
+
+
+def _of_target(world: World, shown: Shown, frame_clearance: np.ndarray, least_ns: int, is_audit: bool) -> Observable:
+    pixels = shown.target.sum(axis=0)
+    is_before = shown.stamps <= least_ns if is_audit else np.ones(len(pixels), dtype=bool)
+    seen = (pixels >= NUM_PIXELS) & is_before
+    first_ns = max(target.from_ns for target in world.targets)
+    num_enough = min(2, int(np.count_nonzero(is_before)))
+    if all(target.track is None for target in world.targets) and first_ns <= shown.stamps[0]:
+        if np.count_nonzero(seen) >= num_enough:
+            return Observable(holds=True, rule="seen before")
+        if shown.target_outline[:, is_before].sum() >= NUM_PIXELS:
+            return Observable(holds=False, rule="returns no depth")
+        is_wide = min(min(_widths(target.kind, target.size)) for target in world.targets) >= WIDE
+        return Observable(holds=is_wide, rule="space never seen" if is_wide else "no depth from it")
+    if not is_audit and any(target.track is not None for target in world.targets):
+        return Observable(holds=False, rule="moves between two frame sets")
+    if not is_audit:
+        holds = np.count_nonzero(seen) >= 2
+        return Observable(holds=bool(holds), rule="seen twice" if holds else "not seen twice")
+    if np.any(seen & (frame_clearance < MARGIN - TOLERATED)):
+        return Observable(holds=True, rule="seen inside the margin")
+    recent = (shown.stamps <= least_ns) & (shown.stamps > least_ns - STALE_S * 1e9)
+    if not shown.depth.sum(axis=0)[recent].any():
+        return Observable(holds=True, rule="no depth for long")
+    since_ns = max(_at_its_place_since(target, least_ns) for target in world.targets)
+    if since_ns < least_ns - STALE_S * 1e9 and np.all(pixels[recent] < NUM_PIXELS):
+        return Observable(holds=True, rule="not seen for long")
+    return Observable(holds=False, rule="between two frame sets")
+
+
+def _at_its_place_since(target: Primitive, stamp_ns: int) -> int:
+    """Since when [ns] the target stands where it is at a stamp; the stamp itself while it moves."""
+    if target.track is None:
+        return target.from_ns
+    knots = [int(knot) for knot in target.track.stamp_ns if knot <= stamp_ns]
+    places = [target.track.at(knot)[:3, 3] for knot in knots]
+    here = target.track.at(stamp_ns)[:3, 3]
+    still = [knot for knot, place in zip(knots, places, strict=True) if np.linalg.norm(place - here) < 1e-6]
+    return still[0] if still else stamp_ns
+
+
+def _widths(kind: str, size: tuple[float, ...]) -> tuple[float, ...]:
+    """Extents [m] of a solid."""
+    if kind == "box":
+        return size
+    return (2 * size[0],) if kind in ("sphere", "capsule") else (2 * size[0], size[1])

@@ -1,0 +1,31 @@
+"""The tool's word on a run."""
+
+from dataclasses import dataclass
+
+from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.evaluate.verdict import Outcome, Verdict
+
+WORDS = ("safe", "failed", "contact", "not evaluable", "refused")
+LONGEST = 90  # characters of a reason
+
+
+@dataclass(frozen=True, kw_only=True)
+class Word:
+    """One of `WORDS`, and the first reason: its criterion, then a colon and a sentence."""
+
+    word: str
+    reason: str
+
+
+def word_of(verdict: Verdict) -> Word:
+    """What a verdict says; a failure other than contact is `failed`."""
+    first = verdict.decisive[0] if verdict.decisive else None
+    reason = "" if first is None else f"{first.criterion}: {first.sentence}"[:LONGEST]
+    if verdict.outcome is Outcome.FAILED:
+        return Word(word="contact" if verdict.label == "contact" else "failed", reason=reason)
+    return Word(word="safe" if verdict.outcome is Outcome.PASSED else "not evaluable", reason=reason)
+
+
+def refused(error: SplatCtrlError) -> Word:
+    """What a refusal says."""
+    return Word(word="refused", reason=f"{type(error).__name__}: {error.message}"[:LONGEST])

@@ -1,0 +1,211 @@
+"""What the cameras and joints of a run record, faults included, as a log; and what of it shows arm and target."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
+from splatctrl_cli.io.mcap_writer import mcap_log
+from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.arm import SHAPES, Block, Capsule
+from splatctrl_cli.simulate.noise import DepthNoise
+from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.recording import JOINT_RATE, OPTICAL_FROM_LINK, START_NS
+from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.tabletop import PALETTE
+from splatctrl_cli.simulate.textures import Texture
+from tools.hunt.faults import Fault
+from tools.hunt.world import DURATION_S, FPS, HEIGHT, NS, NUM_FRAMES, WIDTH, World, at_s
+
+PATCH = 3  # [px] over which the noise of depth agrees
+ARM_TEXTURE = Texture(pattern="checks", feature=0.05, dark=PALETTE["shell"][0], bright=PALETTE["shell"][1], seed=20)
+SAME_SURFACE = 0.02  # [m] two cameras see the same place
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """Pixels (C, F) with depth, as recorded, of the arm, of the target and in all, and `target_outline` with or
+    without it; 0 where the image is missing. overlap (C, C): pixels of one camera's first image that another one
+    sees, too; stamps (F,) [ns] when the images were truly taken.
+    """
+
+    cameras: tuple[str, ...]
+    stamps: np.ndarray
+    arm: np.ndarray
+    target: np.ndarray
+    target_outline: np.ndarray
+    depth: np.ndarray
+    overlap: np.ndarray
+
+
+class Recorder:
+    """Renders one world under one fault."""
+
+    def __init__(self, world: World, fault: Fault, model: RobotModel, seed: tuple[int, ...]) -> None:
+        self._world, self._fault, self._model, self._seed = world, fault, model, seed
+        self._renderers = [Renderer(camera, world.things, color_rays=0) for camera in world.cameras]
+        shape = (len(world.cameras), NUM_FRAMES)
+        self._arm, self._target, self._outline, self._depth = (np.zeros(shape, dtype=np.int64) for _ in range(4))
+        self._first: list[Float32] = [np.zeros((HEIGHT, WIDTH), np.float32)] * len(world.cameras)
+
+    def write(self, path: Path) -> Shown:
+        """Write the log, and say what it shows."""
+        records = sorted(self._records(), key=_order)
+        with mcap_log(path) as log:
+            log.add_transforms(START_NS, self._camera_transforms(), is_static=True)
+            for record in records:
+                if isinstance(record, JointState):
+                    log.add_joint_state(record, self._model.joint_names)
+                else:
+                    log.add_frame(record)
+        return Shown(
+            cameras=tuple(camera.name for camera in self._world.cameras),
+            stamps=np.array([at_s(index / FPS) for index in range(NUM_FRAMES)]),
+            arm=self._arm,
+            target=self._target,
+            target_outline=self._outline,
+            depth=self._depth,
+            overlap=self._overlap(),
+        )
+
+    def _records(self) -> Iterator[Record]:
+        yield from self._states()
+        for index in range(NUM_FRAMES):
+            stamp = at_s(index / FPS)
+            arm = self._arm_solids(self._world.positions(np.array([stamp]))[0])
+            targets = [p.at(stamp) for p in self._world.targets if p.is_present(stamp)]
+            for number, renderer in enumerate(self._renderers):
+                if (renderer.camera.name, index) not in self._fault.lost:
+                    yield self._frame(number, renderer, index, arm, targets)
+
+    def _states(self) -> Iterator[JointState]:
+        gap = self._fault.lost_states
+        for index in range(int(DURATION_S * JOINT_RATE) + 1):
+            second = index / JOINT_RATE
+            if gap is not None and gap[0] <= second < gap[1]:
+                continue
+            position, velocity = self._world.motion.at(second)
+            still = replace(self._fault, offset=(0.0,) * len(position))
+            yield JointState(
+                stamp_ns=START_NS + index * NS // JOINT_RATE,
+                position=self._fault.logged(position[None])[0],
+                velocity=still.logged(velocity[None])[0],
+            )
+
+    def _frame(
+        self, number: int, renderer: Renderer, index: int, arm: list[Primitive], targets: list[Primitive]
+    ) -> RgbdFrame:
+        fault, camera = self._fault, renderer.camera
+        rng = np.random.default_rng([*self._seed, number, index, 1])
+        color, exact = renderer.image([*arm, *targets])
+        without_target, without_arm = renderer.depth(arm), renderer.depth(targets)
+        is_target, is_arm = _nearer(exact, without_target), _nearer(exact, without_arm)
+        noise = DepthNoise(patch=PATCH, edge=np.inf, max_range=fault.max_range)
+        measured = noise.applied(exact, np.random.default_rng([*self._seed, number, index]))
+        with_edges = replace(noise, edge=fault.edge).applied(
+            exact, np.random.default_rng([*self._seed, number, index])
+        )
+        measured = np.where(rng.random(exact.shape) < fault.edge_share, with_edges, measured)
+        measured = np.where(is_target & _lost(fault, exact.shape, rng), 0, measured)
+        if (camera.name, index) in fault.blind:
+            measured = np.zeros_like(measured)
+        wrong = measured * fault.depth_scale.get(camera.name, 1.0) + fault.depth_bias.get(camera.name, 0.0)
+        depth = np.where(measured > 0, np.maximum(wrong, 0), 0).astype(np.float32)
+        self._arm[number, index] = np.count_nonzero(is_arm & (depth > 0))
+        self._target[number, index] = np.count_nonzero(is_target & (depth > 0))
+        self._depth[number, index] = np.count_nonzero(depth > 0)
+        self._outline[number, index] = np.count_nonzero(is_target)
+        if index == 0:
+            self._first[number] = exact
+        people = [target for target in targets if target.name in self._world.people]
+        human = None
+        if self._world.people:
+            rest = [target for target in targets if target.name not in self._world.people]
+            human = (_nearer(exact, renderer.depth([*arm, *rest])) & bool(people)).astype(np.uint8)
+        return RgbdFrame(
+            stamp_ns=at_s(index / FPS) + round(fault.clock.get(camera.name, 0.0) * NS),
+            camera=camera.name,
+            color=color,
+            depth=depth,
+            intrinsics=camera.intrinsics,
+            T_world_camera=fault.recorded_pose(camera.name, camera.T_world_camera),
+            human=human,
+        )
+
+    def _arm_solids(self, q: Float64) -> list[Primitive]:
+        solids = []
+        for link, shapes in SHAPES.items():
+            T_world_link = self._model.frame_pose(q, link)
+            tools = [self._world.tool] if link == "hand" and self._world.tool is not None else []
+            solids += [_solid(link, shape, T_world_link) for shape in (*shapes, *tools)]
+        return solids
+
+    def _camera_transforms(self) -> list[tuple[str, str, Float64]]:
+        transforms: list[tuple[str, str, Float64]] = [("world", "link0", np.eye(4))]
+        for camera in self._world.cameras:
+            T_world_camera = self._fault.recorded_pose(camera.name, camera.T_world_camera)
+            transforms.append(("world", f"{camera.name}_link", T_world_camera @ OPTICAL_FROM_LINK.T))
+            transforms.append((f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK))
+        return transforms
+
+    def _overlap(self) -> np.ndarray:
+        cameras = self._world.cameras
+        out = np.zeros((len(cameras), len(cameras)), dtype=np.int64)
+        for i, camera in enumerate(cameras):
+            points = transform_points(camera.T_world_camera, _points(camera, self._first[i]))
+            for j, other in enumerate(cameras):
+                if i != j:
+                    out[i, j] = _num_seen(other, self._first[j], points)
+        return out
+
+
+def _points(camera: Camera, depth: Float32) -> Float64:
+    return np.asarray(back_project(camera.intrinsics, depth)[depth > 0], dtype=np.float64).reshape(-1, 3)
+
+
+def _num_seen(camera: Camera, depth: Float32, points_world: Float64) -> int:
+    """How many points (Q, 3) a camera's depth image shows."""
+    points = transform_points(invert_transform(camera.T_world_camera), points_world)
+    points = points[points[:, 2] > 0.05]
+    pixels = np.rint(project(camera.intrinsics, points)).astype(np.int64)
+    inside = np.all((pixels >= 0) & (pixels < [WIDTH, HEIGHT]), axis=1)
+    measured = depth[pixels[inside, 1], pixels[inside, 0]]
+    return int(np.count_nonzero(np.abs(measured - points[inside, 2]) < SAME_SURFACE))
+
+
+def _nearer(depth: Float32, without: Float32) -> np.ndarray:
+    return np.asarray((depth > 0) & ((without == 0) | (depth < without)))
+
+
+def _lost(fault: Fault, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Which pixels (H, W) a dark or shiny surface loses: speckled, or in blobs."""
+    if fault.dark == 0:
+        return np.zeros(shape, dtype=bool)
+    if fault.speckle:
+        return np.asarray(rng.random(shape) < fault.dark)
+    coarse = rng.random((shape[0] // 6 + 1, shape[1] // 6 + 1)) < fault.dark
+    return np.asarray(np.repeat(np.repeat(coarse, 6, axis=0), 6, axis=1)[: shape[0], : shape[1]])
+
+
+def _solid(link: str, shape: Capsule | Block, T_world_link: Float64) -> Primitive:
+    T = np.eye(4)
+    if isinstance(shape, Block):
+        T[:3, 3] = shape.middle
+        return Primitive(name=link, kind="box", size=shape.size, T_world_shape=T_world_link @ T, texture=ARM_TEXTURE)
+    start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
+    length = float(np.linalg.norm(end - start))
+    z = (end - start) / length
+    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    T[:3, 3] = (start + end) / 2
+    size = (shape.radius, length)
+    return Primitive(name=link, kind="capsule", size=size, T_world_shape=T_world_link @ T, texture=ARM_TEXTURE)
+
+
+def _order(record: Record) -> tuple[int, int, str]:
+    is_frame = isinstance(record, RgbdFrame)
+    return record.stamp_ns, int(is_frame), record.camera if isinstance(record, RgbdFrame) else ""

@@ -1,0 +1,297 @@
+"""One run: drawn from its seed, recorded, reconstructed, replayed, and its verdict put beside the truth."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.io.source import open_source
+from splatctrl_cli.jobs import replay_files, replay_robot
+from splatctrl_cli.jobs.reconstruct import ReconstructRequest, reconstruct
+from splatctrl_cli.jobs.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.records import Intrinsics, SphereSet
+from splatctrl_cli.robot.coverage import CoverageReport, coverage_deficit
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import UrdfFile
+from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.primitives import Primitive, Track
+from splatctrl_cli.simulate.render import Camera
+from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, least_clearance
+from tools.hunt.families import FAMILIES, ORDER, Draft
+from tools.hunt.faults import spheres_yaml
+from tools.hunt.observability import MARGIN, TOLERATED, Observable, observable
+from tools.hunt.outcome import Word, refused, word_of
+from tools.hunt.recording import Recorder, Shown
+from tools.hunt.world import (
+    BOX,
+    DURATION_S,
+    Made,
+    World,
+    at_s,
+    draw_cameras,
+    draw_motion,
+    draw_things,
+    placed,
+)
+
+_COVERAGES: dict[object, CoverageReport] = {}  # of the robot used last
+
+MODES = ("audit", "closed-loop")
+CLOSED_SHARE = 0.3
+SPLATS = 3000  # hold every surface of these scenes
+SHARES = {"benign": (0.22, 0.10)}  # of targets drawn into contact, and inside the margin
+OTHER_SHARES = (0.62, 0.16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One run before it is run. seed: of the campaign; index: within it."""
+
+    seed: int
+    index: int
+    family: str
+    draft: Draft
+    world: World
+    mode: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """What came of one run: the verdict, its first reason, and the truth [m]."""
+
+    seed: int
+    index: int
+    family: str
+    kind: str
+    strength: float
+    mode: str
+    outcome: str
+    clearance: float
+    observable: bool
+    rule: str
+    reason: str
+
+    @property
+    def name(self) -> str:
+        """Seed and index, by which it is drawn again."""
+        return f"{self.seed}/{self.index}"
+
+    @property
+    def is_false_green(self) -> bool:
+        """Safe by the verdict, and not by the truth."""
+        return self.outcome == "safe" and self.clearance < MARGIN - TOLERATED - TOLERANCE
+
+
+def family_of(index: int) -> str:
+    """Families by turns."""
+    return ORDER[index % len(ORDER)]
+
+
+def draw(seed: int, index: int, model: RobotModel) -> Trial:
+    """The run of a seed and an index; the same for the same two."""
+    rng, family = np.random.default_rng([seed, index]), family_of(index)
+    contact, margin = SHARES.get(family, OTHER_SHARES)
+    wish = rng.random()
+    for _ in range(60):
+        draft = FAMILIES[family](rng)
+        arm = TrueArm(model, draft.tool)
+        everywhere = draw_cameras(rng)
+        motion = draw_motion(rng, model, arm, everywhere)
+        cameras = tuple(camera for camera in everywhere if camera.name in draft.cameras)
+        if wish < contact:
+            clearance = -float(rng.uniform(0.001, 0.025))
+        else:
+            clearance = float(rng.uniform(0.0, 0.02) if wish < contact + margin else rng.uniform(0.045, 0.15))
+        second = draft.second if draft.second is not None else float(rng.uniform(1.2, 2.7))
+        if draft.carried is not None:
+            targets: Made = (_carried(draft, motion, model),)
+        else:
+            found = placed(rng, draft.make, motion, arm, cameras, clearance=clearance, second=second)
+            start = motion.at(0.0)[0][None]
+            if found is None or (
+                not draft.touches_first and arm.clearances(found, np.array([at_s(0.0)]), start)[0] < 0.04
+            ):
+                continue
+            targets = found
+        world = World(
+            motion=motion,
+            things=draw_things(rng, motion, arm),
+            targets=targets,
+            cameras=tuple(_zoomed(camera, draft.zoom) for camera in cameras),
+            tool=draft.tool,
+            people=draft.people,
+        )
+        mode = MODES[int(rng.random() < CLOSED_SHARE and not draft.only_audit)]
+        return Trial(seed=seed, index=index, family=family, draft=draft, world=world, mode=mode)
+    raise RuntimeError(f"{seed}/{index}: no scene found")
+
+
+def run(seed: int, index: int) -> Row:
+    """Draw, record, judge, compare."""
+    with TemporaryDirectory(prefix="hunt") as name:
+        folder = Path(name)
+        model = true_robot(folder)
+        trial = draw(seed, index, model)
+        arm = TrueArm(model, trial.world.tool)
+        shown = record(trial, model, folder)
+        evidence = _evidence(trial, arm, shown)
+        outcome, result = _judged(trial, folder)
+        clearance = _true_clearance(trial, arm, result)
+    return Row(
+        seed=seed,
+        index=index,
+        family=trial.family,
+        kind=trial.draft.kind,
+        strength=trial.draft.strength,
+        mode=trial.mode,
+        outcome=outcome.word,
+        clearance=clearance,
+        observable=evidence.holds,
+        rule=evidence.rule,
+        reason=outcome.reason,
+    )
+
+
+def true_robot(folder: Path) -> RobotModel:
+    """The arm as it is, its files written to a folder."""
+    urdf, spheres = folder / "true.urdf", folder / "true.yaml"
+    urdf.write_text(arm_urdf(), encoding="utf-8")
+    spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
+    return RobotModel.from_urdf(urdf, spheres)
+
+
+def record(trial: Trial, model: RobotModel, folder: Path) -> Shown:
+    """Write what the tool is given: log.mcap, robot.urdf, robot.yaml."""
+    fault, rng = trial.draft.fault, np.random.default_rng([trial.seed, trial.index, 1])
+    (folder / "robot.urdf").write_text(fault.urdf(), encoding="utf-8")
+    (folder / "robot.yaml").write_text(spheres_yaml(fault.spheres(rng)), encoding="utf-8")
+    recorder = Recorder(trial.world, fault, model, (trial.seed, trial.index, 2))
+    return recorder.write(folder / "log.mcap")
+
+
+def config_of(trial: Trial) -> Config:
+    """The defaults, with fewer iterations than a person would use, for the small images of these runs."""
+    config = Config()
+    splats = trial.draft.fault.max_splats or SPLATS
+    scene = replace(
+        config.scene,
+        max_splats=splats,
+        first_iterations=50,
+        iterations_per_step=8,
+        window=4,
+        checkpoint_period=86400.0,
+    )
+    control = replace(config.control, solver="daqp", pose_gain=4.0, max_time=DURATION_S)
+    return replace(config, scene=scene, control=control)
+
+
+def _judged(trial: Trial, folder: Path) -> tuple[Word, ReplayResult | None]:
+    """The chain's own word; None beside a refusal."""
+    config, log, robot = config_of(trial), folder / "log.mcap", (folder / "robot.urdf", folder / "robot.yaml")
+    try:
+        with _quick():
+            reconstruct(
+                ReconstructRequest(
+                    source=open_source(log),
+                    out=folder / "scene",
+                    config=config,
+                    urdf=robot[0],
+                    spheres=robot[1],
+                    box=BOX,
+                    threads=1,
+                )
+            )
+            request = ReplayRequest(
+                log=log,
+                urdf=robot[0],
+                spheres=robot[1],
+                out=folder / "replay",
+                config=config,
+                options=SourceOptions(),
+                scene=folder / "scene",
+                latency=trial.draft.fault.latency,
+                mode=trial.mode,
+                worst_frames=0,
+                threads=1,
+            )
+            result = replay(request)
+        return word_of(result.verdict), result
+    except SplatCtrlError as error:
+        return refused(error), None
+
+
+def _true_clearance(trial: Trial, arm: TrueArm, result: ReplayResult | None) -> float:
+    """The least clearance [m] over the judged motion: of an audit from the first judged state to the log's end, of a
+    closed loop over what it drove; over the recorded motion where nothing was judged.
+    """
+    first, last = at_s(0.0), at_s(DURATION_S)
+    positions: Positions = trial.world.positions
+    if result is not None:
+        stamps = np.asarray(result.replay.audit.stamp_ns, dtype=np.int64)
+        first = int(stamps[0])
+        if trial.mode == "closed-loop":
+            last = int(stamps[-1])
+            positions = interpolated(stamps, trial.draft.fault.true_of(np.asarray(result.replay.audit.position)))
+    return least_clearance(arm, trial.world.primitives, positions, first, max(first, last))[0]
+
+
+def _evidence(trial: Trial, arm: TrueArm, shown: Shown) -> Observable:
+    world = trial.world
+    _, least_ns = least_clearance(arm, world.targets, world.positions, at_s(0.0), at_s(DURATION_S))
+    stamps = shown.stamps.astype(np.int64)
+    return observable(
+        trial.draft,
+        world,
+        shown,
+        frame_clearance=arm.clearances(world.targets, stamps, world.positions(stamps)),
+        least_ns=least_ns,
+        is_audit=trial.mode == "audit",
+    )
+
+
+def _carried(draft: Draft, motion: Motion, model: RobotModel) -> Primitive:
+    """The target in the hand, 3 mm into the palm, along the hand's z axis."""
+    assert draft.carried is not None
+    radius, length = draft.carried
+    (solid,) = draft.make(np.zeros(3))
+    seconds = np.arange(0.0, DURATION_S + 0.02, 0.02)
+    T_hand_target = np.eye(4)
+    T_hand_target[2, 3] = 0.066 + radius + length / 2 - 0.003
+    poses = np.array([model.frame_pose(motion.at(float(s))[0], "hand") @ T_hand_target for s in seconds])
+    track = Track(stamp_ns=np.array([at_s(float(s)) for s in seconds]), T_world_shape=poses)
+    return replace(solid, T_world_shape=poses[0], track=track)
+
+
+def _zoomed(camera: Camera, zoom: float) -> Camera:
+    k = camera.intrinsics
+    return replace(
+        camera,
+        intrinsics=Intrinsics(fx=zoom * k.fx, fy=zoom * k.fy, cx=k.cx, cy=k.cy, width=k.width, height=k.height),
+    )
+
+
+@contextmanager
+def _quick() -> Iterator[None]:
+    """Replays without their plots, which nobody looks at, and with the coverage of a robot measured once."""
+    with (
+        patch.object(replay_files, "draw_replay", lambda *args, **kwargs: None),
+        patch.object(replay_robot, "coverage_deficit", _coverage),
+    ):
+        yield
+
+
+def _coverage(urdf: UrdfFile, spheres: SphereSet, **options: object) -> CoverageReport:
+    key = (urdf.text, spheres.links, spheres.centers.tobytes(), spheres.radii.tobytes())
+    if key not in _COVERAGES:
+        _COVERAGES.clear()
+        _COVERAGES[key] = coverage_deficit(urdf, spheres, **options)  # type: ignore[arg-type]
+    return _COVERAGES[key]
