@@ -462,8 +462,8 @@ def _controller(judged: Judged) -> Iterator[Reason]:
 def _map_error(judged: Judged) -> Iterator[Reason]:
     """What the map itself may miss, as held-out depth bounds it: surface clearance less the bound is at least 0.
 
-    A smaller clearance is no contact that was seen, but one that the map cannot exclude: not evaluable, unless another
-    measure fails. So is evidence that is too little for a bound.
+    A smaller clearance is no contact that was seen, but one that the map cannot exclude: not evaluable, unless
+    another measure fails. So is evidence that is too little for a bound.
     """
     found, surface = judged.replay.map_error, _least(judged.replay.between["surface"])
     if found is None:
