@@ -15,7 +15,7 @@ from itertools import islice
 import numpy as np
 
 from splatctrl_cli.config.motion import VerdictConfig
-from splatctrl_cli.control.audit import DistanceFunction
+from splatctrl_cli.control.audit import DistanceFunction, Stamps
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
@@ -25,7 +25,6 @@ from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.rows import ranges
 from splatctrl_cli.io.scene_folder import open_scene
 from splatctrl_cli.io.state_source import open_states
-from splatctrl_cli.jobs.known_scene import KnownScene
 from splatctrl_cli.jobs.reconstruction import training_cameras
 from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay_store import StoredAudit
@@ -161,39 +160,63 @@ def open_evidence(request: ReplayRequest, model: RobotModel) -> Evidence | None:
 
 
 def map_error(evidence: Evidence, inputs: ReplayInputs, audit: StoredAudit, config: VerdictConfig) -> MapError:
-    """How far the map, as it was known at each held-out frame set within the judged time, misses what that shows near
-    the judged motion.
-    """
-    swept = Swept.of(inputs.model, audit, config.evidence_reach)
-    first_ns, last_ns = int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
-    motion, stamps, misses, places, num_points = inputs.motion(), [], [], [], 0
-    for step in evidence.frame_sets():
-        if not first_ns <= step.stamp_ns <= last_ns:
-            continue
-        points = [
-            apart_from_robot(inputs.model, motion.at(frame.stamp_ns)[0], swept.near(surface_points(frame)))
-            for frame in step.frames
-        ]
-        miss, place = largest_miss(np.concatenate(points), _exact(inputs.scene, step.stamp_ns))
-        stamps.append(step.stamp_ns)
-        misses.append(miss)
-        places.append(place)
-        num_points += sum(len(part) for part in points)
-    bound = conformal_bound(np.array(misses, dtype=np.float64), config.confidence)
-    found = MapError(
+    """How far the map misses what the held-out frame sets within the judged time show near the judged motion."""
+    found = misses_of(evidence.frame_sets(), inputs, audit, config.evidence_reach)
+    bound = conformal_bound(found.distance, config.confidence)
+    error = MapError(
         source=evidence.name,
-        num_sets=len(stamps),
-        num_seen=int(np.isfinite(misses).sum()),
-        num_points=num_points,
+        num_sets=len(found.stamp_ns),
+        num_seen=int(np.isfinite(found.distance).sum()),
+        num_points=found.num_points,
         bound=None,
     )
     if bound is None:
-        return found
+        return error
+    x, y, z = (float(value) for value in found.place[bound.at])
     return replace(
-        found,
+        error,
         bound=replace(bound, bound=max(bound.bound, 0.0)),
-        time_s=(stamps[bound.at] - first_ns) * 1e-9,
-        place=places[bound.at],
+        time_s=float(found.stamp_ns[bound.at] - audit.stamp_ns[0]) * 1e-9,
+        place=(x, y, z),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misses:
+    """Of T frame sets: stamp_ns (T,), the largest miss distance (T,) [m], NaN where none of its points counts, and
+    its place (T, 3) [m]; num_points that count in all.
+    """
+
+    stamp_ns: Stamps
+    distance: Float64
+    place: Float64
+    num_points: int
+
+
+def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
+    """The largest miss of the map, as it was known at each frame set within the audited time, on surface within
+    `reach` [m] of the audited motion that is not the robot. One set is held at a time.
+    """
+    swept = Swept.of(inputs.model, audit, reach)
+    motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
+    stamps: list[int] = []
+    worst: list[Float64] = []
+    num_points = 0
+    for step in frame_sets:
+        if not first_ns <= step.stamp_ns <= last_ns:
+            continue
+        points = np.concatenate(
+            [
+                apart_from_robot(inputs.model, motion.at(frame.stamp_ns)[0], swept.near(surface_points(frame)))
+                for frame in step.frames
+            ]
+        )
+        stamps.append(step.stamp_ns)
+        worst.append(largest_miss(points, inputs.scene.at(step.stamp_ns).distances["exact"]))
+        num_points += len(points)
+    rows = np.array(worst).reshape(-1, 4)
+    return Misses(
+        stamp_ns=np.array(stamps, dtype=np.int64), distance=rows[:, 0], place=rows[:, 1:], num_points=num_points
     )
 
 
@@ -216,14 +239,13 @@ def apart_from_robot(model: RobotModel, q: Float64, points: Float64) -> Float64:
     return points[body.query(points)[0] > ROBOT_MARGIN]
 
 
-def largest_miss(points: Float64, distance: DistanceFunction) -> tuple[float, tuple[float, float, float]]:
-    """The largest distance [m] of points (Q, 3) to the map, and where; NaN without a point."""
+def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
+    """(4,) the largest distance [m] of points (Q, 3) to the map, and the point; NaN without points."""
     if not len(points):
-        return np.nan, (np.nan, np.nan, np.nan)
+        return np.full(4, np.nan)
     values = distance(points)
     worst = int(np.argmax(values))
-    x, y, z = (float(value) for value in points[worst])
-    return float(values[worst]), (x, y, z)
+    return np.array([values[worst], *points[worst]])
 
 
 class Swept:
@@ -256,7 +278,3 @@ class Swept:
         """Those of points (Q, 3) [m] that are."""
         inside = points[self._box.contains(points)]
         return inside[self._field.query(inside)[0] <= self._reach] if len(inside) else inside
-
-
-def _exact(scene: KnownScene, stamp_ns: int) -> DistanceFunction:
-    return scene.at(stamp_ns).distances["exact"]

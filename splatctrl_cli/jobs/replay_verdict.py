@@ -480,15 +480,17 @@ def _map_error(judged: Judged) -> Iterator[Reason]:
             criterion="map error",
             outcome=Outcome.NOT_EVALUABLE,
             sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
-            "surface near the motion, too few for two stretches that are independent",
+            "surface near the motion, too few for two independent stretches",
             who=found.source,
             remedy="judge a longer motion, or name another camera; verdict.evidence_reach says how near",
             count=found.num_seen,
         )
         return
     value = found.bound.bound
-    if surface is None or surface >= value:
-        yield _passed("map error", _bound_words(found.bound), value, surface or 0.0, "m", found.num_points)
+    if surface is None:
+        return  # no distance at any state, which is said of them
+    if surface >= value:
+        yield _passed("map error", _bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
     yield Reason(
         criterion="map error",

@@ -1,4 +1,5 @@
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def test_stretches_are_apart_and_no_set_is_lost(num: int, length: int) -> None:
     assert found[-1] + 1 == max(len(expected), 1)
     for number, sets in enumerate(expected):
         assert (found[sets] == number).all()
-    for before, after in zip(expected, expected[1:], strict=False):
+    for before, after in pairwise(expected):
         assert after[0] - before[-1] == length
     assert (np.diff(found) >= 0).all() and (np.diff(found) <= 1).all()
 
