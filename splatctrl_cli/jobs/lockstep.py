@@ -214,7 +214,8 @@ def _open(request: ReplayRequest, model: "RobotModel") -> "ShotSource":
             f"{request.log}: --lockstep: expected cameras, got joint states alone",
             remedy="give --scene or --field of the same place",
         )
-    source = open_states(request.log, training_options(request, source.cameras), model.joint_names)
+    if request.evidence in source.cameras:
+        source = open_states(request.log, training_options(request, source.cameras), model.joint_names)
     if not isinstance(source, RosLogSource | CaptureSource):
         raise UsageError(f"{request.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
     return source

@@ -122,8 +122,6 @@ def training_options(request: ReplayRequest, cameras: tuple[str, ...]) -> Source
     """How a lockstep reads the log: of its cameras without the one that is evidence. Raises UsageError where that is
     the only one.
     """
-    if request.evidence not in cameras:
-        return request.options
     others = tuple(camera for camera in cameras if camera != request.evidence)
     if not others:
         raise UsageError(
