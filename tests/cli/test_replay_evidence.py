@@ -17,7 +17,7 @@ from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.jobs import replay_evidence
 from splatctrl_cli.jobs.lockstep import from_log
 from splatctrl_cli.jobs.progress import SILENT
-from splatctrl_cli.jobs.replay_evidence import held_out, open_evidence, trained
+from splatctrl_cli.jobs.replay_evidence import apart_from_robot, held_out, open_evidence, trained
 from splatctrl_cli.jobs.replay_request import ReplayRequest
 from splatctrl_cli.records import Float64, Intrinsics, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
@@ -189,6 +189,30 @@ def test_pixels_at_an_edge_of_depth_are_left_out(desk: Desk, scene: list[str]) -
     assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
     assert desk.metrics()["map_error_bound"] == pytest.approx(0.004, abs=1e-4)
     assert reason(desk)["count"] == 11 * SIZE[1] * (SIZE[0] - 3)
+
+
+def test_the_largest_miss_of_a_view_counts_and_a_map_that_is_too_fat_misses_nothing(
+    desk: Desk, scene: list[str]
+) -> None:
+    depth = np.full(SIZE[::-1], 1.0 - BALL[1] + 0.002)  # within the ball
+    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
+    assert desk.replay(*scene, "--evidence", "cam9", is_judged=True) == 0
+    assert desk.metrics()["map_error_bound"] == 0.0
+    depth[4, 5] = 1.0 - BALL[1] - 0.013
+    desk.source = FilmedSource(states=logged(), frames=[view(k * SECOND // 10, depth) for k in range(11)])
+    assert desk.replay(*scene, "--evidence", "cam9", out="one", is_judged=True) == 0
+    assert desk.metrics("one")["map_error_bound"] == pytest.approx(0.013, abs=1e-4)
+
+
+def test_what_spheres_leave_of_the_robot_uncovered_is_the_robot_as_well(
+    arm: RobotModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    centers, radii = arm.sphere_centers(START), arm.sphere_set.radii
+    top = int(np.argmax(centers[:, 2] + radii))
+    points = centers[top] + np.array([[0, 0, radii[top] + gap] for gap in (0.0, 0.02, 0.04, 0.14)])
+    assert len(apart_from_robot(arm, START, points)) == 2
+    monkeypatch.setattr(arm, "sphere_deficit", np.full(len(radii), 0.1))
+    np.testing.assert_array_equal(apart_from_robot(arm, START, points), points[3:])
 
 
 @pytest.mark.parametrize(
