@@ -10,6 +10,7 @@ from splatctrl_cli.cli.replay_options import (
     MODES,
     POSE,
     add_baseline,
+    add_evidence,
     add_goal,
     add_golden,
     add_lockstep,
@@ -66,6 +67,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="S",
         help="a scene older than this is no evidence (default: 1)",
     )
+    add_evidence(parser)
     add_golden(parser)
     add_baseline(parser)
     add_worst_frames(parser)

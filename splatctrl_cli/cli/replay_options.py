@@ -40,6 +40,7 @@ def replay_request(args: argparse.Namespace) -> "ReplayRequest":
             "twist_frame",
         ),
         *("start_time", "re_anchor", "truth", "max_unknown", "max_map_age", "golden", "golden_tolerance", "zone"),
+        *("evidence", "require_evidence"),
         *("zone_box", "worst_frames", "declare", "force", "seed", "threads"),
     )
     return ReplayRequest(
@@ -70,6 +71,21 @@ def add_lockstep(parser: argparse.ArgumentParser, scene: argparse._ActionsContai
         help="a map is known this long after its frames' stamp (--scene, --lockstep; default: 0)",
     )
     add_disagreement(parser.add_argument_group("with --lockstep"))
+
+
+def add_evidence(parser: argparse.ArgumentParser) -> None:
+    """``--evidence`` and ``--require-evidence``."""
+    parser.add_argument(
+        "--evidence",
+        metavar="CAMERA|K",
+        help="bound the map's error by the depth of a camera of LOG that did not train it, or (--lockstep) of every "
+        "K-th frame set, which then does not",
+    )
+    parser.add_argument(
+        "--require-evidence",
+        action="store_true",
+        help="a replay whose map error nothing bounds cannot be evaluated (exit 5)",
+    )
 
 
 def add_baseline(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ from splatctrl_cli.jobs.replay_modes import Replay
 
 HEADLINE = (
     *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),
-    *("max_velocity_share", "unknown_share", "max_map_age_s", "goal_reached", "duration_s"),
+    *("max_velocity_share", "unknown_share", "max_map_age_s", "map_error_bound", "goal_reached", "duration_s"),
 )
 
 

@@ -174,6 +174,9 @@ class VerdictConfig(Section, section="verdict"):
     confidence: Annotated[
         float, Within(0.5, 0.999999, "", "of the bound on the map's error, where there are enough blocks for it")
     ] = 0.99
+    evidence_reach: Annotated[
+        float, Within(0.001, 10, "m", "from the moving spheres within which held-out surface is evidence of the map")
+    ] = 0.1
     unjudged: Annotated[
         float, Within(0, 1, "", "share of the requested time that may go unjudged; more cannot be evaluated")
     ] = 0.0

@@ -128,7 +128,7 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
         is_chosen = frame.depth > 0
         if counted is not None:
             is_chosen &= counted[index]
-        is_edge = _edges(frame.depth)
+        is_edge = depth_edges(frame.depth)
         num_edges += int(np.count_nonzero(is_chosen & is_edge))
         here = back_project(frame.intrinsics, frame.depth)[is_chosen & ~is_edge]
         points_world = transform_points(frame.T_world_camera, here)
@@ -137,7 +137,7 @@ def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: 
     return np.concatenate(points), np.concatenate(eyes), num_edges
 
 
-def _edges(depth: NDArray[np.float32]) -> Bool:
+def depth_edges(depth: NDArray[np.float32]) -> Bool:
     """(H, W) True where a measured neighbour's depth differs by more than a share of the pixel's own."""
     is_edge = np.zeros(depth.shape, dtype=np.bool_)
     for axis in (0, 1):

@@ -28,6 +28,7 @@ from splatctrl_cli.jobs.known_scene import (
 )
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruct import check_pose_jumps
+from splatctrl_cli.jobs.replay_evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP, ReplayRequest
 from splatctrl_cli.records import Float64, KnownVoxels, UInt8
 from splatctrl_cli.robot.declared import Declarations
@@ -101,7 +102,14 @@ def from_log(
         allow_disagreement=request.allow_disagreement,
         declared=declared,
     )
-    lockstep = Lockstep(fitted, config, _latency_ns(request), console, ends_with_log=request.mode != "closed-loop")
+    lockstep = Lockstep(
+        fitted,
+        config,
+        _latency_ns(request),
+        console,
+        ends_with_log=request.mode != "closed-loop",
+        held_out_every=every_of(request.evidence),
+    )
     return lockstep.scene()
 
 
@@ -109,6 +117,7 @@ class Lockstep:
     """Frame sets that wait, and the stamps and files of the maps after those that were taken in.
 
     ends_with_log: known space is that of the whole log, else that of the frame sets that the replay passed.
+    held_out_every: of so many frame sets one is not taken in, as it is evidence of the map's error.
     """
 
     def __init__(
@@ -119,12 +128,14 @@ class Lockstep:
         console: Progress,
         *,
         ends_with_log: bool,
+        held_out_every: int | None = None,
     ) -> None:
 
         self._fitted, self._config, self._console = fitted, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
         self._stopwatch = Stopwatch()
-        self._steps = fitted.time_steps()
+        self._held_out_every = held_out_every
+        self._steps = trained(fitted.time_steps(), held_out_every)
         self._next = next(self._steps, None)
         self._stamps_ns: list[int] = []
         self._files: list[Path] = []
@@ -208,7 +219,7 @@ class Lockstep:
             command="replay",
             config=self._config.as_dict(),
             inputs=fitted.source.digests(),
-            metrics=fitted.metrics(),
+            metrics=fitted.metrics() | {EVERY: self._held_out_every},
             stopwatch=self._stopwatch,
             seed=fitted.seed,
         )
@@ -225,6 +236,8 @@ def _open(request: ReplayRequest, model: "RobotModel") -> "ShotSource":
             f"{request.log}: --lockstep: expected cameras, got joint states alone",
             remedy="give --scene or --field of the same place",
         )
+    if request.evidence in source.cameras:
+        source = open_states(request.log, training_options(request, source.cameras), model.joint_names)
     if not isinstance(source, RosLogSource | CaptureSource):
         raise UsageError(f"{request.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
     return source

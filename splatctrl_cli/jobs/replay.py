@@ -1,6 +1,6 @@
 """A replay from its request to its result: read, replay, measure, write."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError
@@ -13,6 +13,7 @@ from splatctrl_cli.jobs.lockstep import check_lockstep, opened_scene
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import declarations_of
 from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone
+from splatctrl_cli.jobs.replay_evidence import Evidence, check_evidence, map_error, open_evidence
 from splatctrl_cli.jobs.replay_files import write_replay
 from splatctrl_cli.jobs.replay_goal import check_goal
 from splatctrl_cli.jobs.replay_golden import read_golden
@@ -57,13 +58,16 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
     golden = read_golden(request)
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         with stopwatch.stage("read"):
-            inputs, logged = _read(request, folder, progress)
+            inputs, logged, evidence = _read(request, folder, progress)
         for doubt in doubts_of(request, inputs.model, config.control):
             progress.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
             found = replayed(request, inputs, config, progress)
         with stopwatch.stage("truth"):
             found = with_truth(inputs, found)
+        if evidence is not None:
+            with stopwatch.stage("evidence"):
+                found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
         inputs.scene.finish()
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
@@ -97,17 +101,21 @@ def check_request(request: ReplayRequest) -> None:
     check_gate_names(request.require, names[request.mode], {f"--mode {mode}": names[mode] for mode in names})
     read_zone(request)
     check_lockstep(request)
+    check_evidence(request)
     check_twists(request)
     check_goal(request)
 
 
-def _read(request: ReplayRequest, folder: Path, progress: Progress) -> tuple[ReplayInputs, LoggedStates]:
+def _read(
+    request: ReplayRequest, folder: Path, progress: Progress
+) -> tuple[ReplayInputs, LoggedStates, Evidence | None]:
     model = read_robot(request, request.config.control)
     truth = None if request.truth is None else load_truth(request.truth)
     logged = read_states(request, model)
     if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
         raise InputError(other.sentence, remedy=other.remedy)
     declared = declarations_of(request.declare, model)
+    evidence = open_evidence(request, model)
     scene = opened_scene(request, request.config, model, declared, folder, progress)
     source = logged.source
     given = (request.urdf, request.spheres, request.srdf, request.truth, request.declare)
@@ -123,7 +131,7 @@ def _read(request: ReplayRequest, folder: Path, progress: Progress) -> tuple[Rep
         mismatches=_mismatches(request, logged, model),
         declared=declared,
     )
-    return inputs, logged
+    return inputs, logged, evidence
 
 
 def _mismatches(request: ReplayRequest, logged: LoggedStates, model: RobotModel) -> tuple[Mismatch, ...]:

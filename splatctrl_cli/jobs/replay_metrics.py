@@ -32,6 +32,7 @@ _TAIL = (
     *("max_velocity_share", "max_acceleration_share", "min_clearance_surface", "min_clearance_between", "unjudged_s"),
     *("min_clearance_splats", "max_unseen_share", "max_evidence_age_s"),
     *("unknown_share", "num_without_distance", "num_static_violations", "max_map_age_s"),
+    *("map_error_bound", "map_error_blocks", "map_error_confidence"),
 )
 _STEPS = (
     *("intervention_share", "intervention_share_scene", "intervention_share_self", "intervention_share_limit"),
@@ -101,6 +102,7 @@ def metrics_of(replay: "Replay") -> Metrics:
         "num_without_distance": int(np.sum(_is_blank(replay))),
         "num_static_violations": len(replay.static_violations),
         "max_map_age_s": _largest(np.asarray(replay.map_age_s)),
+        **_map_error(replay),
     }
     if replay.kept_steps is not None:
         metrics |= _step_metrics(replay, replay.kept_steps.figures)
@@ -122,6 +124,16 @@ def metrics_of(replay: "Replay") -> Metrics:
         metrics[f"truth_share_within_{name}"] = agreement.share_within
         metrics["truth_tolerance"] = agreement.tolerance
     return metrics
+
+
+def _map_error(replay: "Replay") -> Metrics:
+    """By held-out depth; None without, or where that is too little."""
+    bound = None if replay.map_error is None else replay.map_error.bound
+    return {
+        "map_error_bound": None if bound is None else bound.bound,
+        "map_error_blocks": None if bound is None else bound.num_stretches,
+        "map_error_confidence": None if bound is None else bound.confidence,
+    }
 
 
 def first_time(replay: "Replay", metric: str, holds: Callable[[float], bool]) -> float | None:

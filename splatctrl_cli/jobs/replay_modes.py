@@ -25,6 +25,7 @@ from splatctrl_cli.io.state_columns import StateColumns
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone, separations
 from splatctrl_cli.jobs.replay_compare import Comparison, compared, planned_ways_out
+from splatctrl_cli.jobs.replay_evidence import MapError
 from splatctrl_cli.jobs.replay_goal import goal_waypoints
 from splatctrl_cli.jobs.replay_record import ReplayRecord
 from splatctrl_cli.jobs.replay_request import FIRST_MAP, ReplayInputs, ReplayRequest
@@ -52,8 +53,8 @@ class Replay:
     num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
     the first state in the log [s]; between, near, strain and statics: as `ReplayRecord` has them; obstacles (T,):
     what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps: of a controller;
-    separations: with a standstill the distances from people, by name of the motion, sampled at `period` [s];
-    comparison: every motion of --baseline and its figures.
+    map_error: where the request names evidence of it; separations: with a standstill the distances from people, by
+    name of the motion, sampled at `period` [s]; comparison: every motion of --baseline and its figures.
     """
 
     model: "RobotModel"
@@ -80,6 +81,7 @@ class Replay:
     separations: "Mapping[str, Separation]" = field(default_factory=dict)
     comparison: Comparison = field(default_factory=Comparison)
     twist_figures: "Mapping[str, float | None]" = field(default_factory=dict)
+    map_error: MapError | None = None
     period: float = 0.0
 
     @property

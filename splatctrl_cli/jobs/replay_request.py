@@ -28,7 +28,9 @@ class ReplayRequest:
     log: a log or capture with joint states, read as `options` say. One of `scene` (a reconstruction), `field` (a
     baked grid) and `lockstep` (reconstruct the log on the way) says what is known of the scene. base: pose of the
     URDF's root in world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves. Times in
-    seconds; start_time may be FIRST_MAP. report_only: the verdict alone does not set the exit code.
+    seconds; start_time may be FIRST_MAP. evidence: a camera, or every how many frame sets, that did not train the
+    scene and bounds its error; with require_evidence no verdict passes without. report_only: the verdict alone does
+    not set the exit code.
     """
 
     log: Path
@@ -60,6 +62,8 @@ class ReplayRequest:
     truth: Path | None = None
     max_unknown: float = 0.05
     max_map_age: float = 1.0
+    evidence: str | None = None
+    require_evidence: bool = False
     golden: Path | None = None
     golden_tolerance: float = 1e-6
     baseline: tuple[str, ...] = ()

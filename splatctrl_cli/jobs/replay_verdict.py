@@ -7,6 +7,7 @@ import numpy as np
 
 from splatctrl_cli.control.explain import Event, EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
+from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.jobs.replay_golden import Golden, golden_reason
@@ -525,6 +526,56 @@ def _controller(judged: Judged) -> Iterator[Reason]:
     )
 
 
+def _map_error(judged: Judged) -> Iterator[Reason]:
+    """What the map itself may miss, as held-out depth bounds it: surface clearance less the bound is at least 0.
+
+    A smaller clearance is no contact that was seen, but one that the map cannot exclude: not evaluable, unless
+    another measure fails. So is evidence that is too little for a bound.
+    """
+    found, surface = judged.replay.map_error, _least(judged.replay.between["surface"])
+    if found is None:
+        if judged.request.require_evidence:
+            yield Reason(
+                criterion="map error",
+                outcome=Outcome.NOT_EVALUABLE,
+                sentence="not measured",
+                remedy="give --evidence a camera that did not train the map",
+            )
+        return
+    if found.bound is None:
+        yield Reason(
+            criterion="map error",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
+            "surface near the motion, too few for two independent stretches",
+            who=found.source,
+            remedy="judge a longer motion, or name another camera; verdict.evidence_reach says how near",
+            count=found.num_seen,
+        )
+        return
+    value = found.bound.bound
+    if surface is None:
+        return  # no distance at any state, which is said of them
+    if surface >= value:
+        yield _passed("map error", _bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
+        return
+    yield Reason(
+        criterion="map error",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"the map may miss surface by {_mm(value)} ({_bound_words(found.bound)}), and keeps {_mm(surface)}; "
+        "it missed so much",
+        value=surface - value,
+        threshold=0.0,
+        unit="m",
+        time_s=found.time_s,
+        place=found.place,
+        who=found.source,
+        cause="" if found.place is None else "at ({:.2f}, {:.2f}, {:.2f}) m".format(*found.place),
+        remedy="a map that misses less needs more cameras, newer frames or a larger --max-splats",
+        count=found.num_points,
+    )
+
+
 def _clocks(judged: Judged) -> Iterator[Reason]:
     """The cameras' clock against the robot's."""
     clock = judged.logged.clock
@@ -593,6 +644,7 @@ CRITERIA = (
     _limits,
     _controller,
     _surface,
+    _map_error,
     _evidence,
     _calibration,
     _unjudged,
@@ -604,7 +656,8 @@ CRITERIA = (
 
 
 def _notes(judged: Judged) -> tuple[str, ...]:
-    notes = ["map error not measured"]
+    found = judged.replay.map_error
+    notes = ["map error not measured"] if found is None or found.bound is None else [_bound_words(found.bound)]
     close = [name for name, (first, _) in judged.replay.statics.items() if first < judged.threshold]
     if close:
         notes.append(f"{len(close)} fixed spheres stand within the margin of their surroundings")
@@ -630,6 +683,14 @@ def _declared_notes(judged: Judged) -> list[str]:
         is_used = declared.num_uses.get(("carried", index)) or not judged.request.lockstep
         notes.append(f"{carried.link} carries a box" + ("" if is_used else ": warning: no pixel needed it"))
     return notes
+
+
+def _bound_words(bound: ConformalBound) -> str:
+    """The bound on the map's error, and what it rests on."""
+    return (
+        f"map error at most {_mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
+        f"{bound.num_stretches} stretches of held-out depth"
+    )
 
 
 def _bare_moving_links(judged: Judged) -> list[str]:

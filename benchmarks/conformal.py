@@ -1,0 +1,295 @@
+"""`python -m benchmarks.conformal --scenes N`: the bound on a map's error beside the truth, on random tables.
+
+Each seed is a table with random things, an arm that crosses it, and (every other seed) a thing that appears and
+leaves; three cameras train in lockstep and the fourth is evidence. Two questions are asked of each scene.
+
+A further stretch: one stretch of held-out sets is drawn and left out, the bound is made of the others, and what the
+map then misses of the true surface (the same views without noise) is held against it. That is what is promised.
+
+The arm: is the map's clearance less the bound, made of all stretches, a lower bound of the true clearance, at every
+state that is truly nearer than `verdict.evidence_reach`? That is what the verdict makes of it; it asks about surface
+that the held-out camera does not see as well, which nobody promises.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.cli.common import table
+from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.evaluate.conformal import FEWEST, autocorrelation_time, conformal_rank, stretch_scores, stretches
+from splatctrl_cli.io.mcap_writer import mcap_log
+from splatctrl_cli.io.options import SourceOptions
+from splatctrl_cli.jobs.lockstep import from_log
+from splatctrl_cli.jobs.progress import SILENT
+from splatctrl_cli.jobs.replay_evidence import Misses, misses_of
+from splatctrl_cli.jobs.replay_record import ReplayRecord
+from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replay_states import read_states
+from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.time_steps import TimeStep
+from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.random_tabletop import random_things
+from splatctrl_cli.simulate.recording import NOISES, START_NS, Recording, RecordingOptions
+from splatctrl_cli.simulate.tabletop import WAYPOINTS
+from splatctrl_cli.simulate.truth import distance_to
+
+EVIDENCE = "cam3"
+TRAINING = ("cam0", "cam1", "cam2")
+SIZE = (80, 60)
+FPS, DURATION_S = 5.0, 8.0
+SETTINGS = ("scene.max_splats=5000", "scene.first_iterations=20", "scene.iterations_per_step=2")
+CLEAR = 0.01  # [m] at least between the moving arm and a thing
+GUESTS = 10**6  # added to a seed for the thing that visits
+ASKED = 0.5  # confidence for a further stretch, beside as much as the stretches allow: a single one allows it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One scene: `kind` still or visited; num_stretches of `length` sets. A further stretch was promised to be within
+    `bound` [m] with `promise` and is so or not; asked for as much as the stretches allow, `highest` and
+    highest_promise. least_margin [m]: the least of true clearance less (the map's less `full`, the bound of all
+    stretches with promise full_promise), inf where no state is near; seconds it took.
+    """
+
+    seed: int
+    kind: str
+    num_sets: int
+    num_stretches: int
+    length: int
+    bound: float
+    promise: float
+    further: float
+    highest: float
+    highest_promise: float
+    full: float
+    full_promise: float
+    least_margin: float
+    seconds: float
+
+
+class RandomRecording(Recording):
+    """Random things on the table instead of those of `tabletop`, and an arm that passes through its waypoints or near
+    them, in any order; on odd seeds one more thing for a third of the time. What the arm would meet is not there:
+    inside of things the field promises nothing, and the map is made of what lies outside of the robot.
+    """
+
+    def _scene(self) -> tuple[list[Primitive], list[Primitive], Motion]:
+        seed, span = self.options.seed, self.end_ns - self.start_ns
+        rng = np.random.default_rng([seed, 7])
+        order = rng.permutation(len(WAYPOINTS)).tolist()
+        waypoints = np.array([WAYPOINTS[k] for k in (*order, order[0])])
+        waypoints = waypoints + rng.uniform(-0.15, 0.15, waypoints.shape)
+        motion = Motion(times=np.linspace(0.06, 0.94, len(waypoints)) * self.options.duration_s, waypoints=waypoints)
+        centers = self.robot.sphere_centers_batch(
+            np.array([motion.at(t)[0] for t in np.linspace(0, self.options.duration_s, 200)])
+        )
+        radii = np.broadcast_to(self.robot.sphere_set.radii, centers.shape[:2]).ravel()
+
+        def is_clear(thing: Primitive) -> bool:
+            return float((distance_to([thing], centers.reshape(-1, 3), START_NS) - radii).min()) > CLEAR
+
+        first = START_NS + int(span * rng.uniform(0.2, 0.5))
+        there = (first, first + span // 3) if seed % 2 else (START_NS - 2, START_NS - 1)
+        guest = next(thing for thing in random_things(seed + GUESTS) if is_clear(thing))
+        visiting = replace(guest, name="visitor", from_ns=there[0], to_ns=there[1])
+        return [thing for thing in random_things(seed) if is_clear(thing)], [visiting], motion
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the scenes, and print the table; a line of JSON for each scene as well where a file is named."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.conformal", description=__doc__, allow_abbrev=False)
+    parser.add_argument("--scenes", type=int, default=20, metavar="N")
+    parser.add_argument("--seed", type=int, default=0, metavar="FIRST")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="add a line for each scene, and table all in it")
+    args = parser.parse_args(argv)
+    trials = [] if args.json is None or not args.json.exists() else read_trials(args.json)
+    for seed in range(args.seed, args.seed + args.scenes):
+        if any(trial.seed == seed for trial in trials):
+            continue
+        found = trial_of(seed)
+        trials += [] if found is None else [found]
+        if args.json is not None and found is not None:
+            with args.json.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(asdict(found)) + "\n")
+    print("\n".join(table_of(trials)))
+    print(
+        f"{args.scenes - len(trials)} more of {args.scenes} scenes make fewer than {FEWEST} stretches: not evaluable"
+    )
+    return 0
+
+
+def read_trials(path: Path) -> list[Trial]:
+    """The scenes that an earlier run wrote."""
+    return [Trial(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def trial_of(seed: int) -> Trial | None:
+    """One scene, None where its held-out sets make fewer than FEWEST stretches."""
+    start = time.process_time()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        recording, options = recorded(seed, folder), SourceOptions(cameras=TRAINING)
+        config = load_config(None, SETTINGS)
+        urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
+        model = RobotModel.from_urdf(urdf, spheres)
+        request = ReplayRequest(
+            log=folder / "log.mcap", urdf=urdf, spheres=spheres, out=folder, config=config, options=options, threads=1
+        )
+        states = read_states(request, model)
+        scene = from_log(request, config, model, folder, SILENT)
+        inputs = ReplayInputs(
+            source=states.source, states=states.states, model=model, scene=scene, truth=None, digests={}
+        )
+        record, over = audited(inputs, recording, config)
+        reach = config.verdict.evidence_reach
+        measured, exact = (misses_of(sets, inputs, record.audit, reach) for sets in evidence_of(recording))
+    return judged(seed, measured, exact, over, config.verdict.confidence, time.process_time() - start)
+
+
+def recorded(seed: int, folder: Path) -> RandomRecording:
+    """The recording of a seed, with its log and robot in a folder."""
+    urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
+    urdf.write_text(arm_urdf(), encoding="utf-8")
+    spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
+    options = RecordingOptions(duration_s=DURATION_S, fps=FPS, width=SIZE[0], height=SIZE[1], seed=seed, color_rays=0)
+    recording = RandomRecording(options, RobotModel.from_urdf(urdf, spheres))
+    with mcap_log(folder / "log.mcap") as log:
+        log.add_transforms(recording.start_ns, recording.static_transforms(), is_static=True)
+        states = list(recording.joint_states())
+        frames = [frame for step in frame_sets(recording, TRAINING) for frame in step.frames]
+        for record in sorted([*states, *frames], key=lambda record: record.stamp_ns):
+            if isinstance(record, JointState):
+                log.add_joint_state(record, recording.robot.joint_names)
+            else:
+                log.add_frame(record)
+    return recording
+
+
+def frame_sets(recording: RandomRecording, cameras: tuple[str, ...]) -> Iterator[TimeStep]:
+    """The frames of some cameras."""
+    for index in range(int(recording.options.duration_s * recording.options.fps)):
+        q = recording._motion.at(recording._offset_ns(index) / 1e9)[0]
+        yield TimeStep(frames=tuple(recording.frames_at(index, q, cameras)), position=None)
+
+
+def evidence_of(recording: RandomRecording) -> tuple[list[TimeStep], list[TimeStep]]:
+    """The held-out camera's frames, as measured and with exact depth."""
+    noise, seed = NOISES[recording.options.noise], recording.options.seed
+    assert noise is not None
+    options = RecordingOptions(**{**vars(recording.options), "noise": "none"})
+    exact = list(frame_sets(RandomRecording(options, recording.robot), (EVIDENCE,)))
+    measured = []
+    for index, step in enumerate(exact):
+        (frame,) = step.frames
+        depth = noise.applied(frame.depth, np.random.default_rng([seed, 3, index]))
+        measured.append(replace(step, frames=(replace(frame, depth=depth),)))
+    return measured, exact
+
+
+def audited(inputs: ReplayInputs, recording: RandomRecording, config: Config) -> tuple[ReplayRecord, Float64]:
+    """The audit of the logged states, and by how much (T,) [m] the map's clearance exceeds the truth at those that
+    are truly near, -inf at the others.
+    """
+    scene, states, model = inputs.scene, inputs.states, inputs.model
+    assert scene.first_ns is not None
+    first = int(np.searchsorted(states.stamp_ns, scene.first_ns))
+    record = ReplayRecord(model, scene, config=config, max_map_age=1.0)
+    moving = np.flatnonzero(model.moving_spheres)
+    radii, over = model.sphere_set.radii[moving], []
+    stamps = states.stamp_ns[first:]
+    for begin, end in record.blocks(stamps):
+        q = np.asarray(states.position[first + begin : first + end])
+        part = record.measured(stamps[begin:end], q, np.zeros_like(q))
+        centers = model.sphere_centers_batch(q)[:, moving]
+        for index, stamp in enumerate(stamps[begin:end].tolist()):
+            true = float((distance_to(recording.primitives, centers[index], stamp) - radii).min())
+            is_near = true < config.verdict.evidence_reach
+            over.append(float(part.clearance["exact"].distance[index]) - true if is_near else -np.inf)
+    return record, np.array(over)
+
+
+def judged(
+    seed: int, measured: Misses, exact: Misses, over: Float64, confidence: float, seconds: float
+) -> Trial | None:
+    """The two questions, of a scene's misses with and without noise."""
+    length = autocorrelation_time(measured.distance)
+    stretch = stretches(len(measured.distance), length)
+    scores, deciding = stretch_scores(measured.distance, stretch)
+    if len(scores) < FEWEST:
+        return None
+    drawn = int(np.random.default_rng([seed, 8]).integers(len(scores)))
+    core = np.flatnonzero(stretch == stretch[deciding[drawn]])[:length]
+    others = np.delete(scores, drawn)
+    return Trial(
+        seed=seed,
+        kind="visited" if seed % 2 else "still",
+        num_sets=len(stretch),
+        num_stretches=len(scores),
+        length=length,
+        bound=_bound(others, ASKED)[0],
+        promise=_bound(others, ASKED)[1],
+        further=float(np.nanmax(exact.distance[core])),
+        highest=_bound(others, confidence)[0],
+        highest_promise=_bound(others, confidence)[1],
+        full=_bound(scores, confidence)[0],
+        full_promise=_bound(scores, confidence)[1],
+        least_margin=_bound(scores, confidence)[0] - float(over.max(initial=-np.inf)),
+        seconds=seconds,
+    )
+
+
+def _bound(scores: Float64, confidence: float) -> tuple[float, float]:
+    """The bound [m], not below 0, and the confidence that the scores allow."""
+    allowed = min(confidence, len(scores) / (len(scores) + 1))
+    return max(float(np.sort(scores)[conformal_rank(len(scores), allowed) - 1]), 0.0), allowed
+
+
+def table_of(trials: Sequence[Trial]) -> list[str]:
+    """Coverage beside its promise, and the width, by kind and of all."""
+    rows = []
+    by_kind = sorted(trials, key=lambda trial: trial.kind)
+    groups = [(kind, list(group)) for kind, group in groupby(by_kind, key=lambda trial: trial.kind)]
+    for kind, group in [*groups, ("all", list(trials))]:
+        for what, promise, width, is_covered in (
+            ("a further stretch", "promise", "bound", lambda t: t.further <= t.bound),
+            ("a further stretch", "highest_promise", "highest", lambda t: t.further <= t.highest),
+            ("the arm", "full_promise", "full", lambda t: t.least_margin >= 0),
+        ):
+            promised = float(np.mean([getattr(trial, promise) for trial in group]))
+            covered = sum(is_covered(trial) for trial in group)
+            widths = 1e3 * np.array([getattr(trial, width) for trial in group])
+            share = covered / len(group)
+            spread = 1.96 * np.sqrt(share * (1 - share) / len(group))
+            rows.append(
+                (
+                    kind,
+                    what,
+                    len(group),
+                    f"{100 * promised:.1f}",
+                    f"{100 * share:.1f} +- {100 * spread:.1f}",
+                    f"{np.median(widths):.1f}",
+                    f"{np.percentile(widths, 90):.1f}",
+                )
+            )
+    head = ("scenes", "of", "number", "promised %", "covered %", "median mm", "90 % mm")
+    num = np.median([trial.num_stretches for trial in trials])
+    return [
+        *table(head, rows),
+        f"stretches: {num:g} in the median, of {np.median([t.length for t in trials]):g} sets;"
+        f" {np.median([t.seconds for t in trials]):.1f} s of one core a scene",
+    ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
