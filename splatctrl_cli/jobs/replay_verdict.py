@@ -125,7 +125,7 @@ def _by_source(judged: Judged, source: str, criterion: str) -> Iterator[Reason]:
     yield Reason(
         criterion=criterion,
         outcome=Outcome.FAILED,
-        sentence=f"{worst.worst_name} is {_mm(least)} {'deep in the scene' if least < 0 else 'from the scene'}, "
+        sentence=f"{worst.worst_name} is {_mm(abs(least))} {'deep in the scene' if least < 0 else 'from the scene'}, "
         f"margin {_mm(replay.margin)}, {states} states in {_counted(len(events), 'interval')}, worst",
         value=least,
         threshold=replay.margin,
