@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.records import Float64
 
 WINDOW = 0.05  # [s] over which a motion is averaged, so that an encoder's steps are not taken for speed
-ENCODER = 1e-3  # [rad or m] that positions may be off
+ENCODER = 1e-3  # [rad or m] that each position may be off
 Stamps = NDArray[np.int64]
 
 
@@ -47,15 +47,14 @@ class MotionLimits:
         for before in (last, np.minimum(last, np.searchsorted(all_stamps, stamps - window, "right") - 1)):
             has = np.flatnonzero(before >= 0)
             seconds = (stamps[has] - all_stamps[before[has]]) * 1e-9
-            moved = np.maximum(np.abs(positions[has] - everything[before[has]]) - ENCODER, 0.0)
+            moved = np.maximum(np.abs(positions[has] - everything[before[has]]) - 2 * ENCODER, 0.0)
             speed = moved / np.maximum(seconds, 1e-9)[:, None]
             share[has] = np.maximum(share[has], speed / self._velocity)
         sudden = np.zeros_like(share)
         if self._acceleration is not None:
             sudden = self._accelerations(stamps, all_stamps, everything) / self._acceleration
-        keep = all_stamps >= stamps[-1] - 3 * window
-        keep[-1] = True
-        self._stamps, self._positions = all_stamps[keep], everything[keep]
+        oldest = max(int(np.searchsorted(all_stamps, stamps[-1] - 2 * window, "right")) - 1, 0)
+        self._stamps, self._positions = all_stamps[oldest:], everything[oldest:]
         rows = np.arange(num)
         fastest, hardest = share.argmax(axis=1), sudden.argmax(axis=1)
         return Strain(

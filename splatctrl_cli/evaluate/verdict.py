@@ -125,7 +125,8 @@ def verdict_of(
         given = [nothing]
     ordered = sorted(given, key=lambda reason: _WORST_FIRST.index(reason.outcome))
     outcome = ordered[0].outcome
-    label = {Outcome.PASSED: passed, Outcome.FAILED: ordered[0].label or "failed"}.get(outcome, str(outcome))
+    failure = next((r.label for r in ordered if r.outcome is Outcome.FAILED and r.label), "failed")
+    label = {Outcome.PASSED: passed, Outcome.FAILED: failure}.get(outcome, str(outcome))
     return Verdict(
         command=command,
         outcome=outcome,

@@ -1,0 +1,83 @@
+"""What was known just outside of the arm, against a plain reference."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.near_space import EVERY_NS, NearSpace
+from splatctrl_cli.records import Float64
+from tests.control.fakes import PlanarArm
+from tests.reference.intervals import near_figures
+
+SECOND = 1_000_000_000
+FIRST, LATER = np.array([0.0, 0.0]), np.array([1.2, 0.6])
+
+
+def half_seen(points: Float64) -> NDArray[np.int64]:
+    """Above the plane z = 0 seen at 1 to 2 s by their x, below never."""
+    stamps = ((1.5 + 0.5 * points[:, 0]) * SECOND).astype(np.int64)
+    return np.where(points[:, 2] >= 0, stamps, -1)
+
+
+def test_figures_are_those_of_the_reference() -> None:
+    arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
+    first = space.look(0, FIRST, half_seen)
+    assert np.isnan(first.unseen)  # the arm was there from the start
+    found = space.look(5 * SECOND, LATER, half_seen)
+    unseen, age, num = near_figures(arm, LATER, FIRST, 0.03, half_seen, 5 * SECOND)
+    assert num > 60
+    assert (found.unseen, found.age) == (pytest.approx(unseen), pytest.approx(age))
+    assert 0.2 < found.unseen < 0.5 and 3 < found.age < 4
+
+
+@pytest.mark.parametrize(("stamp", "unseen"), [(-1, 1.0), (0, 0.0), (SECOND, 0.0)])
+def test_a_stamp_of_zero_is_seen_and_minus_one_never(stamp: int, unseen: float) -> None:
+    space = NearSpace(PlanarArm(), 0.03)
+    space.look(0, FIRST, lambda points: np.zeros(len(points), np.int64))
+    found = space.look(2 * SECOND, LATER, lambda points: np.full(len(points), stamp))
+    assert found.unseen == unseen
+    assert np.isnan(found.age) if stamp < 0 else found.age == pytest.approx(2 - stamp / SECOND)
+
+
+@pytest.mark.parametrize(("old", "age"), [(0.05, 1.0), (0.15, 9.0)])
+def test_the_age_is_that_of_nine_in_ten(old: float, age: float) -> None:
+    """A few points that nobody looks at any more say nothing, more of them do."""
+    space = NearSpace(PlanarArm(), 0.03)
+
+    def seen(points: Float64) -> NDArray[np.int64]:
+        stamps = np.full(len(points), 9 * SECOND, np.int64)
+        stamps[: round(old * len(points))] = SECOND
+        return stamps
+
+    assert space.look(10 * SECOND, FIRST, seen).age == pytest.approx(age)
+
+
+def test_points_that_are_not_outside_of_the_arm_are_not_asked_for() -> None:
+    arm = PlanarArm()
+    asked: list[Float64] = []
+    space = NearSpace(arm, 0.03)
+
+    def remember(points: Float64) -> NDArray[np.int64]:
+        asked.append(points)
+        return np.zeros(len(points), np.int64)
+
+    space.look(0, LATER, remember)
+    (points,) = asked
+    gap = np.linalg.norm(points[:, None] - arm.sphere_centers(LATER), axis=2) - arm.sphere_set.radii
+    assert gap.min() > 0.01 and (gap.min(axis=1) < 0.03 + 1e-12).all()
+
+
+def test_states_are_thinned_by_time_across_blocks() -> None:
+    space = NearSpace(PlanarArm(), 0.03)
+    stamps = np.arange(0, 200, 10, dtype=np.int64) * 1_000_000  # 100 Hz
+    assert EVERY_NS == 50_000_000
+    assert space.due(stamps[:12]) == [0, 5, 10]
+    assert space.due(stamps[12:]) == [3]  # the state at 150 ms
+    assert space.due(np.array([10 * SECOND, 11 * SECOND])) == [0, 1]  # slow states are all looked at
+
+
+def test_too_few_points_say_nothing() -> None:
+    arm = PlanarArm()
+    arm.sphere_set.radii[0] = 5.0  # the base swallows all of the arm
+    found = NearSpace(arm, 0.03).look(0, FIRST, half_seen)
+    assert np.isnan(found.unseen) and np.isnan(found.age)

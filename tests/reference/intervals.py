@@ -1,0 +1,63 @@
+"""Float64 references of what the verdict takes from motions: one formula, one plain loop each."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.near_space import LastSeen
+from splatctrl_cli.records import Float64
+
+
+def interval_bound(first: Float64, last: Float64, motion: Float64, levers: Float64) -> float:
+    """Least over spheres of (d_0 + d_1 - L) / 2, L = sum over joints of lever arm times motion."""
+    bounds = []
+    for d_0, d_1, arms in zip(first, last, levers, strict=True):
+        travel = sum(float(lever) * abs(float(step)) for lever, step in zip(arms, motion, strict=True))
+        bounds.append((float(d_0) + float(d_1) - travel) / 2)
+    return min(bounds)
+
+
+def velocity_shares(
+    stamps: NDArray[np.int64], positions: Float64, limit: Float64, window: float, off: float
+) -> Float64:
+    """(T,) largest over the joints of |q_i - q_k| less 2 `off`, over time and limit; k: the state before i, and the
+    newest that is `window` [s] older.
+    """
+    found = np.zeros(len(stamps))
+    for i in range(1, len(stamps)):
+        older = [k for k in range(i) if stamps[i] - stamps[k] >= round(window * 1e9)]
+        for k in (i - 1, *older[-1:]):
+            for joint, most in enumerate(limit):
+                moved = max(abs(float(positions[i, joint] - positions[k, joint])) - 2 * off, 0.0)
+                found[i] = max(found[i], moved / (float(stamps[i] - stamps[k]) * 1e-9) / float(most))
+    return found
+
+
+def near_figures(
+    arm: ArmModel, q: Float64, q_first: Float64, margin: float, last_seen: LastSeen, now_ns: int
+) -> tuple[float, float, int]:
+    """Share of the points on the shells in new space that were never seen, the age [s] within which 90 % of the seen
+    ones were seen, and how many points there are.
+    """
+    steps = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
+    never, ages, num = [], [], 0
+    for s in np.flatnonzero(arm.moving_spheres):
+        for step in steps:
+            away = np.array(step) / np.linalg.norm(step)
+            point = arm.sphere_centers(q)[s] + (arm.sphere_set.radii[s] + margin) * away
+            others = _gaps(arm, q, point)
+            others[s] = np.inf
+            if min(others) <= 0.01:
+                continue
+            num += 1
+            last = int(last_seen(point[None])[0])
+            if min(_gaps(arm, q_first, point)) > 0.05:
+                never.append(last < 0)
+            if last >= 0:
+                ages.append((now_ns - last) * 1e-9)
+    return float(np.mean(never)), float(np.quantile(ages, 0.9)), num
+
+
+def _gaps(arm: ArmModel, q: Float64, point: Float64) -> list[float]:
+    spheres = zip(arm.sphere_centers(q), arm.sphere_set.radii, strict=True)
+    return [float(np.linalg.norm(point - center) - radius) for center, radius in spheres]
