@@ -25,7 +25,7 @@ from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.io.rows import ranges
 from splatctrl_cli.io.scene_folder import open_scene
 from splatctrl_cli.io.state_source import open_states
-from splatctrl_cli.jobs.reconstruction import training_cameras
+from splatctrl_cli.jobs.reconstruction import SAME_MOMENT_NS, training_cameras
 from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay_store import StoredAudit
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame
@@ -192,8 +192,11 @@ class Misses:
 
 
 def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: StoredAudit, reach: float) -> Misses:
-    """The largest miss of the map, as it was known at each frame set within the audited time, on surface within
-    `reach` [m] of the audited motion that is not the robot. One set is held at a time.
+    """The largest miss of the map on surface within `reach` [m] of the audited motion that is not the robot, for each
+    frame set within the audited time. One set is held at a time.
+
+    The map is the one that states just before the set were judged by: it is oldest then. One that has taken in what
+    other cameras saw at the same moment is better than any that a state is judged by until the next.
     """
     swept = Swept.of(inputs.model, audit, reach)
     motion, first_ns, last_ns = inputs.motion(), int(audit.stamp_ns[0]), int(audit.stamp_ns[-1])
@@ -210,7 +213,8 @@ def misses_of(frame_sets: Iterable[TimeStep], inputs: ReplayInputs, audit: Store
             ]
         )
         stamps.append(step.stamp_ns)
-        worst.append(largest_miss(points, inputs.scene.at(step.stamp_ns).distances["exact"]))
+        known = inputs.scene.at(max(step.stamp_ns - SAME_MOMENT_NS, first_ns))
+        worst.append(largest_miss(points, known.distances["exact"]))
         num_points += len(points)
     rows = np.array(worst).reshape(-1, 4)
     return Misses(

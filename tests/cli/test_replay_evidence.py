@@ -322,3 +322,17 @@ def test_an_evidence_camera_is_left_out_of_the_training_or_refused(
     assert main([*log, "--cameras", "cam0,cam1"]) == 2
     assert "--evidence cam1: --cameras has it train the map; leave it out of --cameras" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_map_of_evidence_is_the_one_that_states_before_it_were_judged_by(desk: Desk, scene: list[str]) -> None:
+    low = ((BALL[0][0], BALL[0][1], BALL[0][2] - 0.03), BALL[1])
+    grown = write_scene(
+        desk.folder / "grown", (0, splats_of(low)), (SECOND // 2, splats_of(BALL)), (SECOND, splats_of(BALL))
+    )
+    frames = [view(k * SECOND // 10, 1.0 - BALL[1]) for k in (5, 6, 8, 10)]  # from 0.5 s on, as it is then
+    desk.source = FilmedSource(states=logged(), frames=frames)
+    assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9") == 0
+    assert desk.metrics()["map_error_bound"] == pytest.approx(0.03, abs=1e-4)
+    desk.source = FilmedSource(states=logged(), frames=frames[1:])
+    assert desk.replay("--scene", str(grown), *scene[2:], "--evidence", "cam9", out="later") == 0
+    assert desk.metrics("later")["map_error_bound"] == pytest.approx(0.0, abs=1e-4)
