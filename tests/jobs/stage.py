@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from splatctrl_cli.io.output import part_digests, write_json
 from splatctrl_cli.io.scene_writer import SceneWriter
-from splatctrl_cli.records import Balls, Float64, JointState, KnownVoxels, SplatSet
+from splatctrl_cli.records import Balls, Float64, JointState, KnownVoxels, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.textures import Texture
@@ -69,6 +69,7 @@ class Stage:
     states: Sequence[JointState] = field(default_factory=passing)
     balls: Sequence[Ball] = (FAR,)
     later: Sequence[Ball] = ()  # there from half a second on
+    people: Sequence[Ball] = ()
     map_stamps: Sequence[int] = tuple(i * QUARTER for i in range(5))
     unrepresented: ArrayLike = ()
     last_seen: KnownVoxels | None = None  # instead of all that was seen at the time of each map
@@ -104,10 +105,10 @@ class Stage:
         self.desk.robot = robot
         return code, self.desk.verdict() if (self.desk.folder / "out").exists() else {}
 
-    def truth(self, *balls: Ball) -> Path:
-        """A truth.json of these balls beside the states."""
+    def truth(self, *balls: Ball, name: str = "ball") -> Path:
+        """A truth.json of these balls, called `name` and a number, beside the states."""
         robot = Path(self.desk.robot[1]), Path(self.desk.robot[3])
-        primitives = tuple(sphere(f"ball{i}", *ball) for i, ball in enumerate(balls))
+        primitives = tuple(sphere(f"{name}{i}", *ball) for i, ball in enumerate(balls))
         truth = Truth(
             path=self.desk.folder / "truth.json",
             primitives=primitives,
@@ -135,7 +136,10 @@ class Stage:
         return ball_beside(self.arm, end, gap, way=np.array(way), radius=radius)
 
     def _splats(self, stamp_ns: int) -> SplatSet:
-        return splats_of(*self.balls, *(self.later if stamp_ns >= SECOND // 2 else ()))
+        later = self.later if stamp_ns >= SECOND // 2 else ()
+        splats = splats_of(*self.balls, *later, *self.people)
+        splats.labels[len(self.balls) + len(later) :] = Label.HUMAN
+        return splats
 
     def _voxels(self, stamp_ns: int) -> KnownVoxels:
         if self.last_seen is not None:
