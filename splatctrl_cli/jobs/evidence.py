@@ -52,6 +52,11 @@ def scene_mismatches(
             sentence=f"{scene.path} was made from another recording: {'; '.join(other[:3])}",
             remedy="reconstruct this log",
         )
+    if scene.has_clock and not scene.snapshots:
+        yield Mismatch(
+            sentence=f"{scene.path} has no snapshot: the map of its end would judge the log from its beginning",
+            remedy="reconstruct again",
+        )
     if scene.has_clock and len(states):
         stamps = [snapshot.stamp_ns for snapshot in scene.snapshots] or [scene.stamp_ns]
         first, last = int(states.stamp_ns[0]), int(states.stamp_ns[-1])

@@ -57,6 +57,7 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     reasons: list[Reason] = []
     for criterion in CRITERIA:
         reasons += criterion(judged)
+    reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
     reasons += gate_reasons(
         request.require, judged.metrics, first_time=lambda name, holds: first_time(replay, name, holds)
     )
@@ -169,7 +170,8 @@ def _unrepresented(judged: Judged) -> Iterator[Reason]:
 def _surface(judged: Judged) -> Iterator[Reason]:
     """The clearance of the body, not of its spheres: less what they leave uncovered; and between the states."""
     replay, model = judged.replay, judged.replay.model
-    spheres = _least(replay.audit.clearance["exact"].distance)
+    clearance = replay.audit.clearance
+    spheres = _least(clearance["certified" if "certified" in clearance else "exact"].distance)  # as `surface` is
     moving = np.asarray(model.moving_spheres)
     if np.isnan(model.sphere_deficit[moving]).any():
         yield Reason(

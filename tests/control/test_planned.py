@@ -111,3 +111,12 @@ def test_a_way_out_is_planned_in_the_scene_of_the_stall_and_waits_as_configured(
     assert asked == [7] and detour is not None
     np.testing.assert_array_equal(detour.path.waypoints[0], given.start)
     assert detour.wait_distance == PLANNER.wait_distance and detour.clock == 0.0
+
+
+def test_a_plan_is_made_with_the_margin_of_the_arm_to_itself() -> None:
+    found = planned_path(ARM, one_wall(), task(), PLANNER, replace(CONFIG, self_margin=0.07))
+    assert found.self_margin == 0.07
+    centers, radii = ARM.sphere_centers(START), ARM.sphere_set.radii
+    apart = [np.linalg.norm(centers[a] - centers[b]) - radii[a] - radii[b] for a, b in ARM.pairs]
+    own = found.clearance.rows(START[None])[0, len(found.clearance.moving) :]
+    assert own == pytest.approx(np.array(apart) - 0.07)

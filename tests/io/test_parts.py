@@ -144,6 +144,7 @@ def test_splats_in_other_units_or_another_frame_are_refused(
     folder = write_scene(tmp_path / "scene", (0, splats_of(((0.0, 0.0, 0.0), 0.05))))
     for file in (folder / "splats.ply", folder / "snapshots" / "000000.ply"):
         file.write_bytes(path.read_bytes())
+    as_written(folder)
     for look in (SceneFolder.splats, lambda scene: scene.splats_at(0)):
         with pytest.raises(InputError, match=f"comment '{key}: {value}'"):
             look(open_scene(folder))

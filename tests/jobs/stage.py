@@ -1,0 +1,171 @@
+"""One run that is safe, and what it takes to break one thing of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from splatctrl_cli.io.output import part_digests, write_json
+from splatctrl_cli.io.scene_writer import SceneWriter
+from splatctrl_cli.records import Balls, Float64, JointState, KnownVoxels, Label, SplatSet
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.truth import Truth, truth_document
+from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
+from tests.known_voxels import known
+
+FAR = ((-1.0, 0.0, 1.3), 0.05)  # a ball behind the arm
+MOVE = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+QUARTER = SECOND // 4
+Ball = tuple[tuple[float, float, float], float]
+
+
+def states_on(positions: Float64, *, step_ns: int = SECOND // 10, start_ns: int = 0) -> list[JointState]:
+    """States at postures (T, 7), by default at 10 Hz."""
+    return [
+        JointState(stamp_ns=start_ns + i * step_ns, position=np.asarray(q, np.float64), velocity=np.zeros(7))
+        for i, q in enumerate(positions)
+    ]
+
+
+def resting(q: Float64 = START, num: int = 11) -> list[JointState]:
+    """The arm at q for (num - 1) / 10 s."""
+    return states_on(np.tile(q, (num, 1)))
+
+
+def passing(move: Float64 = MOVE, num: int = 11) -> list[JointState]:
+    """The straight way from START to START + move."""
+    return states_on(START + np.linspace(0, 1, num)[:, None] * move)
+
+
+def ball_beside(arm: RobotModel, q: Float64, gap: float, *, way: Float64 | None = None, radius: float = 0.05) -> Ball:
+    """A ball whose surface is `gap` [m] from the moving arm at q; at the other postures of a way (T, J) the arm is
+    further from it.
+    """
+    moving = np.flatnonzero(arm.moving_spheres)
+    radii, centers = arm.sphere_set.radii[moving], arm.sphere_centers(q)[moving]
+    others = np.zeros((0, len(moving), 3)) if way is None else arm.sphere_centers_batch(way)[:, moving]
+    generator = np.random.default_rng(3)
+    for nearest, away in zip(generator.integers(-12, 0, 2000), generator.normal(size=(2000, 3)), strict=True):
+        out = away / np.linalg.norm(away)
+        center = centers[nearest] + (radii[nearest] + gap + radius) * out
+        gaps = np.linalg.norm(centers - center, axis=1) - radii - radius
+        before = np.linalg.norm(others - center, axis=2) - radii - radius
+        if np.argmin(gaps) == nearest + len(gaps) and before.min(initial=np.inf) > gap + 0.002:
+            return (float(center[0]), float(center[1]), float(center[2])), radius
+    raise AssertionError
+
+
+@dataclass(kw_only=True)
+class Stage:
+    """What a replay is made of; by default of one that is safe: nothing is near, all is seen, four maps a second."""
+
+    desk: Desk
+    arm: RobotModel
+    states: Sequence[JointState] = field(default_factory=passing)
+    balls: Sequence[Ball] = (FAR,)
+    later: Sequence[Ball] = ()  # there from half a second on
+    people: Sequence[Ball] = ()
+    map_stamps: Sequence[int] = tuple(i * QUARTER for i in range(5))
+    unrepresented: ArrayLike = ()
+    last_seen: KnownVoxels | None = None  # instead of all that was seen at the time of each map
+    run: dict[str, Any] = field(default_factory=dict)  # of the scene's run.json, besides what it always has
+    spheres: Path | None = None
+
+    def scene(self, name: str = "scene") -> Path:
+        """Its folder, written now."""
+        folder = self.desk.folder / name
+        folder.mkdir()
+        writer = SceneWriter(folder, {"frame": "world"})
+        for stamp_ns in self.map_stamps:
+            voxels = self._voxels(stamp_ns)
+            writer.snapshot(stamp_ns, self._splats(stamp_ns), voxels, voxels.grid.states(0.3, 0.7))
+        last = self.map_stamps[-1]
+        writer.finish(last, self._splats(last), self._voxels(last))
+        metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": last}
+        write_json(folder / "run.json", {"metrics": metrics, "parts": part_digests(folder)} | self.run)
+        return folder
+
+    def judged(self, *arguments: str, mode: str = "audit", scene: Path | None = None) -> tuple[int, dict[str, Any]]:
+        """Exit code and verdict of the replay."""
+        self.desk.source.states = self.states
+        where = ("--scene", str(scene or self.scene()))
+        return self.replayed(*where, "--mode", mode, *arguments)
+
+    def replayed(self, *arguments: str) -> tuple[int, dict[str, Any]]:
+        """Exit code and verdict of a replay against any scene; no verdict where it did not come to one."""
+        robot = self.desk.robot
+        if self.spheres is not None:
+            self.desk.robot = [*robot[:2], "--spheres", str(self.spheres)]
+        code = self.desk.replay(*arguments, "-q", "--force", is_judged=True)
+        self.desk.robot = robot
+        return code, self.desk.verdict() if (self.desk.folder / "out").exists() else {}
+
+    def truth(self, *balls: Ball, name: str = "ball") -> Path:
+        """A truth.json of these balls, called `name` and a number, beside the states."""
+        robot = Path(self.desk.robot[1]), Path(self.desk.robot[3])
+        primitives = tuple(sphere(f"{name}{i}", *ball) for i, ball in enumerate(balls))
+        truth = Truth(
+            path=self.desk.folder / "truth.json",
+            primitives=primitives,
+            cameras=(),
+            luminance_std={},
+            joint_names=tuple(self.arm.joint_names),
+            robot_urdf=robot[0],
+            robot_spheres=robot[1],
+            T_world_base=np.eye(4),
+            stamps=np.array([s.stamp_ns for s in self.states], np.int64),
+            clearance=np.zeros(len(self.states)),
+        )
+        moving = np.flatnonzero(self.arm.moving_spheres)
+        radii = self.arm.sphere_set.radii[moving]
+        gaps = [truth.distance(self.arm.sphere_centers(s.position)[moving], s.stamp_ns) - radii for s in self.states]
+        document = truth_document(replace(truth, clearance=np.array([gap.min() for gap in gaps])))
+        for file in robot:
+            (self.desk.folder / file.name).write_bytes(file.read_bytes())
+        write_json(truth.path, document)
+        return truth.path
+
+    def ball_at_the_end(self, gap: float, radius: float = 0.05) -> Ball:
+        """A ball that the arm is `gap` [m] from at its last state, and further from before."""
+        *way, end = (state.position for state in self.states)
+        return ball_beside(self.arm, end, gap, way=np.array(way), radius=radius)
+
+    def _splats(self, stamp_ns: int) -> SplatSet:
+        later = self.later if stamp_ns >= SECOND // 2 else ()
+        splats = splats_of(*self.balls, *later, *self.people)
+        splats.labels[len(self.balls) + len(later) :] = Label.HUMAN
+        return splats
+
+    def _voxels(self, stamp_ns: int) -> KnownVoxels:
+        if self.last_seen is not None:
+            return self.last_seen
+        return known(grid_seen(), stamp_ns, self.unrepresented)
+
+
+def sphere(name: str, center: tuple[float, float, float], radius: float) -> Primitive:
+    T = np.eye(4)
+    T[:3, 3] = center
+    texture = Texture(pattern="noise", feature=0.1, dark=(0.0, 0.0, 0.0), bright=(1.0, 1.0, 1.0))
+    return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=T, texture=texture)
+
+
+def voxels(seen_ns: int = 0, *, is_seen: ArrayLike = True, is_known: ArrayLike = True) -> KnownVoxels:
+    """Voxels of which those of `is_seen` were last seen at one stamp, and those of `is_known` were ever."""
+    grid = grid_seen()
+    grid.num_updates[:] = is_known
+    return KnownVoxels(
+        grid=grid,
+        last_seen=np.broadcast_to(np.asarray(is_seen, np.uint16), grid.num_updates.shape).copy(),
+        step_stamps_ns=np.array([seen_ns], np.int64),
+        unrepresented=Balls.of_voxels(np.zeros((0, 3), np.float32), grid.voxel, np.zeros(0, np.uint8)),
+    )
+
+
+def decisive(verdict: dict[str, Any]) -> dict[str, str]:
+    """Outcome by criterion of what did not pass."""
+    return {r["criterion"]: r["outcome"] for r in verdict["reasons"] if r["outcome"] != "passed"}

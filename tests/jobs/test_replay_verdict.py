@@ -1,0 +1,436 @@
+"""Every criterion of a replay's verdict turns it when it alone is broken."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.bake import bake
+from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.io.state_offset import ClockOffset
+from splatctrl_cli.jobs import replay as job
+from splatctrl_cli.records import Box, Float64, LossReport
+from splatctrl_cli.robot.model import RobotModel
+from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
+from tests.jobs.stage import FAR, MOVE, QUARTER, Stage, ball_beside, decisive, passing, resting, states_on, voxels
+
+pytestmark = pytest.mark.usefixtures("without_plots")
+END = START + MOVE
+
+
+@pytest.fixture
+def stage(desk: Desk, arm: RobotModel) -> Stage:
+    return Stage(desk=desk, arm=arm)
+
+
+@pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
+def test_a_run_with_nothing_broken_is_safe(stage: Stage, mode: str) -> None:
+    code, verdict = stage.judged(mode=mode)
+    assert (code, verdict["outcome"], verdict["label"], decisive(verdict)) == (0, "passed", "safe", {})
+    assert all(reason["count"] for reason in verdict["reasons"])
+    assert {"clearance", "self-clearance", "position limits", "velocity limits", "surface clearance"} <= {
+        reason["criterion"] for reason in verdict["reasons"]
+    }
+    assert "map error not measured" in verdict["sentence"]
+
+
+def self_collision(arm: RobotModel) -> Float64:
+    """A posture within the limits in which the arm meets itself."""
+    pairs, radii = arm.self_pairs(), arm.sphere_set.radii
+    for q in np.random.default_rng(0).uniform(arm.lower, arm.upper, (2000, 7)):
+        centers = arm.sphere_centers(q)
+        gaps = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1) - radii[pairs].sum(axis=1)
+        if gaps.min() < -0.01 and np.linalg.norm(centers - np.array(FAR[0]), axis=1).min() > 0.5:
+            return np.asarray(q)
+    raise AssertionError
+
+
+def less_of(stage: Stage, change: Callable[[dict[str, list[dict[str, object]]]], None]) -> Path:
+    """The robot's spheres with a change."""
+    document = yaml.safe_load(Path(stage.desk.robot[3]).read_text())
+    change(document["collision_spheres"])
+    path = stage.desk.folder / "fewer.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def near_margin(stage: Stage) -> None:
+    stage.balls = [FAR, stage.ball_at_the_end(0.01)]
+
+
+def in_contact(stage: Stage) -> None:
+    stage.balls = [FAR, stage.ball_at_the_end(-0.01)]
+
+
+def met_between_states(stage: Stage) -> None:
+    """The hand passes a small ball midway between two states, half a radian apart."""
+    turn = np.array([0.5, 0, 0, 0, 0, 0, 0])
+    ball = ball_beside(stage.arm, START, 0.01, way=START + np.array([[-0.5], [0.5]]) * turn, radius=0.01)
+    stage.balls = [FAR, ball]
+    stage.states = states_on(START + np.array([[-1.5], [-0.5], [0.5], [1.5]]) * turn, step_ns=QUARTER)
+
+
+def folded(stage: Stage) -> None:
+    stage.states = resting(self_collision(stage.arm))
+
+
+def met_at_the_mount(stage: Stage) -> None:
+    stage.later = [beside_the_mount(stage.arm)]
+
+
+def beside_the_mount(arm: RobotModel, gap: float = -0.01) -> tuple[tuple[float, float, float], float]:
+    """A ball behind the base, `gap` from its hindmost sphere, which no joint moves."""
+    x, y, z = arm.sphere_centers(START)[0]
+    assert not arm.moving_spheres[0]
+    return (float(x - arm.sphere_set.radii[0] - gap - 0.01), float(y), float(z)), 0.01
+
+
+def outside_limits(stage: Stage) -> None:
+    q = START.copy()
+    q[0] = stage.arm.lower[0] - 0.05
+    stage.states = resting(q)
+
+
+def too_fast(stage: Stage) -> None:
+    stage.states = passing(np.array([0.9, 0, 0, 0, 0, 0, 0]), num=5)  # 2.25 rad/s, limit 2.175
+
+
+def jumped(stage: Stage) -> None:
+    positions = np.tile(START, (11, 1))
+    positions[:, 6] = 1.6
+    positions[5, 6] -= np.pi
+    stage.states = states_on(positions)
+
+
+def little_covered(stage: Stage) -> None:
+    """Spheres of the hand 20 mm smaller, 10 mm more than the margin from a ball."""
+
+    def shrink(spheres: dict[str, list[dict[str, object]]]) -> None:
+        for one in spheres["hand"]:
+            one["radius"] = float(one["radius"]) - 0.02  # type: ignore[arg-type]
+
+    stage.spheres = less_of(stage, shrink)
+    stage.balls = [FAR, stage.ball_at_the_end(0.01)]
+
+
+def bare_forearm(stage: Stage) -> None:
+    def remove(spheres: dict[str, list[dict[str, object]]]) -> None:
+        del spheres["link5"]
+
+    stage.spheres = less_of(stage, remove)
+
+
+def never_seen_where_it_goes(stage: Stage) -> None:
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]), num=11)
+    stage.last_seen = voxels(SECOND, is_seen=False)
+
+
+def frames_that_renew_nothing(stage: Stage) -> None:
+    stage.states = resting(num=21)
+    stage.map_stamps = [i * QUARTER for i in range(9)]
+    stage.last_seen = voxels(0)
+
+
+def no_new_map(stage: Stage) -> None:
+    stage.states = resting(num=21)
+    stage.map_stamps = [0, QUARTER]
+    stage.last_seen = voxels(2 * SECOND)
+
+
+def gap_in_the_log(stage: Stage) -> None:
+    del stage.states[3:7]  # type: ignore[attr-defined]
+    stage.balls = [FAR, stage.ball_at_the_end(0.2)]
+
+
+def three_stamps(stage: Stage) -> None:
+    stage.states = stage.states[::5]
+    stage.balls = [FAR, stage.ball_at_the_end(0.2)]
+
+
+def dropped_states(stage: Stage) -> None:
+    stage.desk.source.loss = LossReport(conflicting_states=1)
+
+
+def late_maps(stage: Stage) -> None:
+    stage.map_stamps = [6 * SECOND // 10, 8 * SECOND // 10, SECOND]
+
+
+def without_a_splat(stage: Stage) -> None:
+    center, _ = stage.ball_at_the_end(0.01, radius=0.05 * 3**0.5)
+    stage.unrepresented = [center]
+
+
+ALONE = {
+    "margin": (near_margin, (), "clearance", "margin broken", "near object splat 1"),
+    "contact": (in_contact, (), "clearance", "contact", "deep in the scene"),
+    "self-collision": (folded, (), "self-clearance", "contact", "deep in each other"),
+    "fixed sphere": (met_at_the_mount, (), "static clearance", "contact", "which no joint moves"),
+    "position limits": (outside_limits, (), "position limits", "limits broken", "joint1 is 0.0500 rad"),
+    "velocity limits": (too_fast, (), "velocity limits", "limits broken", "joint1 reaches 1.0"),
+    "a jump by pi": (jumped, (), "velocity limits", "limits broken", "joint7 reaches"),
+    "between states": (
+        met_between_states,
+        ("--set", "verdict.longest_interval=0.3"),
+        "clearance between states",
+        "not evaluable",
+        "between two states",
+    ),
+    "surface deficit": (little_covered, (), "surface clearance", "not evaluable", "the spheres keep 3"),
+    "bare link": (bare_forearm, (), "surface clearance", "not evaluable", "no sphere on link5"),
+    "unseen space": (
+        never_seen_where_it_goes,
+        (),
+        "known space",
+        "not evaluable",
+        "100 % of the space about the arm",
+    ),
+    "evidence age": (frames_that_renew_nothing, (), "evidence age", "not evaluable", "frames without depth renew"),
+    "map age": (no_new_map, (), "map age", "not evaluable", "1.75 s old, allowed 1 s"),
+    "gap": (gap_in_the_log, (), "judged time", "not evaluable", "0.50 s of 1.00 s lie between states"),
+    "three stamps": (three_stamps, (), "judged time", "not evaluable", "2 gaps"),
+    "dropped states": (dropped_states, (), "judged states", "not evaluable", "1 logged states were dropped"),
+    "lead-in": (late_maps, (), "judged time", "not evaluable", "--start-time first-map"),
+    "latency": (lambda _: None, ("--latency", "0.9"), "judged time", "not evaluable", "come before the first map"),
+    "starved map": (without_a_splat, (), "clearance", "not evaluable", "raise --max-splats"),
+}
+CODES = {"not evaluable": 5}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_one_criterion_that_is_broken_turns_the_verdict_and_names_itself(stage: Stage, name: str) -> None:
+    broken, arguments, criterion, label, words = ALONE[name]
+    broken(stage)
+    code, verdict = stage.judged(*arguments)
+    assert set(decisive(verdict)) == {criterion}
+    assert (verdict["label"], code) == (label, CODES.get(label, 1))
+    assert words in verdict["sentence"]
+    code, _ = stage.judged(*arguments, "--report-only", scene=stage.desk.folder / "scene")
+    assert code == 0
+
+
+def test_a_broken_margin_says_when_where_and_who(stage: Stage) -> None:
+    near_margin(stage)
+    _, verdict = stage.judged()
+    worst = verdict["reasons"][0]
+    assert (worst["value"], worst["threshold"]) == (pytest.approx(0.01, abs=1e-5), 0.02)
+    assert worst["who"].startswith("hand[") and worst["time_s"] == pytest.approx(1.0)
+    center, radius = stage.balls[1]
+    assert np.linalg.norm(np.array(worst["place"]) - center) == pytest.approx(radius, abs=1e-5)
+    assert worst["count"] == 11
+
+
+@pytest.mark.parametrize(("gap", "code"), [(0.0185, 1), (0.0195, 0), (0.0205, 0)])
+def test_the_margin_is_kept_up_to_what_a_solver_leaves(stage: Stage, gap: float, code: int) -> None:
+    stage.states, stage.balls = resting(), [FAR, ball_beside(stage.arm, START, gap)]
+    assert stage.judged()[0] == code
+
+
+@pytest.mark.parametrize(("gap", "label"), [(0.01, "margin broken"), (-0.01, "contact")])
+def test_the_truth_alone_turns_the_verdict(stage: Stage, gap: float, label: str) -> None:
+    truth = stage.truth(FAR, stage.ball_at_the_end(gap))
+    code, verdict = stage.judged("--truth", str(truth))
+    assert (code, verdict["label"], decisive(verdict)) == (1, label, {"true clearance": "failed"})
+    assert verdict["reasons"][0]["value"] == pytest.approx(gap, abs=1e-5)
+    assert "near ball1" in verdict["sentence"]
+
+
+def test_a_truth_that_keeps_the_margin_passes_as_a_criterion(stage: Stage) -> None:
+    code, verdict = stage.judged("--truth", str(stage.truth(FAR)))
+    assert code == 0 and "true clearance" in {r["criterion"] for r in verdict["reasons"]}
+
+
+def test_contact_by_the_truth_is_contact_where_the_map_only_breaks_the_margin(stage: Stage) -> None:
+    stage.balls = [FAR, stage.ball_at_the_end(0.01)]
+    truth = stage.truth(FAR, stage.ball_at_the_end(-0.01))
+    code, verdict = stage.judged("--truth", str(truth))
+    assert (code, verdict["label"]) == (1, "contact")
+    assert verdict["sentence"].startswith("replay: CONTACT") and "true clearance: hand" in verdict["sentence"]
+
+
+def test_what_stands_at_the_mount_from_the_start_is_only_said(stage: Stage) -> None:
+    stage.balls = [FAR, beside_the_mount(stage.arm)]
+    code, verdict = stage.judged()
+    assert (code, decisive(verdict)) == (0, {})
+    assert any("fixed spheres stand within the margin" in note for note in verdict["notes"])
+
+
+@pytest.mark.parametrize(("gap", "code"), [(-0.02, 0), (-0.045, 1)])
+def test_at_a_mount_only_what_comes_much_nearer_counts(stage: Stage, gap: float, code: int) -> None:
+    stage.balls = [FAR, beside_the_mount(stage.arm, 0.0)]
+    stage.later = [beside_the_mount(stage.arm, gap)]
+    assert stage.judged()[0] == code
+
+
+def test_acceleration_limits_count_where_they_are_set(stage: Stage) -> None:
+    seconds = np.arange(11)[:, None] * 0.05
+    stage.states = states_on(START + 0.5 * 4.0 * seconds**2 * np.array([1.0, 0, 0, 0, 0, 0, 0]), step_ns=SECOND // 20)
+    scene = stage.scene()
+    code, verdict = stage.judged("--set", "control.max_acceleration=1", scene=scene)
+    assert (code, decisive(verdict)) == (1, {"acceleration limits": "failed"})
+    assert "joint1 reaches" in verdict["sentence"]
+    assert stage.judged("--set", "control.max_acceleration=3", scene=scene)[0] == 0
+    assert stage.judged(scene=scene)[0] == 0
+
+
+@pytest.mark.parametrize("height", [0.35, 0.6])
+def test_unknown_space_counts_from_the_share_that_is_allowed(stage: Stage, height: float) -> None:
+    above = grid_seen().origin[2] + 0.1 * np.arange(40) > height
+    stage.last_seen = voxels(SECOND, is_known=~above)
+    scene = stage.scene()
+    stage.judged(scene=scene)
+    share = stage.desk.metrics()["unknown_share"]
+    assert (height < 0.5) == (share > 0.5) and 0.05 < share < 0.95
+    for allowed, code in ((share - 1e-3, 5), (share + 1e-3, 0)):
+        found, verdict = stage.judged("--max-unknown", str(allowed), scene=scene)
+        assert found == code
+        assert decisive(verdict) == ({"known space": "not evaluable"} if code else {})
+
+
+def test_half_of_the_space_that_the_motion_comes_to_must_have_been_seen(stage: Stage) -> None:
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    shares, codes = [], []
+    for number, height in enumerate((0.25, 0.35, 0.45, 0.55, 0.65)):
+        above = grid_seen().origin[2] + 0.1 * np.arange(40) > height
+        stage.last_seen = voxels(SECOND, is_seen=~above)
+        codes.append(stage.judged(scene=stage.scene(f"scene{number}"))[0])
+        shares.append(stage.desk.metrics()["max_unseen_share"])
+    assert [5 if share > 0.5 else 0 for share in shares] == codes
+    assert set(codes) == {0, 5} and min(abs(share - 0.5) for share in shares) < 0.15
+
+
+def test_a_map_may_be_as_old_as_is_said(stage: Stage) -> None:
+    no_new_map(stage)
+    scene = stage.scene()
+    assert stage.judged("--max-map-age", "1.76", scene=scene)[0] == 0
+    assert stage.judged("--max-map-age", "1.74", scene=scene)[0] == 5
+
+
+def test_states_of_another_hour_are_not_judged_by_a_scene_or_a_field(stage: Stage) -> None:
+    stage.states = states_on(np.tile(START, (11, 1)), start_ns=3600 * SECOND)
+    code, verdict = stage.judged()
+    assert code == 5 and {"map age", "evidence age", "evidence"} <= set(decisive(verdict))
+    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR), moment=SECOND)))
+    assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
+
+
+def baked(stage: Stage, *, splats: object, voxel: float = 0.04, moment: int | None = None) -> Path:
+    """A field of the arm's surroundings."""
+    box = Box(lower=np.array([-1.2, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.4]))
+    grid = bake(splats, box, replace(FieldConfig(), voxel=voxel), occupancy=grid_seen(), threads=1)  # type: ignore[arg-type]
+    header = dict(grid.header) | ({} if moment is None else {"stamp_ns": moment})
+    folder = stage.desk.folder / "field"
+    folder.mkdir()
+    write_npz(folder / "field.npz", replace(grid, header=header))
+    return folder
+
+
+def test_a_margin_that_only_the_grids_bound_breaks_is_a_matter_of_the_grid(stage: Stage) -> None:
+    ball = stage.ball_at_the_end(0.03)
+    stage.desk.source.states = stage.states
+    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR, ball), voxel=0.08)))
+    assert (code, decisive(verdict)) == (5, {"certified clearance": "not evaluable"})
+    found = re.search(r"bake again with --voxel at most ([\d.]+)", verdict["sentence"])
+    assert found is not None and 0.005 < float(found[1]) < 0.08
+
+
+def test_a_value_of_the_grid_below_the_margin_is_red(stage: Stage) -> None:
+    ball = stage.ball_at_the_end(-0.01)
+    stage.desk.source.states = stage.states
+    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR, ball), voxel=0.04)))
+    assert (code, verdict["label"], decisive(verdict)["clearance"]) == (1, "contact", "failed")
+
+
+def test_after_a_long_lead_in_the_rest_can_be_judged_as_the_remedy_says(stage: Stage) -> None:
+    late_maps(stage)
+    scene = stage.scene()
+    code, verdict = stage.judged(scene=scene)
+    assert code == 5 and "judge the rest alone with --start-time first-map" in verdict["sentence"]
+    code, verdict = stage.judged("--start-time", "first-map", scene=scene)
+    assert (code, decisive(verdict)) == (0, {})
+    assert "from 0.60 to 1.00 s of the log" in verdict["scope"]
+
+
+def test_a_short_lead_in_is_left_out_and_said(stage: Stage) -> None:
+    stage.map_stamps = [SECOND // 2, SECOND]
+    code, verdict = stage.judged()
+    assert code == 0 and "0.50 s before the first map are left out" in verdict["notes"]
+
+
+def test_a_gap_that_the_arm_cannot_use_is_bounded(stage: Stage) -> None:
+    stage.states = [s for i, s in enumerate(resting()) if i not in (4, 5, 6)]  # 0.4 s
+    stage.balls = [((-4.0, 0.0, 1.3), 0.05)]
+    assert stage.judged()[0] == 0
+
+
+def test_a_share_of_the_time_may_be_left_unjudged(stage: Stage) -> None:
+    gap_in_the_log(stage)
+    scene = stage.scene()
+    assert stage.judged("--set", "verdict.unjudged=0.49", scene=scene)[0] == 5
+    assert stage.judged("--set", "verdict.unjudged=0.51", scene=scene)[0] == 0
+
+
+def test_a_controller_that_cannot_keep_its_rows_fails_alone(stage: Stage) -> None:
+    goal = "--goal-joints=" + ",".join(str(v) for v in START)
+    code, verdict = stage.judged("--set", "control.self_margin=0.06", goal, mode="closed-loop")
+    assert (code, verdict["label"], decisive(verdict)) == (1, "controller failed", {"controller": "failed"})
+    assert "its rows could not be kept at 1 relaxed of 1 steps" in verdict["sentence"]
+
+
+def test_a_goal_that_is_not_reached_fails_alone(stage: Stage) -> None:
+    code, verdict = stage.judged("--set", "control.max_time=0.3", mode="closed-loop")
+    assert (code, verdict["label"], decisive(verdict)) == (1, "goal not reached", {"goal": "failed"})
+
+
+def test_a_scene_that_comes_into_the_driven_arm_is_a_hit(stage: Stage) -> None:
+    stage.states, stage.later = passing(), [ball_beside(stage.arm, START + 0.3 * MOVE, -0.02)]
+    code, verdict = stage.judged(mode="closed-loop")
+    assert code == 1 and decisive(verdict)["scene hits"] == "failed"
+    (hit,) = [r for r in verdict["reasons"] if r["criterion"] == "scene hits"]
+    assert hit["value"] == 1 and hit["time_s"] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize(("offset", "uncertainty", "code"), [(0.2, 0.02, 5), (-0.2, 0.02, 5), (0.06, 0.02, 0)])
+def test_clocks_that_disagree_turn_the_verdict_alone(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch, offset: float, uncertainty: float, code: int
+) -> None:
+    clock = ClockOffset(offset_s=offset, uncertainty_s=uncertainty, correlation=0.9, runner_up=0.2, num_intervals=50)
+    read = job.read_states
+    monkeypatch.setattr(job, "read_states", lambda *given: replace(read(*given), clock=clock))
+    found, verdict = stage.judged()
+    assert (found, decisive(verdict)) == (code, {"clocks": "not evaluable"} if code else {})
+    assert not code or ("ahead of" if offset > 0 else "behind") in verdict["sentence"]
+
+
+def test_a_failure_outranks_what_cannot_be_evaluated(stage: Stage) -> None:
+    in_contact(stage)
+    dropped_states(stage)
+    code, verdict = stage.judged()
+    assert (code, decisive(verdict)) == (1, {"clearance": "failed", "judged states": "not evaluable"})
+    assert "and 1 more reason" in verdict["sentence"]
+
+
+@pytest.mark.parametrize(
+    ("gate", "code"),
+    [("min_clearance>=0.1", 0), ("min_clearance>=5", 1), ("min_clearance_true>=0", 5), ("clock_offset_s<=1", 5)],
+)
+def test_a_gate_turns_the_verdict_with_report_only_too(stage: Stage, gate: str, code: int) -> None:
+    scene = stage.scene()
+    for more in ((), ("--report-only",)):
+        found, verdict = stage.judged("--require", gate, *more, scene=scene)
+        assert found == code
+        assert set(decisive(verdict)) == ({f"--require {gate}"} if code else set())
+
+
+def test_a_misspelled_metric_is_refused_before_anything_is_read(
+    stage: Stage, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, verdict = stage.replayed("--scene", "nowhere", "--require", "min_clearence>=0")
+    assert (code, verdict) == (2, {})
+    assert "unknown metric; did you mean min_clearance?" in capsys.readouterr().err
+    code, _ = stage.replayed("--scene", "nowhere", "--require", "goal_reached>=1")
+    assert code == 2 and "a figure of --mode closed-loop" in capsys.readouterr().err
