@@ -98,16 +98,24 @@ def test_the_clearance_is_no_more_than_that_of_any_point_of_the_surface(model: R
 
 
 def test_the_least_clearance_is_found_between_two_samples(model: RobotModel) -> None:
-    middle = model.frame_pose(START, "hand")[:3, 3]
-    target = moving(ball(middle), [1.0, 1.7], np.array([[0.16, 0.0, 0.35], [0.16, 0.0, -0.35]]))  # 1 m/s
-    stamps = np.array([at_s(0), at_s(3)])
-    positions = interpolated(stamps, np.array([START, START]))
-    arm = TrueArm(model)
-    found, when = least_clearance(arm, [target], positions, at_s(0), at_s(3))
-    fine = np.arange(at_s(1.0), at_s(1.7), 200_000)
-    exact = arm.clearances([target], fine, positions(fine))
-    assert abs(found - exact.min()) < 3e-4
-    assert arm.clearances([target], np.array([when]), START[None])[0] == found
+    T = model.frame_pose(START, "hand")
+    place, away = (T @ [0.025 + 0.05 + 0.004, 0.0, 0.033, 1.0])[:3], T[:3, 0]  # 4 mm beside the palm, for a moment
+    target = moving(ball(place), [0.6, 1.0073, 1.4], np.array([0.4 * away, 0 * away, 0.4 * away]))  # at 1 m/s
+    arm, still = TrueArm(model), interpolated(np.array([at_s(0), at_s(3)]), np.array([START, START]))
+    found, when = least_clearance(arm, [target], still, at_s(0), at_s(3))
+    assert abs(found - 0.004) < 3e-4
+    assert abs(when - at_s(1.0073)) < 1e6
+
+
+def test_a_ball_that_passes_a_round_link_is_nearest_between_two_samples(model: RobotModel) -> None:
+    T = model.frame_pose(START, "link6")  # a capsule of 48 mm along x
+    passing = ball((T @ [0.044, -0.048 - 0.01 - 0.004, 0.0, 1.0])[:3], 0.01)
+    target = moving(passing, [1.0, 1.58], np.array([-0.29 * T[:3, 2], 0.29 * T[:3, 2]]))  # nearest at 1.29 s
+    arm, still = TrueArm(model), interpolated(np.array([at_s(0), at_s(3)]), np.array([START, START]))
+    found, when = least_clearance(arm, [target], still, at_s(0), at_s(3))
+    fine = np.arange(at_s(1.28), at_s(1.30), 100_000)
+    assert abs(found - arm.clearances([target], fine, still(fine)).min()) < 2e-4
+    assert abs(when - at_s(1.29)) < 5e6
 
 
 def test_what_is_there_for_a_millisecond_alone_counts(model: RobotModel) -> None:

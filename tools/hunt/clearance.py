@@ -105,8 +105,10 @@ def least_clearance(
     positions: joint positions (T, J) at stamps (T,). Between two samples nothing can come nearer by more than half of
     how far the arm and the scene moved in between.
     """
-    edges = [edge for p in primitives for edge in (p.from_ns, p.to_ns - 1) if first_ns <= edge <= last_ns]
-    stamps = np.unique([*np.arange(first_ns, last_ns, STEP_NS), last_ns, *edges]).astype(np.int64)
+    knots = [knot for p in primitives if p.track is not None for knot in p.track.stamp_ns.tolist()]
+    edges = [edge for p in primitives for edge in (p.from_ns, p.to_ns - 1)]
+    turns = [stamp for stamp in (*knots, *edges) if first_ns <= stamp <= last_ns]
+    stamps = np.unique([*np.arange(first_ns, last_ns, STEP_NS), last_ns, *turns]).astype(np.int64)
     values, moved = _sampled(arm, primitives, positions, stamps)
     while True:
         least = (values[:-1] + values[1:] - _travel(moved)) / 2
@@ -139,7 +141,9 @@ def _sampled(
 
 
 def _travel(moved: tuple[Float64, ...]) -> Float64:
-    """How far [m] arm and scene came towards each other at most between neighbouring samples (T - 1,)."""
+    """How far [m] arm and scene came towards each other at most between neighbouring samples (T - 1,), between which
+    solids go straight on.
+    """
     steps = [np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1) for points in moved]
     return np.asarray(steps[0] + (np.max(steps[1:], axis=0) if len(steps) > 1 else 0.0))
 
