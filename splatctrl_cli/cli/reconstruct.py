@@ -116,10 +116,11 @@ def run(args: argparse.Namespace) -> int:
 
         return run_gaussians(args, _config(args), _open(args), _box(args))
     check_gate_names(args.require, GATED)
+    config = _config(args)  # refused before anything is read
     request = ReconstructRequest(
         source=_open(args),
         out=args.out or Path("scene"),
-        config=_config(args),
+        config=config,
         box=_box(args),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
         **{name: getattr(args, name) for name in PASSED_ON},

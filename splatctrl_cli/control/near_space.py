@@ -5,19 +5,24 @@ question is put to points on shells: each moving sphere's radius and the margin 
 other spheres of the arm.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.records import Bool, Float64, KnownVoxels
+from splatctrl_cli.records import Bool, Float64
 
 EVERY_NS = 200_000_000  # between states that are looked at: cameras that stop are stale five times as late
 APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
 NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
 FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
 LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
+
+
+LastSeen = Callable[[Float64], NDArray[np.int64]]
+"""points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera last returned depth through or on them, -1 never."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +56,7 @@ class NearSpace:
                 self._next_ns = stamp_ns + EVERY_NS
         return chosen
 
-    def look(self, stamp_ns: int, q: Float64, known: KnownVoxels) -> NearFigures:
+    def look(self, stamp_ns: int, q: Float64, last_seen: LastSeen) -> NearFigures:
         """What was known about the posture q (J,) at a stamp."""
         centers = self._model.sphere_centers(q)
         if self._first is None:
@@ -59,7 +64,7 @@ class NearSpace:
         points = (centers[self._moving][:, None] + self._offsets).reshape(-1, 3)
         points = points[_is_outside(points, centers, self._radii + APART, self._owners)]
         fewest = LEAST_SHARE * len(self._owners)
-        seen = known.last_seen_ns(points)
+        seen = last_seen(points)
         is_never = seen < 0
         is_new = _is_outside(points, self._first, self._radii + NEW)
         unseen = age = np.nan

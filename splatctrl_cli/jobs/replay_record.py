@@ -198,7 +198,7 @@ class ReplayRecord:
             stamp = int(part.stamp_ns[at])
             known = self._scene.voxels_at(stamp)
             if known is not None:
-                figures = self._near.look(stamp, part.position[at], known)
+                figures = self._near.look(stamp, part.position[at], known.last_seen_ns)
                 unseen[at], age[at] = figures.unseen, figures.age
         self.near.append(unseen=unseen, age=age)
 

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.replay_states import LoggedStates
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
 STATIC_CHANGE = 0.01  # [m] by which a fixed sphere must come nearer to count: splats move by less about a surface
-MOUNTED = 0.03  # [m] the same of one that stands within the margin of its mount, whose map grows in the first frames
+MOUNTED = 0.03  # [m] the same of one that stands near its mount, whose map grows in the first frames
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
 UNSEEN = 0.5  # of the points about the arm: three cameras about a table leave 0.02 to 0.3
 MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a calibrated rig
@@ -253,7 +253,7 @@ def _statics(judged: Judged) -> Iterator[Reason]:
     broken = {
         name: (first, least)
         for name, (first, least) in judged.replay.statics.items()
-        if least < judged.threshold and least < first - (MOUNTED if first < judged.threshold else STATIC_CHANGE)
+        if least < judged.threshold and least < first - (MOUNTED if first < 2 * judged.threshold else STATIC_CHANGE)
     }
     if broken:
         name, (first, least) = min(broken.items(), key=lambda item: item[1][1])

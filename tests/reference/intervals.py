@@ -36,8 +36,8 @@ def velocity_shares(
 def near_figures(
     arm: ArmModel, q: Float64, q_first: Float64, margin: float, last_seen: LastSeen, now_ns: int
 ) -> tuple[float, float, int]:
-    """Share of the points on the shells in new space that were never seen, the age [s] within which 90 % of the seen
-    ones were seen, and how many points there are.
+    """Share of the points on the shells in new space that were never seen, the age [s] within which three quarters of
+    the seen ones were seen, and how many points there are.
     """
     steps = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
     never, ages, num = [], [], 0
@@ -55,7 +55,7 @@ def near_figures(
                 never.append(last < 0)
             if last >= 0:
                 ages.append((now_ns - last) * 1e-9)
-    return float(np.mean(never)), float(np.quantile(ages, 0.9)), num
+    return float(np.mean(never)), float(np.quantile(ages, 0.75)), num
 
 
 def _gaps(arm: ArmModel, q: Float64, point: Float64) -> list[float]:
