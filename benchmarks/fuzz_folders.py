@@ -72,7 +72,8 @@ def scene_folder(folder: Path) -> tuple[Path, Commands]:
     metrics = {"cameras": ["camera"], "has_clock": False, "stamp_ns": 200}
     config = {"occupancy": {"free_below": 0.3}}
     write_json(folder / "run.json", {"command": "reconstruct", "metrics": metrics, "inputs": {}, "config": config})
-    bake = ("sdf-bake", "IN", "-o", "OUT", "--voxel", "0.2", "--no-report", "--threads", "1")
+    coarse = ("--voxel", "0.2", "--set", "field.max_loss=1")
+    bake = ("sdf-bake", "IN", "-o", "OUT", *coarse, "--no-report", "--threads", "1")
     return folder, (INFO, ("export", "IN", "-o", "OUT.ply"), bake, bake, (*bake, "--at", "0"))
 
 

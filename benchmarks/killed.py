@@ -52,8 +52,8 @@ def tasks(folder: Path) -> list[Task]:
     """What is killed; each task may use what the ones before it wrote."""
     robot = ("--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml"))
     audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *robot, "--max-unknown", "1")
-    bake = ("sdf-bake", str(folder / "splats.ply"), "--voxel", "0.1", "--no-report")
-    fine = ("sdf-bake", str(folder / "splats.ply"), "--voxel", "0.06", "--no-report", "--threads", "1")
+    bake = ("sdf-bake", str(folder / "splats.ply"), "--set", "field.max_loss=1", "--no-report", "--voxel", "0.1")
+    fine = (*bake[:-1], "0.06", "--threads", "1")
     found = [
         Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture", resumes=True),
         Task(name="export", arguments=("export", str(folder / "a.ply"), "--isotropic"), out="splats.ply"),

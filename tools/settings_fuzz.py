@@ -121,10 +121,11 @@ class Desk:
         self._made(*made, "-o", folder / "scene")
         drive = ("replay", log / "log.mcap", "--scene", folder / "scene", *robot, *quiet, "--mode", "closed-loop")
         short = (*drive, "--set", "control.max_time=0.2", "--set", "planner.max_iterations=20")
+        coarse = ("--set", "field.max_loss=1", "--set", "field.voxel=0.05")
         self.commands: dict[str, tuple[object, ...]] = {
             **dict.fromkeys(("scene", "occupancy", "human"), made),
             "gaussians": ("reconstruct", "--dtu", log / "dtu", "--method", "3dgs", *quiet, *fast_3dgs),
-            "field": ("sdf-bake", folder / "scene", *quiet, "--set", "field.voxel=0.05", "--no-report"),
+            "field": ("sdf-bake", folder / "scene", *quiet, *coarse, "--no-report"),
             **dict.fromkeys(("control", "verdict"), short),
             "planner": (*short, "--baseline", "birrt"),
         }

@@ -154,10 +154,13 @@ def channels_of(args: argparse.Namespace, default: Sequence[str], unknown: str) 
 
 
 def with_options(config: "Config", args: argparse.Namespace) -> "Config":
-    """The configuration with what the options say of the field."""
+    """The configuration with what the options say of the field. Raises UsageError for cells that are too coarse."""
+    from splatctrl_cli.field.layout import check_loss
+
     names = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")
     given = {name: getattr(args, name) for name in names}
     field: FieldConfig = replace(config.field, **{name: value for name, value in given.items() if value is not None})
+    check_loss(field.voxel, field.max_loss)
     return replace(config, field=field)
 
 

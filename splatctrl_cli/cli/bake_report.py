@@ -10,6 +10,7 @@ from splatctrl_cli.cli.common import table
 if TYPE_CHECKING:
     from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy
     from splatctrl_cli.evaluate.reliability import Reliability
+    from splatctrl_cli.evaluate.verdict import Verdict
     from splatctrl_cli.field.incremental import Changes
     from splatctrl_cli.field.report import GridStatistics
     from splatctrl_cli.records import DistanceGrid
@@ -86,15 +87,61 @@ def summary_lines(summary: Mapping[str, Any]) -> list[str]:
     return table(("field", ""), [(name.replace("_", " "), _shown(value)) for name, value in summary.items()])
 
 
-def warnings_of(header: Mapping[str, Any], statistics: "GridStatistics", *, has_occupancy: bool) -> tuple[str, ...]:
-    """Those on the splats' health, on a box that no camera saw, and on one that no splat is near."""
+def warnings_of(header: Mapping[str, Any], statistics: "GridStatistics") -> tuple[str, ...]:
+    """Those on the splats' health, and on a box that no splat is near."""
     found = list(header["health"]["warnings"])
-    seen = statistics.observed
-    if has_occupancy and seen is not None and seen["never_seen"] == statistics.num_cells:
-        found.append("no cell of the grid was ever seen by a camera; check --box")
     if statistics.lowest is not None and statistics.lowest > FAR:
         found.append(f"the box holds no splat: the nearest is {statistics.lowest:.3g} m from every cell; check --box")
     return tuple(found)
+
+
+def bake_verdict(
+    report: FieldReport,
+    max_loss: float,
+    require: Sequence[str],
+    figures: Mapping[str, float | None],
+    *,
+    has_occupancy: bool,
+) -> "Verdict":
+    """The verdict on a field: what its cells may lose [m], that a camera saw some of it, and each ``--require``.
+
+    has_occupancy: whether it is known what cameras saw.
+    """
+    from splatctrl_cli.evaluate.gates import gate_reasons
+    from splatctrl_cli.evaluate.verdict import Outcome, Reason, noted, verdict_of
+    from splatctrl_cli.field.layout import LOSS
+
+    summary = report.summary()
+    num_cells, unseen, loss = summary["num_cells"], summary["never_seen_share"], LOSS * summary["voxel"]
+    reasons = [
+        Reason(
+            criterion="loss",
+            outcome=Outcome.PASSED,
+            sentence=f"cells read at most {1e3 * loss:.1f} mm too little of the distance to the splats",
+            value=loss,
+            threshold=max_loss,
+            unit="m",
+            count=num_cells,
+        )
+    ]
+    if has_occupancy and unseen == 1:
+        reasons.append(
+            Reason(
+                criterion="known space",
+                outcome=Outcome.NOT_EVALUABLE,
+                sentence="no cell of the grid was ever seen by a camera",
+                value=unseen,
+                threshold=1.0,
+                remedy="give a --box that the cameras saw",
+                count=num_cells,
+            )
+        )
+    cells = " x ".join(map(str, summary["shape"]))
+    return verdict_of(
+        "sdf-bake",
+        [*reasons, *(noted("field", text) for text in report.warnings), *gate_reasons(require, figures)],
+        scope=f"{cells} cells of {summary['voxel']:g} m, {summary['num_splats']} splats",
+    )
 
 
 def metric_names(*, with_truth: bool) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from splatctrl_cli.evaluate.verdict import Verdict
     from splatctrl_cli.io.check_report import CheckReport
     from splatctrl_cli.io.check_times import Rate
     from splatctrl_cli.io.finding import Finding
@@ -81,14 +82,42 @@ def run(args: argparse.Namespace) -> int:
     else:
         report = check_log(log, options, model=model, num_images=args.quick)
     report = replace(report, findings=[*report.findings, *_agreement(report)])
-    Console(args).result(report.as_dict(), list(_lines(report)))
-    return _exit_code(report, args.fail_on)
+    verdict = _verdict(report, fail_on=args.fail_on)
+    code = 0 if args.fail_on == "never" else verdict.exit_code
+    Console(args).concluded(verdict, report.as_dict(), _lines(report), code, has_findings=True)
+    return code
 
 
-def _exit_code(report: "CheckReport", fail_on: str) -> int:
-    counts = report.counts
-    failing = {"error": counts["error"], "warning": counts["error"] + counts["warning"], "never": 0}[fail_on]
-    return 1 if failing else 0
+def _verdict(report: "CheckReport", *, fail_on: str) -> "Verdict":
+    """Of the findings: errors, and warnings where asked for, fail; the other warnings are notes."""
+    from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
+    from splatctrl_cli.io.finding import Severity
+
+    fatal = {Severity.ERROR, *([Severity.WARNING] if fail_on == "warning" else [])}
+    read = Reason(
+        criterion="messages",
+        outcome=Outcome.PASSED if report.num_messages else Outcome.NOT_EVALUABLE,
+        sentence=f"{report.num_messages} {report.unit} read",
+        value=float(report.num_messages),
+        threshold=1.0,
+        count=report.num_messages,
+    )
+    found = [
+        Reason(
+            criterion=finding.code,
+            outcome=Outcome.FAILED if finding.severity in fatal else Outcome.PASSED,
+            sentence=f"{finding.where}: {finding.what}",
+            value=finding.value,
+            unit=finding.unit,
+            time_s=report.seconds(finding),
+            who=finding.where,
+            remedy=finding.remedy,
+            is_note=finding.severity is Severity.WARNING,
+        )
+        for finding in report.sorted_findings
+    ]
+    counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in report.counts.items())
+    return verdict_of("check", [read, *found], scope=f"{Path(report.path).name}: {counts}")
 
 
 def _robot(args: argparse.Namespace) -> "RobotModel | None":
@@ -140,11 +169,9 @@ def _agreement(report: "CheckReport") -> list["Finding"]:
 
 
 def _lines(report: "CheckReport") -> Iterator[str]:
-    counts = report.counts
     span = f", {report.duration_s:.2f} s" if report.duration_s else ""
     num = f", {report.num_messages} {report.unit}" if report.num_messages else ""
     yield f"{report.path}: {report.kind}{span}{num}"
-    yield ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in counts.items())
     for finding in report.sorted_findings:
         yield ""
         at = report.seconds(finding)

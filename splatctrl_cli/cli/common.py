@@ -101,14 +101,26 @@ class Console:
             for line in lines:
                 print(line)
 
-    def concluded(self, verdict: "Verdict", result: Mapping[str, Any], lines: Iterable[str], code: int) -> None:
-        """A verdict, its reasons, then `result` or `lines`; the sentence goes to stderr too where `code` is not 0."""
+    def concluded(
+        self,
+        verdict: "Verdict",
+        result: Mapping[str, Any],
+        lines: Iterable[str],
+        code: int,
+        *,
+        has_findings: bool = False,
+    ) -> None:
+        """A verdict, its reasons and notes, then `result` or `lines`; the sentence goes to stderr too where `code` is
+        not 0. has_findings: the lines say each reason themselves.
+        """
         if self.is_json:
             self.result({"exit_code": code, "verdict": verdict.as_dict(), **result}, ())
         else:
             print(verdict.sentence)
-            for reason in verdict.decisive[1:MAX_REASONS]:
+            for reason in () if has_findings else verdict.decisive[1:MAX_REASONS]:
                 print(f"  {reason.outcome}: {reason}")
+            for reason in () if has_findings else verdict.said:
+                print(f"  note: {reason}")
             print()
             self.result({}, lines)
         if code:

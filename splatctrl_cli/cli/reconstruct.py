@@ -19,25 +19,29 @@ from splatctrl_cli.cli.score_reference import add_scan, open_dtu, open_held_out,
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
 
 if TYPE_CHECKING:
     from splatctrl_cli.config import Config
     from splatctrl_cli.jobs.reconstruct import ReconstructResult
     from splatctrl_cli.records import Box, RecordSource
 
-DAMAGED = 3
 DEFAULT_POSE_JUMP = 1.0  # [m]
 DECIDING_OPTIONS = (
     *("cameras", "camera", "camera_pose", "world_frame", "depth_scale", "pairing_tolerance", "joint_topic"),
     *("holdout", "scan", "box"),
 )  # what decides the bytes of a scene, beside the configuration
-PASSED_ON = ("urdf", "spheres", "points", "declare", "allow_disagreement", "force", "resume", "seed", "threads")
-GATED = (
-    *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet", "evicted"),
-    *("unrepresented_voxels", "unrepresented_volume", "max_unrepresented_voxels"),
-    *("loss", "psnr"),
-)  # what --require can name
+PASSED_ON = (
+    "urdf",
+    "spheres",
+    "points",
+    "declare",
+    "allow_disagreement",
+    "force",
+    "resume",
+    "seed",
+    "threads",
+    "require",
+)
 
 
 def register(subparsers: Subparsers) -> None:
@@ -115,28 +119,23 @@ def run(args: argparse.Namespace) -> int:
         from splatctrl_cli.cli.reconstruct_gaussians import run as run_gaussians
 
         return run_gaussians(args, _config(args), _open(args), _box(args))
-    check_gate_names(args.require, GATED)
-    config = _config(args)  # refused before anything is read
     request = ReconstructRequest(
+        config=_config(args),  # refused before the source is opened
         source=_open(args),
         out=args.out or Path("scene"),
-        config=config,
         box=_box(args),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
         **{name: getattr(args, name) for name in PASSED_ON},
     )
     console = Console(args)
     result = reconstruct(request, console)
-    console.result(
-        {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed},
-        [*_lines(result), f"wrote {result.out}"],
-    )
-    check_gates(args.require, {name: _number(result.metrics[name]) for name in GATED})
-    return DAMAGED if result.loss.damaged else 0
+    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
+    console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"], result.verdict.exit_code)
+    return result.verdict.exit_code
 
 
 def _lines(result: "ReconstructResult") -> list[str]:
-    metrics, removed, loss = result.metrics, result.removed, result.loss
+    metrics, removed = result.metrics, result.removed
     psnr = metrics["psnr"]
     columns = {
         **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
@@ -148,23 +147,13 @@ def _lines(result: "ReconstructResult") -> list[str]:
     lines = table(list(columns), [list(columns.values())])
     reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
     lines.append("removed: " + (", ".join(reasons) or "none"))
-    if metrics["frames_without_depth"]:
-        lines.append(
-            f"note: {metrics['frames_without_depth']} frames without any valid depth: nothing seeded from them"
-        )
-    if loss.invalid_depth:
-        lines.append(f"note: {loss.invalid_depth} pixels of depth NaN, infinite or negative: taken as none")
-    return lines + [f"note: {note}" for note in loss.notes]
+    return lines
 
 
 def _box(args: argparse.Namespace) -> "Box | None":
     from splatctrl_cli.records import Box
 
     return None if args.box is None else Box.from_text(args.box)
-
-
-def _number(value: object) -> float | None:
-    return None if value is None else float(str(value))
 
 
 def _config(args: argparse.Namespace) -> "Config":

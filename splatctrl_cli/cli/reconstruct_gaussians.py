@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
+from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.verdict import verdict_of
+from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
 from splatctrl_cli.jobs.reconstruction import training_cameras
 
 if TYPE_CHECKING:
@@ -17,7 +19,6 @@ if TYPE_CHECKING:
     from splatctrl_cli.records import Box, RecordSource, RgbdFrame
     from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow
 
-DAMAGED = 3
 GATED = ("iterations", "splats", "cloned", "split", "pruned", "unmet", "loss", "psnr")  # what --require can name
 ROUTES = "leave out --method, or give a folder of views (a TOML file or --dtu)"
 
@@ -49,6 +50,13 @@ def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box:
             "background": list(fitter.background),
             "workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()],
         }
+        gates = gate_reasons(args.require, {name: _number(metrics[name]) for name in GATED})
+        verdict = verdict_of(
+            "reconstruct",
+            [map_reason(rows[-1].gaussians), *loss_notes(source.loss), *gates],
+            scope=f"{len(frames)} views, {rows[-1].gaussians} Gaussians",
+            is_damaged=bool(source.loss.damaged),
+        )
         write_run(
             partial,
             command="reconstruct",
@@ -57,12 +65,11 @@ def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box:
             metrics=metrics,
             stopwatch=stopwatch,
             seed=args.seed,
+            verdict=verdict.as_dict(),
         )
-    console.result(
-        {"scene": str(out), "metrics": metrics}, [*_lines(metrics, stopwatch.seconds["fit"], source), f"wrote {out}"]
-    )
-    check_gates(args.require, {name: _number(metrics[name]) for name in GATED})
-    return DAMAGED if source.loss.damaged else 0
+    lines = [*_lines(metrics, stopwatch.seconds["fit"]), f"wrote {out}"]
+    console.concluded(verdict, {"scene": str(out), "metrics": metrics}, lines, verdict.exit_code)
+    return verdict.exit_code
 
 
 def _refuse_what_needs_time(args: argparse.Namespace, source: "RecordSource") -> None:
@@ -134,14 +141,13 @@ def _metrics(rows: "list[GaussianAuditRow]", frames: "list[RgbdFrame]") -> dict[
     }
 
 
-def _lines(metrics: dict[str, object], seconds: float, source: "RecordSource") -> list[str]:
+def _lines(metrics: dict[str, object], seconds: float) -> list[str]:
     psnr = _number(metrics["psnr"])
     names = ("iterations", "splats", "cloned", "split", "pruned", "unmet")
-    lines = table(
+    return table(
         [*names, "training dB", "seconds"],
         [[*(metrics[name] for name in names), "-" if psnr is None else f"{psnr:.2f}", f"{seconds:.1f}"]],
     )
-    return lines + [f"note: {note}" for note in source.loss.notes]
 
 
 def _number(value: object) -> float | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
-from splatctrl_cli.cli.score_baseline import PREFIX, add_baseline, changes, read_baseline
+from splatctrl_cli.cli.score_baseline import add_baseline, changes, read_baseline
 from splatctrl_cli.cli.score_cloud import add_cloud, cloud_figures, cloud_settings
 from splatctrl_cli.cli.score_fit import add_fit, run_fit
 from splatctrl_cli.cli.score_reference import (
@@ -16,16 +16,14 @@ from splatctrl_cli.cli.score_reference import (
     open_reference,
     recording_check,
 )
-from splatctrl_cli.cli.score_report import lines_of, result_of, write_scores
+from splatctrl_cli.cli.score_report import gated_names, lines_of, result_of, score_verdict, write_scores
 from splatctrl_cli.cli.score_scans import lines_of_scans, scenes_of_scans, score_scans
 from splatctrl_cli.cli.source_options import add_source
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
+from splatctrl_cli.evaluate.gates import check_gate_names
 
 if TYPE_CHECKING:
-    from splatctrl_cli.records import RecordSource
-
-DAMAGED = 3
+    from splatctrl_cli.evaluate.verdict import Verdict
 
 
 def register(subparsers: Subparsers) -> None:
@@ -96,10 +94,10 @@ def run(args: argparse.Namespace) -> int:
     for name, default in (("config", None), ("set", []), ("seed", 0), ("fit_iterations", None), ("fit_splats", None)):
         if getattr(args, name) != default:
             raise UsageError(f"--{name.replace('_', '-')}: only with --fit", remedy="leave it out")
-    names = _gated()
-    changed = [PREFIX + name for name in names]
-    earlier = None if args.baseline is None else read_baseline(args.baseline)
-    check_gate_names(args.require, [*names, *changed] if earlier else names, {"--baseline": changed})
+    names, changed = gated_names(with_changes=False), gated_names(with_changes=True)
+    if args.baseline is not None:
+        read_baseline(args.baseline)  # better refused now than after the views
+    check_gate_names(args.require, names if args.baseline is None else changed, {"--baseline": changed})
     console = Console(args)
     from splatctrl_cli.io.output import output_path
 
@@ -107,28 +105,18 @@ def run(args: argparse.Namespace) -> int:
     output = output_path(args.out, force=args.force, is_folder=True) if args.out else nullcontext()
     with output as folder:
         if scenes:
-            result, is_damaged = score_scans(args, console, scenes, score_scene, folder)
+            result, verdict = score_scans(args, console, scenes, score_scene, folder)
         else:
-            result, source = score_scene(args, console, folder)
-            is_damaged = bool(source.loss.damaged)
-    if earlier is not None:
-        result["metrics"] |= changes(result, earlier, args.baseline)
-    console.result(result, lines_of_scans(result) if scenes else lines_of(result))
-    check_gates(args.require, dict.fromkeys([*names, *changed], None) | result["metrics"])
-    return DAMAGED if is_damaged else 0
+            result, verdict = score_scene(args, console, folder)
+    lines = lines_of_scans(result) if scenes else lines_of(result)
+    console.concluded(verdict, result, lines, verdict.exit_code)
+    return verdict.exit_code
 
 
-def _gated() -> tuple[str, ...]:
-    from splatctrl_cli.evaluate.cloud import cloud_names
-    from splatctrl_cli.evaluate.score import metric_names
-
-    return (*metric_names(), *cloud_names(), "free_mass", "num_skipped", "num_warnings", "num_scans")
-
-
-def score_scene(
-    args: argparse.Namespace, console: Console, folder: Path | None
-) -> "tuple[dict[str, Any], RecordSource]":
-    """Score one scene, write what `-o` asks for into `folder`, and return everything that --json prints."""
+def score_scene(args: argparse.Namespace, console: Console, folder: Path | None) -> "tuple[dict[str, Any], Verdict]":
+    """Score one scene, write what `-o` asks for into `folder`, and return everything that --json prints, and the
+    verdict.
+    """
     from splatctrl_cli.cli.score_views import Scorer, view_drawer
     from splatctrl_cli.evaluate.perceptual import Lpips
     from splatctrl_cli.io.output import Stopwatch
@@ -152,6 +140,9 @@ def score_scene(
         with stopwatch.stage("cloud"):
             surface = (cloud, cloud_figures(cloud, scene, scores.training, args.threads))
     result = result_of(args, scene, reference, cameras, scores, recording=recording, cloud=surface, lpips=lpips)
+    if args.baseline is not None:
+        result["metrics"] |= changes(result, read_baseline(args.baseline), args.baseline)
+    verdict = score_verdict(result, args.require, is_damaged=bool(reference.source.loss.damaged))
     if folder:
-        write_scores(folder, args, digests, result, scores, stopwatch)
-    return result, reference.source
+        write_scores(folder, args, digests, result, scores, stopwatch, verdict)
+    return result, verdict

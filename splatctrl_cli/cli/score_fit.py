@@ -16,17 +16,16 @@ from splatctrl_cli.cli.numbers import setting, whole
 from splatctrl_cli.cli.score_cloud import cloud_settings
 from splatctrl_cli.cli.score_fit_picture import draw_methods
 from splatctrl_cli.cli.score_reference import is_folder_of_views, words
-from splatctrl_cli.cli.score_report import COLUMNS, cell, protocol_lines
+from splatctrl_cli.cli.score_report import COLUMNS, cell, protocol_lines, views_reason
 from splatctrl_cli.cli.score_scans import masks_of_scan
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.map import MOST_ITERATIONS
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
+from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.verdict import Verdict, noted, verdict_of
 
 if TYPE_CHECKING:
-    from splatctrl_cli.records import RecordSource
-
-    ScoreScene = Callable[[argparse.Namespace, Console, Path | None], tuple[dict[str, Any], RecordSource]]
+    ScoreScene = Callable[[argparse.Namespace, Console, Path | None], tuple[dict[str, Any], Verdict]]
 
 NUM_SPLATS = 10_000  # IV-A: what both methods begin with, and the budget of ours
 METHODS = {"3dgs": "3D-GS", "budget": "ours"}
@@ -127,11 +126,24 @@ def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
                 scenes = {name: folder / scan / method / "scene" for method, name in METHODS.items()}
                 draw_methods(_scoring(args, scan), console, scenes, folder / scan / "methods.png")
         result = _result(args, fits, iterations, splats)
+        verdict = _verdict(result, fits, args.require)
         if args.out is not None:
-            _write(folder, args, result, config.as_dict())
-    console.result(result, _lines(result, fits))
-    check_gates(args.require, dict.fromkeys(GATED, None) | result["metrics"])
-    return 0
+            _write(folder, args, result, config.as_dict(), verdict)
+    console.concluded(verdict, result, _lines(result, fits), verdict.exit_code)
+    return verdict.exit_code
+
+
+def _verdict(result: dict[str, Any], fits: Sequence[Fitted], require: Sequence[str]) -> Verdict:
+    num_views = min(fit.score["metrics"]["num_views"] for fit in fits)
+    return verdict_of(
+        "score",
+        [
+            views_reason(num_views),
+            *(noted("score", line) for line in result["warnings"]),
+            *gate_reasons(require, dict.fromkeys(GATED, None) | result["metrics"]),
+        ],
+        scope=f"{len(fits)} fits of {', '.join(result['scans'])}",
+    )
 
 
 def _refuse(args: argparse.Namespace) -> None:
@@ -177,6 +189,7 @@ def _scored(
 
 def _scoring(args: argparse.Namespace, scan: str) -> argparse.Namespace:
     """What `score` would be told of one scan."""
+    args = argparse.Namespace(**{**vars(args), "require": []})  # the gates are on both fits together
     if args.dtu is None:
         return argparse.Namespace(**{**vars(args), "scan": None})
     masks = args.masks
@@ -310,7 +323,6 @@ def _lines(result: dict[str, Any], fits: Sequence[Fitted]) -> list[str]:
         *protocol_lines(result["protocol"]),
         f"PSNR {result['psnr']}; {settings['splats']:,} splats to begin with, {settings['iterations']} iterations,"
         f" seed {settings['seed']}, the same losses; memory: the largest of the scans",
-        *(f"warning: {line}" for line in result["warnings"]),
     ]
 
 
@@ -332,7 +344,9 @@ def _whole(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}"
 
 
-def _write(folder: Path, args: argparse.Namespace, result: dict[str, Any], config: dict[str, Any]) -> None:
+def _write(
+    folder: Path, args: argparse.Namespace, result: dict[str, Any], config: dict[str, Any], verdict: Verdict
+) -> None:
     from splatctrl_cli.io.output import Stopwatch, write_json, write_run
 
     write_json(folder / "score.json", result)
@@ -344,4 +358,5 @@ def _write(folder: Path, args: argparse.Namespace, result: dict[str, Any], confi
         metrics=result["metrics"],
         stopwatch=Stopwatch(),
         seed=args.seed,
+        verdict=verdict.as_dict(),
     )

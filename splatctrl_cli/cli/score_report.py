@@ -1,7 +1,7 @@
 """What `score` prints and writes: the protocol it went by, a row per view, the mean."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from splatctrl_cli.cli.score_views import Scores
 
 if TYPE_CHECKING:
     from splatctrl_cli.evaluate.perceptual import Lpips
+    from splatctrl_cli.evaluate.verdict import Reason, Verdict
     from splatctrl_cli.io.output import Stopwatch
     from splatctrl_cli.io.scene_folder import SceneFolder
 
@@ -91,6 +92,49 @@ def _free_mass(path: Path, scene: "SceneFolder") -> float:
     return free_mass(spheres.splats, scene.occupancy(), free_below)
 
 
+def gated_names(*, with_changes: bool) -> tuple[str, ...]:
+    """What --require can name; with_changes: since a --baseline, too."""
+    from splatctrl_cli.evaluate.cloud import cloud_names
+    from splatctrl_cli.evaluate.score import metric_names
+
+    names = (*metric_names(), *cloud_names(), "free_mass", "num_skipped", "num_warnings", "num_scans")
+    return (*names, *(PREFIX + name for name in names)) if with_changes else names
+
+
+def score_verdict(result: Mapping[str, Any], require: Sequence[str], *, is_damaged: bool) -> "Verdict":
+    """The verdict on a result: that there are views, what speaks against its figures, and each ``--require``."""
+    from splatctrl_cli.evaluate.gates import gate_reasons
+    from splatctrl_cli.evaluate.verdict import noted, verdict_of
+
+    metrics = result["metrics"]
+    num_scans = metrics.get("num_scans")
+    of_scans = "" if num_scans is None else f" of {_count(num_scans, 'scan')}"
+    return verdict_of(
+        "score",
+        [
+            views_reason(metrics["num_views"]),
+            *(noted("score", line) for line in result["warnings"]),
+            *gate_reasons(require, dict.fromkeys(gated_names(with_changes=True), None) | metrics),
+        ],
+        scope=f"{_count(metrics['num_views'], 'view')}{of_scans}",
+        is_damaged=is_damaged,
+    )
+
+
+def views_reason(num_views: float) -> "Reason":
+    """Whether anything was compared."""
+    from splatctrl_cli.evaluate.verdict import Outcome, Reason
+
+    return Reason(
+        criterion="views",
+        outcome=Outcome.PASSED if num_views else Outcome.NOT_EVALUABLE,
+        sentence=f"{_count(num_views, 'view')} compared",
+        value=float(num_views),
+        threshold=1.0,
+        count=int(num_views),
+    )
+
+
 def write_scores(
     folder: Path,
     args: argparse.Namespace,
@@ -98,6 +142,7 @@ def write_scores(
     result: dict[str, Any],
     scores: Scores,
     stopwatch: "Stopwatch",
+    verdict: "Verdict",
 ) -> None:
     """The files of ``score -o``."""
     import csv
@@ -123,6 +168,7 @@ def write_scores(
         inputs={**digests, "scene/splats.ply": sha256(args.scene / "splats.ply")},
         metrics=result["metrics"],
         stopwatch=stopwatch,
+        verdict=verdict.as_dict(),
     )
 
 
@@ -165,7 +211,6 @@ def lines_of(result: dict[str, Any]) -> list[str]:
     )
     if "chamfer" in metrics:
         lines += cloud_lines(metrics, result["protocol"]["definitions"]["cloud"])
-    lines += [f"warning: {line}" for line in result["warnings"]]
     lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
     if metrics["free_mass"] is not None:
         lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")

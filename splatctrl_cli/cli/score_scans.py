@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import Console, table
-from splatctrl_cli.cli.score_baseline import change_cells
+from splatctrl_cli.cli.score_baseline import PREFIX, change_cells, changes, read_baseline
 from splatctrl_cli.cli.score_reference import words
-from splatctrl_cli.cli.score_report import COLUMNS, cell, cloud_lines, protocol_lines, with_change
+from splatctrl_cli.cli.score_report import COLUMNS, cell, cloud_lines, protocol_lines, score_verdict, with_change
 from splatctrl_cli.errors import InputError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.records import RecordSource
+    from splatctrl_cli.evaluate.verdict import Verdict
 
-    ScoreScene = Callable[[argparse.Namespace, Console, Path | None], tuple[dict[str, Any], RecordSource]]
+    ScoreScene = Callable[[argparse.Namespace, Console, Path | None], tuple[dict[str, Any], Verdict]]
 
 SUMS = ("num_views", "num_skipped", "num_warnings", "num_points", "num_reference")
 
@@ -42,8 +42,8 @@ def score_scans(
     scenes: Mapping[str, Path],
     score_scene: "ScoreScene",
     folder: Path | None,
-) -> tuple[dict[str, Any], bool]:
-    """Score every scene against its scan; returns what --json prints, and whether a scan was damaged.
+) -> "tuple[dict[str, Any], Verdict]":
+    """Score every scene against its scan; returns what --json prints, and the verdict, on the means.
 
     Masks are those of DIR/SCAN; `folder` gets a folder for each scan, and the means.
     """
@@ -55,13 +55,18 @@ def score_scans(
         if place is not None:
             place.mkdir()
         masks = None if args.masks is None else masks_of_scan(args.masks, scan)
-        scoring = argparse.Namespace(**{**vars(args), "scene": scene, "scan": scan, "masks": masks})
-        results[scan], source = score_scene(scoring, console, place)
-        is_damaged |= bool(source.loss.damaged)
+        of_scan = {"scene": scene, "scan": scan, "masks": masks}
+        of_scan |= {"require": [], "baseline": None}  # which the means alone are held to
+        scoring = argparse.Namespace(**{**vars(args), **of_scan})
+        results[scan], verdict = score_scene(scoring, console, place)
+        is_damaged |= verdict.is_damaged
     result = result_of_scans(args, results)
+    if args.baseline is not None:
+        result["metrics"] |= changes(result, read_baseline(args.baseline), args.baseline)
+    verdict = score_verdict(result, args.require, is_damaged=is_damaged)
     if folder is not None:
-        _write(folder, result)
-    return result, is_damaged
+        _write(folder, result, verdict)
+    return result, verdict
 
 
 def masks_of_scan(folder: Path, scan: str) -> Path:
@@ -134,17 +139,26 @@ def lines_of_scans(result: dict[str, Any]) -> list[str]:
     lines += ["", *protocol_lines(result["protocol"])]
     if "chamfer" in metrics:
         lines += cloud_lines(metrics, "; ".join(one["protocol"]["definitions"]["cloud"] for one in results.values()))
-    return lines + [f"warning: {line}" for line in result["warnings"]]
+    return lines
 
 
-def _write(folder: Path, result: dict[str, Any]) -> None:
+def _write(folder: Path, result: dict[str, Any], verdict: "Verdict") -> None:
     import csv
 
-    from splatctrl_cli.io.output import write_json
+    from splatctrl_cli.io.output import Stopwatch, write_json, write_run
 
     write_json(folder / "score.json", result)
     with (folder / "scans.csv").open("w", newline="", encoding="utf-8") as stream:
-        names = [name for name in result["metrics"] if name != "num_scans"]
+        names = [name for name in result["metrics"] if name != "num_scans" and not name.startswith(PREFIX)]
         rows = csv.DictWriter(stream, fieldnames=["scan", *names], lineterminator="\n", extrasaction="ignore")
         rows.writeheader()
         rows.writerows({"scan": scan, **one["metrics"]} for scan, one in result["results"].items())
+    write_run(
+        folder,
+        command="score",
+        config={"scans": result["scans"]},
+        inputs={},
+        metrics=result["metrics"],
+        stopwatch=Stopwatch(),
+        verdict=verdict.as_dict(),
+    )

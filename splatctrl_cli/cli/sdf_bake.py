@@ -17,7 +17,7 @@ from splatctrl_cli.cli.bake_options import (
 )
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, configured
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
+from splatctrl_cli.evaluate.gates import check_gate_names
 
 if TYPE_CHECKING:
     from splatctrl_cli.cli.bake_report import FieldReport
@@ -41,7 +41,7 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.cli.bake_report import metric_names, metrics
+    from splatctrl_cli.cli.bake_report import bake_verdict, metric_names, metrics
     from splatctrl_cli.cli.bake_run import CHECKPOINT, FOLDER, clear_leftovers
     from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
     from splatctrl_cli.jobs.resume import told_how_to_go_on
@@ -63,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
         result = report.summary() | ({"accuracy": report.accuracy} if report.accuracy else {})
         truth = None if report.accuracy is None else report.accuracy.get("truth")
         figures = metrics(result, truth)
+        has_occupancy = job.source.occupancy is not None
+        verdict = bake_verdict(report, config.field.max_loss, args.require, figures, has_occupancy=has_occupancy)
         _remove(partial / FOLDER)
         write_run(
             partial,
@@ -72,11 +74,11 @@ def run(args: argparse.Namespace) -> int:
             metrics=figures,
             stopwatch=stopwatch,
             seed=args.seed,
+            verdict=verdict.as_dict(),
         )
     console.log(f"baked in {stopwatch.seconds['bake']:.2f} s; wrote {out}")
-    console.result(result, lines)
-    check_gates(args.require, figures)
-    return 0
+    console.concluded(verdict, result, lines, verdict.exit_code)
+    return verdict.exit_code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,9 +193,7 @@ def _bake(
         grid, changes = _baked(job, args, partial, console)
     with stopwatch.stage("report"):
         statistics = grid_statistics(grid)
-        warnings = warnings_of(grid.header, statistics, has_occupancy=job.source.occupancy is not None)
-        for warning in warnings:
-            console.log(f"warning: {warning}")
+        warnings = warnings_of(grid.header, statistics)
     with stopwatch.stage("write"):
         write_grid(partial, grid, job.formats)
     report = FieldReport(grid=grid, statistics=statistics, warnings=warnings, changes=changes)

@@ -16,6 +16,7 @@ class Outcome(StrEnum):
 
 
 EXIT_CODES = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.NOT_EVALUABLE: 5}
+DAMAGED = 3
 _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a definite failure outranks missing evidence
 
 
@@ -26,7 +27,7 @@ class Reason:
     value and threshold in `unit`, None where there is none; time_s: when [s], counted as in the output's files;
     place (3,): where [m], world; who: the link, sphere, joint or camera; cause: what is there; remedy: what a person
     can do. count: how many states, views or points the value rests on. label: what the outcome is called where this
-    decides it, such as "contact".
+    decides it, such as "contact". is_note: worth a line though it decides nothing.
     """
 
     criterion: str
@@ -42,6 +43,7 @@ class Reason:
     remedy: str = ""
     count: int | None = None
     label: str = ""
+    is_note: bool = False
 
     def __str__(self) -> str:
         """The sentence with when, who, what, where and the remedy."""
@@ -56,7 +58,7 @@ class Verdict:
     """The outcome of a command and its reasons: those that decided it first.
 
     label: the outcome in the command's own word, such as "safe"; scope: what was judged; notes: what a person should
-    know and that decides nothing.
+    know and that decides nothing. is_damaged: part of the input was lost.
     """
 
     command: str
@@ -65,11 +67,12 @@ class Verdict:
     scope: str
     reasons: tuple[Reason, ...]
     notes: tuple[str, ...] = ()
+    is_damaged: bool = False
 
     @property
     def exit_code(self) -> int:
-        """0 passed, 1 failed, 5 not evaluable."""
-        return EXIT_CODES[self.outcome]
+        """1 failed, 5 not evaluable; passed 0, or 3 where part of the input was lost."""
+        return EXIT_CODES[self.outcome] or (DAMAGED if self.is_damaged else 0)
 
     def exit_code_of(self, criteria: tuple[str, ...] | None) -> int:
         """`exit_code` of the reasons alone whose criterion begins with one of `criteria` (None: of all)."""
@@ -82,6 +85,11 @@ class Verdict:
     def decisive(self) -> tuple[Reason, ...]:
         """The reasons that are not passed, those of the outcome first."""
         return tuple(reason for reason in self.reasons if reason.outcome is not Outcome.PASSED)
+
+    @property
+    def said(self) -> tuple[Reason, ...]:
+        """The reasons that passed and are worth a line."""
+        return tuple(reason for reason in self.reasons if reason.is_note and reason.outcome is Outcome.PASSED)
 
     @property
     def sentence(self) -> str:
@@ -113,6 +121,7 @@ def verdict_of(
     scope: str = "",
     passed: str = "passed",
     notes: Iterable[str] = (),
+    is_damaged: bool = False,
 ) -> Verdict:
     """The verdict that reasons make: failed where any failed, else not evaluable where any is, else passed.
 
@@ -134,7 +143,13 @@ def verdict_of(
         scope=scope,
         reasons=tuple(ordered),
         notes=tuple(notes),
+        is_damaged=is_damaged,
     )
+
+
+def noted(criterion: str, sentence: str, *, remedy: str = "") -> Reason:
+    """A reason that decides nothing and is worth a line."""
+    return Reason(criterion=criterion, outcome=Outcome.PASSED, sentence=sentence, remedy=remedy, is_note=True)
 
 
 def _plain(reason: Reason) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Where the cells of a distance grid stand, and whether there is room for them."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from splatctrl_cli.records import Box, Float64, SplatSet
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
 
 HALF_DIAGONAL = 0.5 * 3.0**0.5  # of a cell, in voxels
+LOSS = 2.0 * HALF_DIAGONAL  # the most that the certified distance may read too little, in voxels
 
 Shape = tuple[int, int, int]
 
@@ -55,6 +57,24 @@ def bounding_box(splats: SplatSet, padding: float) -> Box:
     lower = (splats.centers - splats.radii[:, None]).min(axis=0).astype(np.float64)
     upper = (splats.centers + splats.radii[:, None]).max(axis=0).astype(np.float64)
     return Box(lower=lower - padding, upper=upper + padding)
+
+
+def check_loss(voxel: float, max_loss: float) -> None:
+    """Raise UsageError for cells [m] so large that what is read from them may be off by more than max_loss [m].
+
+    The certified distance is ``max_c (hard(c) - |x - c|)`` over the eight centres c around x. The nearest of them is
+    at most half a diagonal away, and hard is 1-Lipschitz: ``hard(c) >= hard(x) - |x - c|``, so it reads at most a
+    diagonal, ``sqrt(3) voxel``, below ``hard(x)``, as it does in the middle of eight balls around the centres. The
+    interpolated exact distance is off by at most half of that, either way.
+    """
+    loss = LOSS * voxel
+    if loss > max_loss:
+        largest = math.floor(max_loss / LOSS * 1e4) / 1e4
+        raise UsageError(
+            f"field.voxel: expected at most {largest:g} m, which loses up to field.max_loss = {max_loss:g} m of"
+            f" clearance, got {voxel:g} m, which loses up to {loss:.4g} m",
+            remedy=f"give --voxel {largest:g} or less",
+        )
 
 
 def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:

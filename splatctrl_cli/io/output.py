@@ -209,9 +209,11 @@ def write_run(
     metrics: Mapping[str, Any],
     stopwatch: Stopwatch,
     seed: int = 0,
+    verdict: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, and what came out; of WITH_PARTS
-    also the sha256 of every file, which is checked when one is opened: it is to be written last.
+    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, what came out and, of a command
+    that judges, its verdict; of WITH_PARTS also the sha256 of every file, which is checked when one is opened: it is
+    to be written last.
 
     ``--resume`` is left out of the arguments: an interrupted run leaves what an uninterrupted one does.
     """
@@ -226,6 +228,7 @@ def write_run(
         "config": config,
         "inputs": inputs,
         "metrics": metrics,
+        **({} if verdict is None else {"verdict": verdict}),
         "seconds": {name: round(value, 4) for name, value in stopwatch.seconds.items()},
     }
     if command in WITH_PARTS:

@@ -1,20 +1,23 @@
 """A reconstruction from its request to its result: a recording into splats, occupancy, audit and snapshots."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.gates import check_gate_names
+from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.io.points import read_points
 from splatctrl_cli.io.scene_writer import CHECKPOINT
 from splatctrl_cli.io.shot import ShotSource
 from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.reconstruction import Reconstruction, training_cameras
 from splatctrl_cli.jobs.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
-from splatctrl_cli.records import Box, LossReport, RecordSource
+from splatctrl_cli.records import Box, RecordSource
 from splatctrl_cli.robot.declared import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.consistency import largest_jump
@@ -26,8 +29,8 @@ class ReconstructRequest:
 
     urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given.
     points: a coloured cloud to start from, instead of depth. declare: a TOML of what the robot carries. resume: go on
-    with what an interrupted run left. options: what else decides the bytes, by the names of the options: a run that
-    is resumed must have the same.
+    with what an interrupted run left. require: gates on its metrics. options: what else decides the bytes, by the
+    names of the options: a run that is resumed must have the same.
     """
 
     source: RecordSource
@@ -43,19 +46,20 @@ class ReconstructRequest:
     resume: bool = False
     seed: int = 0
     threads: int = 0
+    require: Sequence[str] = ()
     options: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructResult:
-    """The scene folder `out`, its metrics as in ``run.json``, splats removed by reason, what the input lost, and the
-    time it took [s].
+    """The scene folder `out`, its metrics and verdict as in ``run.json``, splats removed by reason, and the time it
+    took [s].
     """
 
     out: Path
     metrics: Mapping[str, Any]
+    verdict: Verdict
     removed: Mapping[str, int]
-    loss: LossReport
     seconds: float
 
 
@@ -65,6 +69,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
     Raises SplatCtrlError for a recording that cannot be reconstructed.
     """
     source, config = request.source, request.config
+    check_gate_names(request.require, GATED)
     training_cameras(source)
     robot = _robot(request)
     for doubt in () if robot is None else robot.doubts:
@@ -111,6 +116,14 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         for table, index in declared.unused():
             if table == "carried":
                 progress.log(f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it")
+        made = Reconstructed(
+            metrics=metrics,
+            rows=fitted.rows,
+            config=config,
+            loss=source.loss,
+            is_seeded=request.points is not None,
+        )
+        verdict = reconstruct_verdict(made, request.require)
         write_run(
             partial,
             command="reconstruct",
@@ -119,12 +132,13 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
             metrics=metrics,
             stopwatch=stopwatch,
             seed=request.seed,
+            verdict=verdict.as_dict(),
         )
     return ReconstructResult(
         out=request.out,
         metrics=metrics,
+        verdict=verdict,
         removed={name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed},
-        loss=source.loss,
         seconds=sum(stopwatch.seconds.values()),
     )
 

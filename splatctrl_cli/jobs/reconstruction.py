@@ -295,7 +295,11 @@ class Reconstruction:
 
     def _restore(self, checkpoint: "Checkpoint") -> None:
 
-        self.rows = [AuditRow(**{**row, "cameras": tuple(row["cameras"])}) for row in self.writer.audited()]
+        tuples = ("cameras", "blind")
+        self.rows = [
+            AuditRow(**row | {name: tuple(row[name]) for name in tuples if name in row})
+            for row in self.writer.audited()
+        ]
         self.num_read = checkpoint.progress["num_read"]
         self.is_refined = checkpoint.progress["is_refined"]
         self.stamps = checkpoint.progress["stamps"]

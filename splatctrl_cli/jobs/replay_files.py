@@ -48,7 +48,15 @@ def write_replay(
     with stopwatch.stage("picture"):
         draw_replay(folder, replay, seconds_of(replay))
         replay_compare.draw_methods(folder, replay.comparison, replay.period, replay.margin)
-    write_run(folder, command="replay", config=config.as_dict(), inputs=inputs, metrics=metrics, stopwatch=stopwatch)
+    write_run(
+        folder,
+        command="replay",
+        config=config.as_dict(),
+        inputs=inputs,
+        metrics=metrics,
+        stopwatch=stopwatch,
+        verdict=verdict.as_dict(),
+    )
 
 
 def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, coverage: str) -> dict[str, Any]:

@@ -14,7 +14,8 @@ class AuditRow:
     without any. unrepresented: occupied voxels that no splat stands for. without_depth: frames without any valid
     depth, which seed nothing. loss and psnr are None where no view shows anything of the workspace. self_mask: by
     link, measured less rendered depth over the pixels within the robot's outline: `median_mm`, its `sign` and
-    `num_pixels`. inside_robot: by link, measured points inside it that its surface does not explain.
+    `num_pixels`. inside_robot: by link, measured points inside it that its surface does not explain. blind: cameras
+    without any valid depth.
     """
 
     stamp_ns: int
@@ -34,6 +35,7 @@ class AuditRow:
     psnr: float | None
     self_mask: dict[str, dict[str, float]] = field(default_factory=dict)
     inside_robot: dict[str, int] = field(default_factory=dict)
+    blind: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -472,6 +472,7 @@ class SceneFitter:
         terms = [known.get(id(view)) or self._evaluate(view, self._planes(view)) for view in counted]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
         loss, psnr = mean_loss(terms, c), psnr_of(terms)
+        empty = [view for view in views if not (view.frame.depth > 0).any()]
         return AuditRow(
             stamp_ns=max(view.frame.stamp_ns for view in views),
             cameras=tuple(view.frame.camera for view in views),
@@ -485,7 +486,8 @@ class SceneFitter:
             robot=int((buffer.labels[buffer.is_alive] == Label.ROBOT).sum()),
             human=int((buffer.labels[buffer.is_alive] == Label.HUMAN).sum()),
             unrepresented=len(self.unrepresented),
-            without_depth=sum(not (view.frame.depth > 0).any() for view in views),
+            without_depth=len(empty),
+            blind=tuple(dict.fromkeys(view.frame.camera for view in empty)),
             loss=None if loss is None else round(loss + c.lambda_reg * opacity, 6),
             psnr=None if psnr is None else round(psnr, 4),
         )

@@ -53,7 +53,7 @@ def test_a_frame_without_depth_is_counted_and_seeds_nothing(
     views = [frame() for _ in range(4)]
     views[2].depth[:] = 0.0
     assert reconstruct(write_folder(tmp_path / "in", views), tmp_path / "scene", "-q") == 0
-    assert "note: 1 frames without any valid depth" in capsys.readouterr().out
+    assert "  note: depth: 1 frame has none: nothing is seeded from it" in capsys.readouterr().out
     rows = audit(tmp_path / "scene")
     assert [row["without_depth"] for row in rows] == [0, 0, 1, 0]
     assert json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]["frames_without_depth"] == 1
@@ -64,7 +64,7 @@ def test_depth_that_is_not_finite_is_counted_and_is_none(tmp_path: Path, capsys:
     for view, values in ((odd[1], [np.nan, np.inf, -np.inf, -1.0]), (plain[1], [0.0] * 4)):
         view.depth[20, 10:14] = values
     assert reconstruct(write_folder(tmp_path / "odd", odd), tmp_path / "a", "-q") == 0
-    assert "note: 4 pixels of depth NaN, infinite or negative: taken as none" in capsys.readouterr().out
+    assert "  note: input: 4 pixels of depth NaN, infinite or negative: taken as none" in capsys.readouterr().out
     assert reconstruct(write_folder(tmp_path / "plain", plain), tmp_path / "b", "-q") == 0
     assert "infinite" not in capsys.readouterr().out
     assert audit(tmp_path / "a") == audit(tmp_path / "b")

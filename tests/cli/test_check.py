@@ -20,7 +20,7 @@ GOOD = LogRecipe(num_frames=20)
 def test_a_good_log_is_exit_0_and_can_start_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, printed, error = run(capsys, "check", make_log(tmp_path / "log.mcap", GOOD), "--fail-on", "warning")
     assert (code, error) == (0, "")
-    assert "0 errors, 0 warnings, " in printed
+    assert re.match(r"check: PASSED \(log\.mcap: 0 errors, 0 warnings, \d+ notes?\)\n\n", printed)
     assert "can start: ingest, reconstruct, score, replay" in printed
 
 
@@ -32,7 +32,8 @@ def test_a_warning_fails_where_it_is_asked_to(
     found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on)
     assert found == code
     assert "warning: camera cam0, at " in printed
-    assert "[pose-missing]" in printed
+    assert printed.startswith("check: FAILED (" if code else "check: PASSED (")
+    assert printed.count("[pose-missing]\n") == 1, "its table says it, and nothing else does"
 
 
 @pytest.mark.parametrize(("fail_on", "code"), [("error", 1), ("warning", 1), ("never", 0)])
@@ -43,6 +44,8 @@ def test_an_error_fails_unless_never(
     found, printed, _ = run(capsys, "check", log, "--fail-on", fail_on, "--json")
     assert found == code
     result = json.loads(printed)
+    assert (result["exit_code"], result["verdict"]["outcome"]) == (code, "failed")
+    assert result["verdict"]["reasons"][0]["criterion"] == "depth-scale"
     assert result["counts"]["error"] == 1
     finding = result["findings"][0]
     assert (finding["severity"], finding["code"], finding["where"]) == (

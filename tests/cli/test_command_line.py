@@ -3,6 +3,7 @@
 Each subcommand runs as a process of its own in some tests; what only asks for another line of it runs in this one.
 """
 
+import argparse
 import json
 import signal
 import subprocess
@@ -15,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli import demo
-from splatctrl_cli.cli.main import COMMANDS, main
+from splatctrl_cli.cli.main import COMMANDS, build_parser, main
+from splatctrl_cli.evaluate.verdict import noted
 from splatctrl_cli.io.capture import write_capture
 from splatctrl_cli.io.source import open_source
 from tests.cli import here
@@ -59,7 +61,7 @@ class Work:
             "ingest": [self.log],
             "reconstruct": [self.log, "--cameras", "cam0", *QUICK],
             "export": [scene],
-            "sdf-bake": [scene, "--voxel", "0.5"],
+            "sdf-bake": [scene, "--voxel", "0.5", "--set", "field.max_loss=1"],
             "score": [scene, "--reference", self.log, "--cameras", "cam1", "--threads", "1"],
             "robot": ["spheres", "--urdf", urdf],
             "replay": [self.log, "--scene", scene, "--urdf", urdf, "--max-unknown", "1"],
@@ -242,15 +244,56 @@ def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: 
 def test_force_replaces_what_the_demo_wrote(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(demo, "_run", lambda command, expected, console, folder, out: None)
+    done = noted("step", "expected 'done', got 'done'")
+    monkeypatch.setattr(demo, "_run", lambda command, console, folder, out: done)
     monkeypatch.setattr(demo, "_pictures", lambda data, out, threads: {})
     out = tmp_path / "out"
     assert main(["demo", "-o", str(out), "-q"]) == 0
     run = json.loads((out / "run.json").read_text())
     assert run["command"] == "demo"
     assert set(run["inputs"]) == {"log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml"}
+    assert run["verdict"]["label"] == "passed"
     assert main(["demo", "-o", str(out), "-q", "--force"]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    labels = dict(demo.EXPECTED)
+
+    def step(args: argparse.Namespace) -> int:
+        name = "replay --mode closed-loop" if getattr(args, "mode", "") == "closed-loop" else args.command
+        if name in labels:
+            args.out.mkdir()
+            (args.out / "run.json").write_text(json.dumps({"verdict": {"label": labels[name]}}))
+        return 1 if name.startswith("replay -") else 0
+
+    build = build_parser
+
+    def parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
+        made = build(words)
+        parse = made.parse_args
+        made.parse_args = lambda *given: argparse.Namespace(**{**vars(parse(*given)), "run": step})  # type: ignore
+        return made
+
+    monkeypatch.setattr(demo, "_pictures", lambda data, out, threads: {})
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr("splatctrl_cli.cli.main.build_parser", parser)
+        args = build(["demo"]).parse_args(["demo", "-o", str(out)])
+        assert demo.run(args) == 0
+        said = capsys.readouterr()
+        assert "demo: replay --mode closed-loop: expected 'margin broken', got 'margin broken'" in said.err
+        assert "\ndemo: PASSED (8 steps)\n" in f"\n{said.out}"
+        labels["replay --mode closed-loop"] = "safe"
+        args.force = True
+        assert demo.run(args) == 1
+    said = capsys.readouterr()
+    assert (
+        "demo: NOT AS EXPECTED (8 steps): replay --mode closed-loop: expected 'margin broken', got 'safe'" in said.out
+    )
+    assert json.loads((out / "run.json").read_text())["verdict"]["exit_code"] == 1
 
 
 @pytest.mark.parametrize("command", WRITERS)

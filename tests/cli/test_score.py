@@ -191,9 +191,11 @@ def test_without_a_clock_every_view_is_scored_from_the_final_splats(
 def test_the_table_shows_each_view_and_the_mean(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scored) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split("  ")[0] == "view"
-    assert [line.split()[0] for line in lines[2:5]] == ["cam3-0001", "cam3-0002", "cam3-0003"]
-    assert lines[6].startswith("mean of 3")
+    assert lines[0] == "score: PASSED (3 views)"
+    table = lines[lines.index("") + 1 :]
+    assert table[0].split("  ")[0] == "view"
+    assert [line.split()[0] for line in table[2:5]] == ["cam3-0001", "cam3-0002", "cam3-0003"]
+    assert table[6].startswith("mean of 3")
     assert "3 views scored, 1 before the first snapshot" in lines[-2]
     assert lines[-1].startswith("in front: ")
 

@@ -23,7 +23,9 @@ def test_both_methods_are_fitted_scored_and_printed_beside_the_paper(
     out = tmp_path / "fit"
     arguments = ["score", "--dtu", str(tmp_path / "dtu"), *QUICK, "--protocol", "holdout:0", "-o", str(out)]
     assert main([*arguments, "--require", "psnr_ours>=5", "--require", "memory_3dgs<=4000"]) == 0
-    header, _, theirs, ours, gain, *rest = capsys.readouterr().out.splitlines()
+    verdict, table = capsys.readouterr().out.split("\n\n", 1)
+    assert verdict.startswith("score: PASSED (2 fits of scan1)")
+    header, _, theirs, ours, gain, *rest = table.splitlines()
     assert header.split("  ")[0] == "method"
     assert theirs.split()[:3] == ["3D-GS", "23.27", "50,000-100,000"]
     assert ours.split()[:3] == ["ours", "23.33", "10,000"]
@@ -59,7 +61,7 @@ def test_the_mean_is_over_the_scans(
         return scene, 50.0 if scan == "scan1" else 70.0
 
     def score(args: Any, console: Any, folder: Path | None) -> Any:
-        metrics = dict.fromkeys(("psnr_seen", "ssim_all"), 1.0) | {
+        metrics = dict.fromkeys(("psnr_seen", "ssim_all", "num_views"), 1.0) | {
             "psnr_all": psnr.get((args.scan, args.scene.parent.name))
         }
         protocol = {"name": "x", "source": "y", "split": "z", "mask_rule": "none", "background": [0.0],

@@ -98,11 +98,11 @@ def test_the_report_says_by_what_its_figures_came_about(place: Path, capsys: pyt
     assert "\nsplit: train 1-3, 5-7; score 0, 4\n" in out
     assert "mask rule: object mask; averaging: mean over the views; resolution: 128x104; backgr" in out
     assert "dB mask" in out
-    assert "mask" in out.splitlines()[0]
+    assert "dB mask" in out.splitlines()[2]
     result = scored(capsys, place, "idr")
     assert " ".join(result) == (
-        "scene reference cameras training_cameras has_clock snapshots recording protocol metrics warnings"
-        " skipped_views views"
+        "exit_code verdict scene reference cameras training_cameras has_clock snapshots recording protocol metrics"
+        " warnings skipped_views views"
     )
     protocol = result["protocol"]
     assert " ".join(protocol) == (
@@ -173,7 +173,7 @@ def test_warnings_are_printed_counted_and_can_be_gated(
     arguments = ("--protocol", HOLDOUT, "--masks", tmp_path, "--require", "num_warnings<=0")
     assert run(place, "mvsnet", *arguments) == 1
     said = capsys.readouterr()
-    assert "\nwarning: holdout-0000 has its mask on 100% of the image's border" in said.out
+    assert "\n  note: score: holdout-0000 has its mask on 100% of the image's border" in said.out
     assert "num_warnings is 1, required <= 0" in said.err
     assert scored(capsys, place, "mvsnet", "--require", "num_warnings<=0")["warnings"] == []
 
@@ -191,7 +191,10 @@ def test_figures_are_compared_with_those_of_an_earlier_score(
     capsys.readouterr()
     assert run(place, "mvsnet", *given, *gate) == 1
     said = capsys.readouterr()
-    assert said.err == "splatctrl: gate failed: change_psnr_all is -1.5, required >= -1\n"
+    assert said.err.startswith(
+        "splatctrl: score: GATE FAILED (2 views): --require change_psnr_all>=-1: change_psnr_all"
+    )
+    assert said.err.endswith(" is -1.5, required >= -1\n")
     (change,) = [line.split() for line in said.out.splitlines() if line.startswith("change")]
     assert change[1:6] == ["-", "+0.00", "-1.50", "+0.0000", "+0.0000"]
     assert run(place, "mvsnet", *given, *gate[2:]) == 2
@@ -303,7 +306,9 @@ def test_a_cloud_in_another_unit_is_refused_with_both_boxes(
 
 def test_a_gate_on_what_was_not_scored_fails(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(place, "mvsnet", "--protocol", HOLDOUT, "--require", "psnr_masked>=1", "--require", "lpips<=1") == 5
-    assert "psnr_masked is unknown, required >= 1; lpips is unknown" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "score: NOT EVALUABLE (2 views): --require psnr_masked>=1: psnr_masked is unknown, required >= 1" in said
+    assert "lpips is unknown, required <= 1" in said
 
 
 def test_another_scan_of_the_same_camera_names_is_refused_with_figures(
@@ -331,7 +336,7 @@ def test_another_recording_may_be_scored_and_is_named(
     assert main(arguments) == 4
     assert "camera: the picture differs by up to " in capsys.readouterr().err
     assert main([*arguments, "--allow-other-recording"]) == 0
-    assert "warning: another recording: camera: the picture differs by up to" in capsys.readouterr().out
+    assert "note: score: another recording: camera: the picture differs by up to" in capsys.readouterr().out
 
 
 def test_a_scene_without_first_frames_is_told_by_the_digests_of_its_files(

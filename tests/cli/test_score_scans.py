@@ -59,7 +59,9 @@ def test_the_mean_is_over_the_scans_whose_own_means_stand_beside_it(
 
 def test_the_table_has_a_row_for_each_scan(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(place, "-q", "--scan", "scan8,scan21") == 0
-    lines = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr().out
+    assert printed.startswith("score: PASSED (2 views of 2 scans)\n")
+    lines = printed.split("\n\n", 1)[1].splitlines()
     assert [line.split()[0] for line in lines[:6]] == [
         "scan",
         lines[1].split()[0],
@@ -79,7 +81,9 @@ def test_a_scan_without_a_scene_and_a_gate_that_fails_are_named(
     assert run(place, "-q", "--scan", "scan8,scan9") == 4
     assert "no scene 'scan9'; scenes: scan21, scan8" in capsys.readouterr().err
     assert run(place, "-q", "--scan", "scan8", "--require", "psnr_masked>=90") == 1
-    assert "gate failed: psnr_masked is " in capsys.readouterr().err
+    assert (
+        "score: GATE FAILED (1 view of 1 scan): --require psnr_masked>=90: psnr_masked is " in capsys.readouterr().err
+    )
 
 
 def test_a_scene_of_another_scan_is_refused(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

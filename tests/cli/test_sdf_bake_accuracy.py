@@ -32,6 +32,7 @@ def true_splats(sample_data: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 def bake(scene: Path, out: Path, *more: object) -> int:
     box = "--box=" + ",".join(f"{value}" for value in BOX.ravel())
     given = ["sdf-bake", str(scene), "-o", str(out), box, "--voxel", "0.03", "--formats", "npz"]
+    given += ["--set", "field.max_loss=1"]
     return main([*given, "-q", *map(str, more)])
 
 

@@ -22,7 +22,7 @@ from splatctrl_cli.io.grid_slabs import GridSlabs
 from splatctrl_cli.io.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 
-OPTIONS = ["--voxel", "0.03", "--channels", "gradient,bound,observed,label,se", "-q"]
+OPTIONS = ["--voxel", "0.03", "--set", "field.max_loss=1", "--channels", "gradient,bound,observed,label,se", "-q"]
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from tests.field.scenes import cloud, splat_set
 from tests.known_voxels import known
 
 BOX = "--box=-0.6,-0.6,-0.5,0.6,0.6,0.5"
-OPTIONS = ["--voxel", "0.025", "--formats", "npz", "--no-report", "-q"]
+OPTIONS = ["--voxel", "0.025", "--set", "field.max_loss=1", "--formats", "npz", "--no-report", "-q"]
 SECOND = 10**9
 
 
@@ -120,7 +120,7 @@ def test_a_bare_file_needs_its_predecessor(fields: Path, tmp_path: Path, capsys:
 def test_a_field_that_every_splat_reaches_is_baked_anew_and_says_so(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ["--distance", "gpdf", "--voxel", "0.1"]
+    given = ["--distance", "gpdf", "--voxel", "0.1", "--set", "field.max_loss=1"]
     assert bake(scene, tmp_path / "0", BOX, "--at", "0", *given) == 0
     assert bake(scene, tmp_path / "2", BOX, "--at", "2", *given) == 0
     words = ["--at", "2", "--update", str(tmp_path / "0"), *given, *OPTIONS[2:-1]]

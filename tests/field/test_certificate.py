@@ -17,8 +17,11 @@ from benchmarks.surfaces import (
     splats_on,
 )
 from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.distance import GpdfField, SafeField, SeField, SphereField
+from splatctrl_cli.field.grid import GridField
+from splatctrl_cli.field.layout import LOSS, check_loss
 from splatctrl_cli.records import Box, DistanceGrid, Float64
 
 NUM = 4000
@@ -87,6 +90,31 @@ def test_the_bound_is_hard_at_the_centre_less_the_margin() -> None:
     cells = np.random.default_rng(0).integers(0, grid.channels["bound"].shape, (NUM, 3))
     exact = exact_distance(grid.origin + grid.voxel * cells, centers, radii)
     np.testing.assert_allclose(grid.channels["bound"][tuple(cells.T)] + margin, exact, atol=1e-6)
+
+
+def test_cells_lose_at_most_a_diagonal_and_all_of_it_between_eight_balls() -> None:
+    voxel, middle = 0.04, np.full(3, 0.02)
+    corners = voxel * np.array(np.meshgrid(*[[0, 1]] * 3)).reshape(3, -1).T
+    box = Box(lower=np.full(3, -0.2), upper=np.full(3, 0.2))
+    for centers, radii in [(corners, np.full(8, 1e-6)), (middle[None], np.array([0.001])), random_balls(60, seed=5)]:
+        field = GridField(bake(splat_set(centers, radii), box, FieldConfig(voxel=voxel, distance="hard")))
+        points = np.random.default_rng(1).uniform(-0.2, 0.2, (20 * NUM, 3))
+        points[0] = middle
+        exact = exact_distance(points, centers, radii)
+        lost = exact - field.certified(points)
+        assert lost.min() > -1e-6 and lost.max() < LOSS * voxel + 1e-5
+        assert np.abs(field.query(points)[0] - exact).max() < 0.5 * LOSS * voxel + 1e-5
+        if len(centers) == 8:
+            assert lost[0] == pytest.approx(np.sqrt(3) * voxel, abs=1e-5), "in the middle of eight balls it is all"
+
+
+def test_cells_that_lose_more_than_allowed_are_refused_with_the_largest_that_do_not() -> None:
+    check_loss(0.02, 0.04)
+    with pytest.raises(UsageError, match=r"at most 0\.023 m, .* got 0\.3 m, .* 0\.5196 m"):
+        check_loss(0.3, 0.04)
+    check_loss(0.023, 0.04)
+    with pytest.raises(UsageError, match=r"field\.max_loss = 0.04 m"):
+        check_loss(0.0231, 0.04)
 
 
 @pytest.mark.parametrize("distance", ["safe", "safe_gpdf"])
