@@ -28,7 +28,6 @@ from tests.jobs.broken import (
 from tests.jobs.stage import FAR, MOVE, Stage, ball_beside, decisive, passing, resting, states_on, voxels
 
 pytestmark = pytest.mark.usefixtures("without_plots")
-END = START + MOVE
 
 
 @pytest.fixture
