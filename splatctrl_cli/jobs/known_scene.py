@@ -176,7 +176,7 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
 
     scene = open_scene(path)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
-    has_times = scene.has_clock and len(stamps) > 1
+    has_times = scene.has_clock and bool(scene.snapshots)
     if latency_ns and not has_times:
         raise UsageError(
             f"--latency: {path} is one scene for all times: expected snapshots", remedy="leave --latency out"
