@@ -101,8 +101,8 @@ def test_the_report_says_by_what_its_figures_came_about(place: Path, capsys: pyt
     assert "dB mask" in out.splitlines()[2]
     result = scored(capsys, place, "idr")
     assert " ".join(result) == (
-        "exit_code verdict scene reference cameras training_cameras has_clock snapshots recording protocol metrics warnings"
-        " skipped_views views"
+        "exit_code verdict scene reference cameras training_cameras has_clock snapshots recording protocol metrics"
+        " warnings skipped_views views"
     )
     protocol = result["protocol"]
     assert " ".join(protocol) == (
