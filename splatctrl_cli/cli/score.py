@@ -119,6 +119,7 @@ def score_scene(args: argparse.Namespace, console: Console, folder: Path | None)
     """
     from splatctrl_cli.cli.score_views import Scorer, view_drawer
     from splatctrl_cli.evaluate.perceptual import Lpips
+    from splatctrl_cli.field.selection import field_splats
     from splatctrl_cli.io.output import Stopwatch
     from splatctrl_cli.io.scene_folder import open_scene
 
@@ -126,6 +127,8 @@ def score_scene(args: argparse.Namespace, console: Console, folder: Path | None)
     cloud = cloud_settings(args)
     lpips = None if args.lpips is None else Lpips(args.lpips)
     scene = open_scene(args.scene)
+    if not scene.is_anisotropic:
+        field_splats(scene.splats())  # raises where there is none to compare
     reference = open_reference(args, console)
     cloud = None if cloud is None else cloud.of_scan(reference.scan)
     cameras = cameras_to_score(args, reference, scene.cameras)

@@ -115,7 +115,7 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
         )
     if not long:
         frames = "1 frame has" if without == 1 else f"{without} frames have"
-        yield noted("depth", f"{frames} none: nothing is seeded from it")
+        yield noted("depth", f"{frames} none, which seeds nothing")
 
 
 def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:

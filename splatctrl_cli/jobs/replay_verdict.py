@@ -381,6 +381,14 @@ def _age(judged: Judged) -> Iterator[Reason]:
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
     known = ages[np.isfinite(ages)]
     if not len(known):
+        if judged.request.field is not None and judged.inputs.source.has_clock:
+            yield Reason(
+                criterion="map age",
+                outcome=Outcome.NOT_EVALUABLE,
+                sentence="the field does not say of what time it is",
+                remedy="give --scene, or bake a reconstruction instead of bare splats",
+                count=judged.num_states,
+            )
         return
     most = float(known.max())
     if most <= allowed:

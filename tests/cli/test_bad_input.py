@@ -53,7 +53,7 @@ def test_a_frame_without_depth_is_counted_and_seeds_nothing(
     views = [frame() for _ in range(4)]
     views[2].depth[:] = 0.0
     assert reconstruct(write_folder(tmp_path / "in", views), tmp_path / "scene", "-q") == 0
-    assert "  note: depth: 1 frame has none: nothing is seeded from it" in capsys.readouterr().out
+    assert "  note: depth: 1 frame has none, which seeds nothing" in capsys.readouterr().out
     rows = audit(tmp_path / "scene")
     assert [row["without_depth"] for row in rows] == [0, 0, 1, 0]
     assert json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]["frames_without_depth"] == 1

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.io import scene_folder, source
 from splatctrl_cli.io.dtu import DtuView, write_dtu
 from splatctrl_cli.io.splats import write_ply
-from splatctrl_cli.records import Float64, Intrinsics, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
+from splatctrl_cli.records import Float64, Intrinsics, Label, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
 
 INTRINSICS = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -186,6 +186,26 @@ def test_without_a_clock_every_view_is_scored_from_the_final_splats(
     assert result["snapshots"] == "final"
     assert result["metrics"]["num_skipped"] == 0
     assert len(result["views"]) == 4
+
+
+@pytest.mark.parametrize("label", [None, Label.ROBOT])
+def test_a_scene_without_a_splat_that_counts_is_not_evaluable_and_leaves_nothing(
+    scored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], label: Label | None
+) -> None:
+    full = wall()
+    splats = full.select(np.zeros(len(full), bool)) if label is None else with_label(full, label)
+    monkeypatch.setattr(FakeScene, "splats", lambda scene: splats)
+    assert run(scored, "-o", scored / "out") == 5
+    err = capsys.readouterr().err
+    assert err == (
+        f"splatctrl: splats: none of {len(splats)} is labelled object, human; give a scene that has some;"
+        " sdf-bake --include takes other labels\n"
+    )
+    assert [path.name for path in scored.iterdir()] == ["scene"]
+
+
+def with_label(splats: SplatSet, label: Label) -> SplatSet:
+    return replace(splats, labels=np.full(len(splats), label, np.uint8))
 
 
 def test_the_table_shows_each_view_and_the_mean(scored: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -179,12 +179,21 @@ def baked(stage: Stage, *, splats: object, voxel: float = 0.04, moment: int | No
 
 
 def test_a_margin_that_only_the_grids_bound_breaks_is_a_matter_of_the_grid(stage: Stage) -> None:
-    ball = stage.ball_at_the_end(0.03)
+    ball, moment = stage.ball_at_the_end(0.03), int(stage.states[-1].stamp_ns)
     stage.desk.source.states = stage.states
-    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR, ball), voxel=0.08)))
+    code, verdict = stage.replayed(
+        "--field", str(baked(stage, splats=splats_of(FAR, ball), voxel=0.08, moment=moment))
+    )
     assert (code, decisive(verdict)) == (5, {"certified clearance": "not evaluable"})
     found = re.search(r"bake again with --voxel at most ([\d.]+)", verdict["sentence"])
     assert found is not None and 0.005 < float(found[1]) < 0.08
+
+
+def test_a_field_that_does_not_say_of_what_time_it_is_is_no_evidence(stage: Stage) -> None:
+    stage.desk.source.states = stage.states
+    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR))))
+    assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
+    assert "does not say of what time it is" in verdict["sentence"]
 
 
 def test_a_value_of_the_grid_below_the_margin_is_red(stage: Stage) -> None:
