@@ -15,7 +15,7 @@ from splatctrl_cli.io.splats import read_ply, read_world_splats, write_ply
 from splatctrl_cli.jobs.known_scene import from_grid
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
 
-BOX = ("--box=-0.1,-0.1,-0.1,0.1,0.1,0.1", "--voxel", "0.025", "--no-report")
+BOX = ("--box=-0.1,-0.1,-0.1,0.1,0.1,0.1", "--voxel", "0.02", "--no-report")
 
 
 def as_written(folder: Path, command: str = "reconstruct") -> Path:
