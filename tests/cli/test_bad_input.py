@@ -56,6 +56,7 @@ def test_a_frame_without_depth_is_counted_and_seeds_nothing(
     assert "  note: depth: 1 frame has none, which seeds nothing" in capsys.readouterr().out
     rows = audit(tmp_path / "scene")
     assert [row["without_depth"] for row in rows] == [0, 0, 1, 0]
+    assert [len(row["blind"]) for row in rows] == [0, 0, 1, 0]
     assert json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]["frames_without_depth"] == 1
 
 

@@ -135,6 +135,7 @@ def test_a_field_folder_is_described_by_what_its_grid_covers(tmp_path: Path) -> 
     )
     write_ply(tmp_path / "splats.ply", splats, {})
     baked = ["--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", "0.1", "-q", "-o", str(tmp_path / "field")]
+    baked += ["--set", "field.max_loss=1"]
     assert main(["sdf-bake", str(tmp_path / "splats.ply"), *baked]) == 0
     summary = describe(tmp_path / "field")
     assert summary.kind == "field folder"
