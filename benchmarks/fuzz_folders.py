@@ -13,6 +13,7 @@ from splatctrl_cli.io.output import write_json
 from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.records import Intrinsics, OccupancyGrid, SplatSet
 from tests.io.test_layouts import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
+from tests.known_voxels import known
 
 Commands = tuple[tuple[str, ...], ...]
 
@@ -66,8 +67,8 @@ def scene_folder(folder: Path) -> tuple[Path, Commands]:
     grid, splats = _occupancy(), _splats()
     for stamp in (100, 200):
         writer.audit(Row(stamp))
-        writer.snapshot(stamp, splats, grid, grid.states(0.3, 0.7))
-    writer.finish(200, splats, grid)
+        writer.snapshot(stamp, splats, known(grid, stamp), grid.states(0.3, 0.7))
+    writer.finish(200, splats, known(grid, 200))
     writer.checkpoint({}, {"a": np.arange(4)}, is_last=True)
     metrics = {"cameras": ["camera"], "has_clock": False, "stamp_ns": 200}
     config = {"occupancy": {"free_below": 0.3}}

@@ -39,7 +39,7 @@ def test_an_empty_set_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert bake(nothing, tmp_path) in (4, 5)
     assert refused(tmp_path, capsys)
     assert bake(replace(spheres(), labels=np.full(5, Label.ROBOT, np.uint8)), tmp_path) == 5
-    assert "none of 5 is labelled object, human; bake a scene that has some" in refused(tmp_path, capsys)
+    assert "none of 5 is labelled object, human; give a scene that has some" in refused(tmp_path, capsys)
 
 
 def test_a_centre_that_is_no_number_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
