@@ -17,13 +17,14 @@ from splatctrl_cli.jobs.replay_evidence import Evidence, check_evidence, map_err
 from splatctrl_cli.jobs.replay_files import write_replay
 from splatctrl_cli.jobs.replay_goal import check_goal
 from splatctrl_cli.jobs.replay_golden import read_golden
+from splatctrl_cli.jobs.replay_judged import Judged
 from splatctrl_cli.jobs.replay_metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replay_modes import Replay, replayed, with_truth
 from splatctrl_cli.jobs.replay_request import MODES, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay_robot import coverage_words, doubts_of, read_robot
 from splatctrl_cli.jobs.replay_states import LoggedStates, read_states
 from splatctrl_cli.jobs.replay_twists import check_twists
-from splatctrl_cli.jobs.replay_verdict import ASKED, Judged, replay_verdict
+from splatctrl_cli.jobs.replay_verdict import ASKED, replay_verdict
 from splatctrl_cli.jobs.replay_worst import draw_worst_frames
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth

@@ -1,0 +1,291 @@
+"""Criteria of a replay's verdict: whether the evidence reaches."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from splatctrl_cli.control.explain import EventKind
+from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.jobs.replay_judged import SLOW, Judged, counted, events_of, held, least_of, mm, nearby, seconds_at
+
+CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
+UNSEEN = 0.5  # of the points about the arm: three cameras about a table leave 0.02 to 0.3
+MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a calibrated rig
+
+
+def known_space(judged: Judged) -> Iterator[Reason]:
+    """Space that no camera ever saw: where the arm's spheres are, and about them where the motion newly comes."""
+    near = nearby(judged, "unseen")
+    if near is not None and near[0] > UNSEEN:
+        yield Reason(
+            criterion="known space",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"{100 * near[0]:.0f} % of the space about the arm that the motion comes to was never seen by a "
+            f"camera, allowed {100 * UNSEEN:g} %",
+            value=near[0],
+            threshold=UNSEEN,
+            time_s=near[1],
+            remedy="add a camera that sees where the arm goes",
+            count=near[2],
+        )
+    share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
+    if share is None:
+        yield Reason(
+            criterion="known space", outcome=Outcome.NOT_EVALUABLE, sentence="what cameras saw is not recorded"
+        )
+        return
+    if share <= allowed:
+        yield held(
+            "known space",
+            f"{100 * share:.2g} % of sphere centres in unseen space",
+            share,
+            allowed,
+            "",
+            judged.num_states,
+        )
+        return
+    first = int(np.argmax(judged.replay.audit.unknown_share > allowed))
+    yield Reason(
+        criterion="known space",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"{100 * share:.1f} % of the sphere centres lie in space no camera ever saw, allowed "
+        f"{100 * allowed:g} %, first",
+        value=share,
+        threshold=allowed,
+        time_s=seconds_at(judged, first),
+        remedy="add a camera, or give a larger --max-unknown",
+        count=judged.num_states,
+    )
+
+
+def evidence_age(judged: Judged) -> Iterator[Reason]:
+    """How old the map was that a state was judged by, and the evidence about the arm."""
+    near = nearby(judged, "age")
+    if near is not None and near[0] > judged.request.max_map_age:
+        yield Reason(
+            criterion="evidence age",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"the cameras last returned depth from about the arm {near[0]:.2f} s before, allowed "
+            f"{judged.request.max_map_age:g} s",
+            value=near[0],
+            threshold=judged.request.max_map_age,
+            unit="s",
+            time_s=near[1],
+            remedy="frames without depth renew nothing: check the cameras ('splatctrl check')",
+            count=near[2],
+        )
+    ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
+    known = ages[np.isfinite(ages)]
+    if not len(known):
+        if judged.request.field is not None and judged.inputs.source.has_clock:
+            yield Reason(
+                criterion="map age",
+                outcome=Outcome.NOT_EVALUABLE,
+                sentence="the field does not say of what time it is",
+                remedy="give --scene, or bake a reconstruction instead of bare splats",
+                count=judged.num_states,
+            )
+        return
+    most = float(known.max())
+    if most <= allowed:
+        yield held("map age", f"at most {most:.2f} s", most, allowed, "s", len(known))
+        return
+    worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
+    yield Reason(
+        criterion="map age",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
+        f"{worst.end_s:.2f} s",
+        value=most,
+        threshold=allowed,
+        unit="s",
+        time_s=worst.worst_s,
+        remedy="the cameras must cover the motion in time; --max-map-age says how old a map may be",
+        count=len(known),
+    )
+
+
+def judged_time(judged: Judged) -> Iterator[Reason]:
+    """Times of the motion for which nothing was measured: gaps, states without a distance, dropped states."""
+    replay, config = judged.replay, judged.request.config.verdict
+    stamps = replay.audit.stamp_ns
+    blank = np.zeros(len(stamps), dtype=np.bool_)
+    for of in replay.audit.clearance.values():
+        blank |= np.isnan(of.distance)
+    if blank.any():
+        yield Reason(
+            criterion="judged states",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"the path leaves known space: at {int(blank.sum())} of {len(stamps)} states a sphere is where "
+            "the field has no distance, first",
+            value=float(blank.mean()),
+            threshold=config.unjudged,
+            time_s=seconds_at(judged, int(np.argmax(blank))),
+            remedy="bake with field.unknown = free or obstacle, over a box that holds the motion",
+            count=len(stamps),
+        )
+    unbounded = replay.between["unbounded"]
+    duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
+    share = float(unbounded.sum()) / duration
+    if share > config.unjudged:
+        gaps = events_of(replay, EventKind.NOT_BOUNDED)
+        worst = max(gaps, key=lambda event: event.worst)
+        yield Reason(
+            criterion="judged time",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
+            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {worst.worst:.2f} s, ending",
+            value=share,
+            threshold=config.unjudged,
+            time_s=worst.worst_s,
+            cause=f"expected at most {config.longest_interval:g} s)",
+            remedy=SLOW,
+            count=len(stamps),
+        )
+    dropped = judged.inputs.source.loss.conflicting_states
+    if dropped > config.unjudged * (dropped + len(stamps)):
+        yield Reason(
+            criterion="judged states",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"{dropped} logged states were dropped: they repeat a stamp with other positions",
+            value=float(dropped),
+            threshold=config.unjudged,
+            remedy="stamp every state with its own time, or give --stamps log",
+            count=len(stamps),
+        )
+    yield from _lead_in(judged)
+
+
+def _lead_in(judged: Judged) -> Iterator[Reason]:
+    """States before the first map."""
+    replay = judged.replay
+    if not replay.lead_in_s > judged.request.config.verdict.lead_in:
+        return
+    yield Reason(
+        criterion="judged time",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first map",
+        value=replay.lead_in_s,
+        threshold=judged.request.config.verdict.lead_in,
+        unit="s",
+        remedy="judge the rest alone with --start-time first-map",
+        count=judged.num_states,
+    )
+
+
+def map_error(judged: Judged) -> Iterator[Reason]:
+    """What the map itself may miss, as held-out depth bounds it: surface clearance less the bound is at least 0.
+
+    A smaller clearance is no contact that was seen, but one that the map cannot exclude: not evaluable, unless
+    another measure fails. So is evidence that is too little for a bound.
+    """
+    found, surface = judged.replay.map_error, least_of(judged.replay.between["surface"])
+    if found is None:
+        if judged.request.require_evidence:
+            yield Reason(
+                criterion="map error",
+                outcome=Outcome.NOT_EVALUABLE,
+                sentence="not measured",
+                remedy="give --evidence a camera that did not train the map",
+            )
+        return
+    if found.bound is None:
+        yield Reason(
+            criterion="map error",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
+            "surface near the motion, too few for two independent stretches",
+            who=found.source,
+            remedy="judge a longer motion, or name another camera; verdict.evidence_reach says how near",
+            count=found.num_seen,
+        )
+        return
+    value = found.bound.bound
+    if surface is None:
+        return  # no distance at any state, which is said of them
+    if surface >= value:
+        yield held("map error", bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
+        return
+    yield Reason(
+        criterion="map error",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), and keeps {mm(surface)}; "
+        "it missed so much",
+        value=surface - value,
+        threshold=0.0,
+        unit="m",
+        time_s=found.time_s,
+        place=found.place,
+        who=found.source,
+        cause="" if found.place is None else "at ({:.2f}, {:.2f}, {:.2f}) m".format(*found.place),
+        remedy="a map that misses less needs more cameras, newer frames or a larger --max-splats",
+        count=found.num_points,
+    )
+
+
+def bound_words(bound: ConformalBound) -> str:
+    """The bound on the map's error, and what it rests on."""
+    return (
+        f"map error at most {mm(bound.bound)} with {100 * bound.confidence:.3g} % confidence from "
+        f"{bound.num_stretches} stretches of held-out depth"
+    )
+
+
+def clocks(judged: Judged) -> Iterator[Reason]:
+    """The cameras' clock against the robot's."""
+    clock = judged.logged.clock
+    if clock is None or clock.offset_s is None or clock.uncertainty_s is None:
+        return
+    offset, uncertainty = float(clock.offset_s), float(clock.uncertainty_s)
+    apart = abs(offset) - uncertainty
+    if apart <= CLOCKS_APART:
+        yield held("clocks", f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
+        return
+    yield Reason(
+        criterion="clocks",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"the cameras' clock is {1e3 * abs(offset):.0f} ms {'ahead of' if offset > 0 else 'behind'} "
+        f"the robot's (+- {1e3 * uncertainty:.0f} ms)",
+        value=abs(offset),
+        threshold=CLOCKS_APART,
+        unit="s",
+        remedy="synchronise the clocks, or shift one in the log",
+        count=clock.num_intervals,
+    )
+
+
+def belonging(judged: Judged) -> Iterator[Reason]:
+    """Whether scene, log and robot belong together."""
+    for mismatch in judged.inputs.mismatches:
+        yield Reason(
+            criterion="evidence",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=mismatch.sentence,
+            remedy=mismatch.remedy,
+        )
+
+
+def calibration(judged: Judged) -> Iterator[Reason]:
+    """Whether the cameras see the robot where its joints put it: what is off there is off for everything."""
+    figures = judged.inputs.scene.figures()
+    residual, by_link = figures.get("self_mask_residual_mm"), figures.get("self_mask")
+    if residual is None or not isinstance(by_link, dict):
+        return
+    value = 1e-3 * float(residual)
+    if value <= MISPLACED:
+        yield held("calibration", f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
+        return
+    link, worst = max(by_link.items(), key=lambda item: abs(float(item[1]["median_mm"])))
+    yield Reason(
+        criterion="calibration",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
+        f"joints put it, allowed {mm(MISPLACED)}",
+        value=value,
+        threshold=MISPLACED,
+        unit="m",
+        who=str(link),
+        remedy="calibrate the cameras ('splatctrl check'), or correct URDF, joint zeros or depth scale",
+        count=int(worst["num_pixels"]),
+    )
