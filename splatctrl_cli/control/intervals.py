@@ -65,7 +65,8 @@ def between_states(
 ) -> Between:
     """Bounds for the intervals between states (T, J) at stamps (T,) [ns] in one scene.
 
-    at_states (T, M) [m]: the clearance of every moving sphere's surface at the states, by `clearances`.
+    at_states (T, M) [m]: the clearance of every moving sphere's surface at the states, by `clearances`; infinite
+    where a sphere is left out, as its contact is meant.
 
     Up to `longest` [s] the arm is taken to have moved in a straight line of joint space, plus what its velocities
     (T, J) say beyond that. Over a longer interval it may have gone anywhere that its velocity limits allow: it is
@@ -119,6 +120,9 @@ def _refined(
             break
         middle = 0.5 * (q_first[open_] + q_last[open_])
         at_middle = clearances(model, reach, middle, distance_to)
+        at_middle[np.isposinf(first[open_]) | np.isposinf(last[open_])] = (
+            np.inf
+        )  # left out at an end: on the way, too
         reached = at_middle.min(axis=1) < margin  # a sample below the margin settles its interval
         np.minimum.at(least, owner[open_[reached]], at_middle[reached].min(axis=1))
         settled = np.isin(owner[open_], owner[open_[reached]])

@@ -136,7 +136,7 @@ def test_unknown_space_counts_from_the_share_that_is_allowed(stage: Stage, heigh
     assert (height < 0.5) == (share > 0.5) and 0.05 < share < 0.95
     for allowed, code in ((share - 1e-3, 5), (share + 1e-3, 0)):
         found, verdict = stage.judged("--max-unknown", str(allowed), scene=scene)
-        assert found == code
+        assert found == code, verdict["sentence"]
         assert decisive(verdict) == ({"known space": "not evaluable"} if code else {})
 
 
@@ -280,7 +280,7 @@ def test_a_gate_turns_the_verdict_with_report_only_too(stage: Stage, gate: str, 
     scene = stage.scene()
     for more in ((), ("--report-only",)):
         found, verdict = stage.judged("--require", gate, *more, scene=scene)
-        assert found == code
+        assert found == code, verdict["sentence"]
         assert set(decisive(verdict)) == ({f"--require {gate}"} if code else set())
 
 
@@ -292,3 +292,23 @@ def test_a_misspelled_metric_is_refused_before_anything_is_read(
     assert "unknown metric; did you mean min_clearance?" in capsys.readouterr().err
     code, _ = stage.replayed("--scene", "nowhere", "--require", "goal_reached>=1")
     assert code == 2 and "a figure of --mode closed-loop" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("link", "end", "code", "said"),
+    [
+        ("hand", 9.0, 0, "contact of hand declared (grasps the ball): "),
+        ("hand", 0.1, 1, "warning: not used by any state"),
+        ("link2", 9.0, 1, "warning: not used by any state"),
+    ],
+)
+def test_contact_that_is_declared_is_left_out_and_listed(
+    stage: Stage, tmp_path: Path, link: str, end: float, code: int, said: str
+) -> None:
+    """Only of its link and within its time; an entry that nothing used is a warning."""
+    in_contact(stage)
+    entry = f'link = "{link}"\nbox = [-2, -2, -2, 2, 2, 2]\nstart = 0\nend = {end}\nreason = "grasps the ball"\n'
+    (tmp_path / "declared.toml").write_text(f"[[expected_contact]]\n{entry}")
+    found, verdict = stage.judged("--declare", str(tmp_path / "declared.toml"))
+    assert found == code, verdict["sentence"]
+    assert any(said in note for note in verdict["notes"])
