@@ -6,6 +6,7 @@ Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixel
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -41,6 +42,7 @@ class Label(IntEnum):
 
 
 MAX_PLACE = 1e6  # [m] of a workspace's corner from the world's origin
+UNANSWERED = 0xFFFF  # in place of a time step: a camera looked at the voxel, and none ever got depth from it
 SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
 SOLID = (
     0b1000  # entity bit of a voxel that a pixel of an object hit since it was last seen free, in a log with a robot
@@ -339,7 +341,8 @@ class KnownVoxels:
     """What was known of space at one moment, and how old that evidence is.
 
     last_seen (X, Y, Z) uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which a camera
-    returned depth through or on the voxel, 0 never. unrepresented: what is occupied, not the robot, and has no splat.
+    returned depth through or on the voxel, 0 never, `UNANSWERED` never although one looked at it. unrepresented: what
+    is occupied, not the robot, and has no splat.
     """
 
     grid: OccupancyGrid
@@ -353,7 +356,12 @@ class KnownVoxels:
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
         i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
         step = np.where(is_inside, self.last_seen[i, j, k], 0).astype(np.int64)
-        return np.concatenate([[-1], self.step_stamps_ns])[step]
+        return np.concatenate([[-1], self.step_stamps_ns])[np.where(step == UNANSWERED, 0, step)]
+
+    @cached_property
+    def unanswered(self) -> Float64:
+        """Centres (K, 3) [m], world, of the voxels that a camera looked at and that never returned depth."""
+        return np.asarray(self.grid.origin + self.grid.voxel * np.argwhere(self.last_seen == UNANSWERED))
 
 
 @dataclass(frozen=True, kw_only=True)

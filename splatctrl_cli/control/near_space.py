@@ -18,6 +18,7 @@ EVERY_NS = 200_000_000  # between states that are looked at: cameras that stop a
 APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
 NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
 FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
+NOWHERE: Float64 = np.empty((0, 3))
 LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
 
 
@@ -29,10 +30,14 @@ LastSeen = Callable[[Float64], NDArray[np.int64]]
 class NearFigures:
     """Of one state: unseen, the share of the points in space that is new to the motion that no camera had ever seen;
     age [s] within which `FRESH_SHARE` of the seen points were last seen. NaN where there are too few points.
+    unanswered [m]: the distance of the nearest voxel's centre that cameras looked at without an answer, and its place
+    (3,) [m]; infinite and NaN where there is none.
     """
 
     unseen: float
     age: float
+    unanswered: float
+    place: Float64
 
 
 class NearSpace:
@@ -56,8 +61,8 @@ class NearSpace:
                 self._next_ns = stamp_ns + EVERY_NS
         return chosen
 
-    def look(self, stamp_ns: int, q: Float64, last_seen: LastSeen) -> NearFigures:
-        """What was known about the posture q (J,) at a stamp."""
+    def look(self, stamp_ns: int, q: Float64, last_seen: LastSeen, unanswered: Float64 = NOWHERE) -> NearFigures:
+        """What was known about the posture q (J,) at a stamp; unanswered: centres (K, 3) [m], world."""
         centers = self._model.sphere_centers(q)
         if self._first is None:
             self._first = centers
@@ -72,7 +77,18 @@ class NearSpace:
             unseen = float(is_never[is_new].mean())
         if (~is_never).sum() >= fewest:
             age = float(np.quantile((stamp_ns - seen[~is_never]) * 1e-9, FRESH_SHARE))
-        return NearFigures(unseen=unseen, age=age)
+        distance, place = self._nearest(unanswered, centers)
+        return NearFigures(unseen=unseen, age=age, unanswered=distance, place=place)
+
+    def _nearest(self, points: Float64, centers: Float64) -> tuple[float, Float64]:
+        """The least distance [m] of points (K, 3) near the arm to its moving spheres, and that point (3,)."""
+        moving, radii = centers[self._moving], self._radii[self._moving]
+        reach = radii.max() + NEW
+        points = points[np.all((points > moving.min(axis=0) - reach) & (points < moving.max(axis=0) + reach), axis=1)]
+        if not len(points):
+            return np.inf, np.full(3, np.nan)
+        distance = np.min(np.linalg.norm(points[:, None] - moving, axis=2) - radii, axis=1)
+        return float(distance.min()), points[distance.argmin()]
 
 
 def _is_outside(points: Float64, centers: Float64, radii: Float64, owners: NDArray[np.integer] | None = None) -> Bool:

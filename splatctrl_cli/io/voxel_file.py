@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.io.arrays import read_arrays, savez
-from splatctrl_cli.records import Balls, KnownVoxels, OccupancyGrid, UInt8, VoxelState
+from splatctrl_cli.records import UNANSWERED, Balls, KnownVoxels, OccupancyGrid, UInt8, VoxelState
 
 MOST_VOXELS = 400_000_000  # as many as reconstruct makes
 _HEADER = 1 << 22  # bytes
+_SHORT = 0xFF  # `UNANSWERED` in one byte
 _GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
 _EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
 
@@ -53,7 +54,8 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
         "origin": known.grid.origin.tolist(),
         "voxel": known.grid.voxel,
         "shape": list(known.last_seen.shape),
-        "last_seen": "1 + index into step_stamps_ns of the last time step with depth through or on it, 0 never",
+        "last_seen": "1 + index into step_stamps_ns of the last time step with depth through or on it, 0 never, "
+        "the largest number: looked at in vain",
         "unrepresented": "centres (K, 3) [m] of voxels that are occupied, not the robot, and have no splat",
         "step_stamps_ns": known.step_stamps_ns.tolist(),
     }
@@ -63,7 +65,7 @@ def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.gen
 def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
     """The arrays that both files have in common; last_seen in one byte where that holds it: twice as fast."""
     balls = known.unrepresented
-    kind = np.uint8 if len(known.step_stamps_ns) <= 255 else np.uint16
+    kind = np.uint8 if len(known.step_stamps_ns) < _SHORT else np.uint16
     return {
         "last_seen": known.last_seen.astype(kind),
         "unrepresented": balls.centers,
@@ -129,10 +131,12 @@ def _read_known(
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
         last_seen: NDArray[Any] = arrays["last_seen"]
         if last_seen.dtype == np.uint8:
-            last_seen = last_seen.astype(np.uint16)
+            is_unanswered = (last_seen == _SHORT) & (len(stamps_ns) < _SHORT)
+            last_seen = np.where(is_unanswered, np.uint16(UNANSWERED), last_seen.astype(np.uint16))
         last_seen = _voxels(last_seen, "last_seen", np.uint16, header)
-        if last_seen.max(initial=0) > len(stamps_ns):
-            raise ValueError(f"last_seen: expected at most {len(stamps_ns)} time steps, got {last_seen.max()}")
+        latest = last_seen.max(initial=0, where=last_seen != UNANSWERED)
+        if latest > len(stamps_ns):
+            raise ValueError(f"last_seen: expected at most {len(stamps_ns)} time steps, got {latest}")
         balls = _balls(arrays, grid.voxel)
         return KnownVoxels(grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls)
     except FileNotFoundError:

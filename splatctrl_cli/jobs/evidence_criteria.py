@@ -29,6 +29,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
             remedy="add a camera that sees where the arm goes",
             count=near[2],
         )
+    yield from _unanswered(judged)
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
         yield Reason(
@@ -56,6 +57,28 @@ def known_space(judged: Judged) -> Iterator[Reason]:
         time_s=seconds_at(judged, first),
         remedy="add a camera, or give a larger --max-unknown",
         count=judged.num_states,
+    )
+
+
+def _unanswered(judged: Judged) -> Iterator[Reason]:
+    """Where cameras looked and got no depth, within the margin of the arm: a dark or shiny thing may stand there."""
+    distance, margin = judged.replay.near["unanswered"], judged.replay.margin
+    if not np.any(distance < margin):
+        return
+    worst = int(np.nanargmin(distance))
+    yield Reason(
+        criterion="known space",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"cameras looked at a place {mm(distance[worst])} from the arm and got no depth from it, margin "
+        f"{mm(margin)}",
+        value=float(distance[worst]),
+        threshold=margin,
+        unit="m",
+        time_s=seconds_at(judged, worst),
+        place=tuple(judged.replay.near["place"][worst].tolist()),
+        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["place"][worst]),
+        remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth from it",
+        count=int(np.isfinite(distance).sum()),
     )
 
 

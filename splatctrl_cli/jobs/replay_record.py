@@ -38,7 +38,7 @@ class ReplayRecord:
 
     between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), the time [s] that
     nobody can bound (`unbounded`), the clearance [m] of the body at the state (`surface`), and that of the spheres to
-    the splats alone (`represented`). near: what was known about the arm (`unseen`, `age` as `NearFigures` has them),
+    the splats alone (`represented`). near: what was known about the arm, as `NearFigures` has it,
     NaN at states that were not looked at. strain: velocity and acceleration as shares of their limits. statics: by
     sphere that no joint moves, its clearance [m] in the first scene and the least in any.
     """
@@ -193,14 +193,15 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states."""
         num = len(part.stamp_ns)
-        unseen, age = np.full(num, np.nan), np.full(num, np.nan)
+        unseen, age, unanswered, place = (np.full(shape, np.nan) for shape in (num, num, num, (num, 3)))
         for at in self._near.due(part.stamp_ns):
             stamp = int(part.stamp_ns[at])
             known = self._scene.voxels_at(stamp)
             if known is not None:
-                figures = self._near.look(stamp, part.position[at], known.last_seen_ns)
+                figures = self._near.look(stamp, part.position[at], known.last_seen_ns, known.unanswered)
                 unseen[at], age[at] = figures.unseen, figures.age
-        self.near.append(unseen=unseen, age=age)
+                unanswered[at], place[at] = figures.unanswered, figures.place
+        self.near.append(unseen=unseen, age=age, unanswered=unanswered, place=place)
 
     def _tell_represented(self, part: AuditTrace) -> None:
         """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""

@@ -98,7 +98,7 @@ class StoredObjects(Sequence[T], Generic[T]):
 
 
 class Figures:
-    """Columns of one number per state, by name; NaN where a state has none."""
+    """Columns of one number, or one row of them, per state, by name; NaN where a state has none."""
 
     def __init__(self) -> None:
         self._files: dict[str, RowFile] = {}
@@ -106,7 +106,7 @@ class Figures:
     def append(self, **columns: Float64) -> None:
         """Add the next states' (T,)."""
         for name, values in columns.items():
-            self._files.setdefault(name, RowFile()).append(values)
+            self._files.setdefault(name, RowFile(values.shape[1:])).append(values)
 
     def __getitem__(self, name: str) -> Float64:
         """A whole column (T,)."""

@@ -9,10 +9,21 @@ from scipy.ndimage import label
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
-from splatctrl_cli.records import SOLID, SWEPT, Bool, Box, Float32, Float64, Label, OccupancyGrid, RgbdFrame
+from splatctrl_cli.records import (
+    SOLID,
+    SWEPT,
+    UNANSWERED,
+    Bool,
+    Box,
+    Float32,
+    Float64,
+    Label,
+    OccupancyGrid,
+    RgbdFrame,
+)
 
 MAX_VOXELS = 400_000_000
-MAX_STEPS = 65_535  # time steps that `last_seen` tells apart
+MAX_STEPS = 65_534  # time steps that `last_seen` tells apart
 
 
 class OccupancyMap:
@@ -64,7 +75,8 @@ class OccupancyMap:
         """
         if len(self.step_stamps_ns) == MAX_STEPS:
             self.step_stamps_ns = self.step_stamps_ns[::2]
-            self.last_seen -= self.last_seen // 2  # (n + 1) // 2, without an overflow
+            is_step = self.last_seen != UNANSWERED
+            self.last_seen[is_step] -= self.last_seen[is_step] // 2  # (n + 1) // 2, without an overflow
         self.step_stamps_ns.append(min(frame.stamp_ns for frame in frames))
 
     def integrate(self, frame: RgbdFrame) -> None:
@@ -92,6 +104,13 @@ class OccupancyMap:
             min_range=self.config.min_range,
             max_range=self.config.max_range,
         )
+
+    def mark_unanswered(self, points: Float64) -> None:
+        """Of the voxels that hold points (K, 3) [m], world: what was never seen was looked at without an answer."""
+        cells = np.floor((points - self.origin) / self.config.voxel + 0.5).astype(np.int64)
+        i, j, k = cells[np.all((cells >= 0) & (cells < self.last_seen.shape), axis=1)].T
+        is_never = self.last_seen[i, j, k] == 0
+        self.last_seen[i[is_never], j[is_never], k[is_never]] = UNANSWERED
 
     def label_robot(self, centers: Float64, radii: Float64, seen: Sequence[tuple[RgbdFrame, Bool, Bool]]) -> None:
         """Set the robot bit where the robot is, by its spheres (S, 3), (S,) [m] and its pixels, and nowhere else.

@@ -23,7 +23,7 @@ from splatctrl_cli.io.voxel_file import (
     write_occupancy,
     write_states,
 )
-from splatctrl_cli.records import SWEPT, Label, OccupancyGrid, SplatSet
+from splatctrl_cli.records import SWEPT, UNANSWERED, Label, OccupancyGrid, SplatSet
 from tests.known_voxels import known
 
 
@@ -167,20 +167,21 @@ def test_a_snapshot_keeps_what_was_known_of_each_voxel(tmp_path: Path) -> None:
         read_states(tmp_path / "b.npz")
 
 
-@pytest.mark.parametrize("num_steps", [2, 300])
+@pytest.mark.parametrize("num_steps", [2, 254, 255, 300])
 def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_path: Path, num_steps: int) -> None:
     want = replace(
         known(grid(), unrepresented=[[0.0, 0.25, 0.4]], label=Label.HUMAN),
         step_stamps_ns=np.arange(num_steps) * 10,
         last_seen=np.zeros((3, 4, 5), np.uint16),
     )
-    want.last_seen[1, 2, 3], want.last_seen[0, 0, 0] = num_steps, 1
+    want.last_seen[1, 2, 3], want.last_seen[0, 0, 0], want.last_seen[2, 0, 1] = num_steps, 1, UNANSWERED
     points = want.grid.origin + 0.05 * np.array([[1.4, 1.6, 3.0], [0.0, 0.4, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
     write_states(tmp_path / "a.npz", want, want.grid.states(0.3, 0.7))
     write_occupancy(tmp_path / "b.npz", want)
     for again in (read_known_states(tmp_path / "a.npz"), read_known_occupancy(tmp_path / "b.npz")):
         assert again is not None
         assert again.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
+        assert again.unanswered == pytest.approx(want.grid.origin + 0.05 * np.array([[2, 0, 1]]))
         assert again.unrepresented.centers.tolist() == want.unrepresented.centers.tolist()
         assert again.unrepresented.labels.tolist() == [Label.HUMAN]
         assert again.unrepresented.radius == pytest.approx(0.025 * 3**0.5)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from splatctrl_cli.records import Float64, LossReport
+from splatctrl_cli.records import UNANSWERED, Float64, LossReport
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import SECOND, START
 from tests.jobs.stage import FAR, QUARTER, Stage, ball_beside, passing, resting, states_on, voxels
@@ -103,6 +103,15 @@ def never_seen_where_it_goes(stage: Stage) -> None:
     stage.last_seen = voxels(SECOND, is_seen=False)
 
 
+def no_answer_beside_it(stage: Stage) -> None:
+    """Nobody got depth from the voxel that the arm ends beside."""
+    center, _ = stage.ball_at_the_end(0.01, radius=0.0)
+    stage.last_seen = voxels(SECOND)
+    grid = stage.last_seen.grid
+    grid.origin[:] = center - grid.voxel * np.round((center - grid.origin) / grid.voxel)
+    stage.last_seen.last_seen[tuple(np.round((center - grid.origin) / grid.voxel).astype(int))] = UNANSWERED
+
+
 def frames_that_renew_nothing(stage: Stage) -> None:
     stage.states = resting(num=21)
     stage.map_stamps = [i * QUARTER for i in range(9)]
@@ -167,6 +176,7 @@ ALONE: dict[str, Broken] = {
         "not evaluable",
         "100 % of the space about the arm",
     ),
+    "no answer": (no_answer_beside_it, (), "known space", "not evaluable", "a place 10.0 mm from the arm"),
     "evidence age": (frames_that_renew_nothing, (), "evidence age", "not evaluable", "frames without depth renew"),
     "map age": (no_new_map, (), "map age", "not evaluable", "1.75 s old, allowed 1 s"),
     "gap": (gap_in_the_log, (), "judged time", "not evaluable", "0.50 s of 1.00 s lie between states"),
