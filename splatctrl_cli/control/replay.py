@@ -194,7 +194,7 @@ def closed_loop(
             q, last_velocity = course.anchor(stamp)
             anchored.append(index)
         if field_at(stamp) is not field:
-            changes.append(_change(model, stamp, q, field, field_at(stamp)))
+            changes.append(scene_change(model, stamp, q, field, field_at(stamp)))
             field = field_at(stamp)
             controller = controller.with_field(field)
         rate = rate_of(config, model, scene_step_at, stamp, q)
@@ -324,7 +324,10 @@ def is_at_goal(pose_error: Float64, config: ControlConfig) -> bool:
     return bool(position <= config.goal_position and rotation <= config.goal_rotation)
 
 
-def _change(model: ArmModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField) -> SceneChange:
+def scene_change(
+    model: ArmModel, stamp_ns: int, q: Float64, before: DistanceField, after: DistanceField
+) -> SceneChange:
+    """What a newer scene, known at a stamp [ns], changes for the moving spheres of the arm at q (J,)."""
     moving = np.asarray(model.moving_spheres)
     least = [float(np.min(sphere_clearance(model, field, q, moving)[1])) for field in (before, after)]
     return SceneChange(stamp_ns=stamp_ns, before=least[0], after=least[1])

@@ -42,6 +42,7 @@ Index = NDArray[np.int64]
 
 Key = TypeVar("Key", bound=Hashable)
 HELD = 2  # scenes whose fields are kept: a rate of change needs two
+NEXT_NS = 500_000_000  # after a motion, in which the next scene is looked for
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,6 +117,13 @@ class KnownScene:
         older_ns, newer_ns = self.stamps_ns[index - 1 : index + 1]
         older, newer = (self.at(stamp + self.latency_ns).barrier for stamp in (older_ns, newer_ns))
         return SceneStep(newer=newer, older=older, seconds=(newer_ns - older_ns) * 1e-9)
+
+    def next_ns(self, stamp_ns: int) -> int | None:
+        """The stamp [ns] from which the scene after the one in use at a stamp is known; None without one soon."""
+        later = self._index_at(stamp_ns) + 1
+        self.advance(stamp_ns + NEXT_NS)
+        known_ns = [stamp + self.latency_ns for stamp in self.stamps_ns[later : later + 1]]
+        return next((known for known in known_ns if known <= stamp_ns + NEXT_NS), None)
 
     def _index_at(self, stamp_ns: int) -> int:
         self.advance(stamp_ns)

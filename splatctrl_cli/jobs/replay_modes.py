@@ -13,7 +13,7 @@ from splatctrl_cli.control.checks import StaticViolation, check_within_limits, s
 from splatctrl_cli.control.course import LoggedMotion
 from splatctrl_cli.control.explain import Event, EventFold, EventKind, Obstacle, clearance_signals
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
-from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence
+from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
 from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.control.standstill import Separation
 from splatctrl_cli.control.step import ControlStep
@@ -22,6 +22,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.clearance import ClearanceAgreement, clearance_agreement, mark_seen
 from splatctrl_cli.io.rows import RowFile, Rows, ranges
 from splatctrl_cli.io.state_columns import StateColumns
+from splatctrl_cli.jobs.known_scene import KnownScene
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone, separations
 from splatctrl_cli.jobs.replay_compare import Comparison, compared, planned_ways_out
@@ -219,6 +220,17 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: "Config", conso
     )
 
 
+def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -> ReplayTrace:
+    """With what the first scene after the motion shows: something may have come between the last two."""
+    last_ns = int(trace.stamp_ns[-1])
+    next_ns = scene.next_ns(last_ns)
+    if next_ns is None:
+        return trace
+    before, after = scene.at(last_ns).barrier, scene.at(next_ns).barrier
+    change = scene_change(model, next_ns, np.asarray(trace.position[-1]), before, after)
+    return replace(trace, scene_changes=(*trace.scene_changes, change))
+
+
 def _driven(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
     """The closed loop, the audit of the states it went through, and how far they are from the log."""
     scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
@@ -238,6 +250,7 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: "Config", cons
         plan_detour=planned_ways_out(inputs, task, config),
         record=loop,
     )
+    trace = _with_next_scene(trace, scene, model)
     apart = Figures()
     for first, last in record.blocks(trace.stamp_ns):
         stamps, positions = trace.stamp_ns[first:last], np.asarray(trace.position[first:last])

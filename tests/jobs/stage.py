@@ -68,7 +68,8 @@ class Stage:
     arm: RobotModel
     states: Sequence[JointState] = field(default_factory=passing)
     balls: Sequence[Ball] = (FAR,)
-    later: Sequence[Ball] = ()  # there from half a second on
+    later: Sequence[Ball] = ()
+    later_from: int = SECOND // 2  # [ns] from which these are there
     people: Sequence[Ball] = ()
     map_stamps: Sequence[int] = tuple(i * QUARTER for i in range(5))
     unrepresented: ArrayLike = ()
@@ -136,7 +137,7 @@ class Stage:
         return ball_beside(self.arm, end, gap, way=np.array(way), radius=radius)
 
     def _splats(self, stamp_ns: int) -> SplatSet:
-        later = self.later if stamp_ns >= SECOND // 2 else ()
+        later = self.later if stamp_ns >= self.later_from else ()
         splats = splats_of(*self.balls, *later, *self.people)
         splats.labels[len(self.balls) + len(later) :] = Label.HUMAN
         return splats

@@ -25,7 +25,7 @@ from tests.jobs.broken import (
     near_margin,
     no_new_map,
 )
-from tests.jobs.stage import FAR, MOVE, Stage, ball_beside, decisive, passing, resting, states_on, voxels
+from tests.jobs.stage import FAR, MOVE, QUARTER, Stage, ball_beside, decisive, passing, resting, states_on, voxels
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 
@@ -250,6 +250,18 @@ def test_a_scene_that_comes_into_the_driven_arm_is_a_hit(stage: Stage) -> None:
     assert code == 1 and decisive(verdict)["scene hits"] == "failed"
     (hit,) = [r for r in verdict["reasons"] if r["criterion"] == "scene hits"]
     assert hit["value"] == 1 and hit["time_s"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_what_came_while_the_arm_was_driven_and_the_next_map_shows_is_a_hit(stage: Stage) -> None:
+    """The loop ends between two maps; the first map after it has a ball where the arm now stands."""
+    assert stage.judged(mode="closed-loop")[0] == 0
+    end_ns = int(stage.desk.rows()[-1]["stamp_ns"])
+    stage.map_stamps = [*range(0, end_ns, QUARTER), end_ns + QUARTER // 10]
+    stage.later, stage.later_from = [ball_beside(stage.arm, START + MOVE, -0.02)], end_ns
+    code, verdict = stage.judged(mode="closed-loop", scene=stage.scene("later"))
+    assert (code, decisive(verdict)) == (1, {"scene hits": "failed"})
+    stage.map_stamps = [*stage.map_stamps[:-1], end_ns + 10 * SECOND]
+    assert stage.judged(mode="closed-loop", scene=stage.scene("much later"))[0] == 0
 
 
 @pytest.mark.parametrize(("offset", "uncertainty", "code"), [(0.2, 0.02, 5), (-0.2, 0.02, 5), (0.06, 0.02, 0)])
