@@ -69,7 +69,6 @@ from splatctrl_cli.scene.window import View, Window, halved, make_view
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NOT_COVERED = 0.05  # accumulated opacity below which the background shows
-HOLES_EVERY = 5  # time steps: a thing that stands in view and returns no depth does so in the next images, too
 EVICT_EVERY = 5  # time steps: it takes as long as a few iterations, and what has no splat is a ball until then
 NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
@@ -125,9 +124,8 @@ class SceneFitter:
         if self.background is None:
             self.background = self._behind(views)
         self.people.take_in(self.occupancy, frames)
-        if self.num_steps % HOLES_EVERY == 0:
-            for frame, mask in seen:
-                self.occupancy.mark_unanswered(unanswered_points(frame, mask.robot_depth, self.occupancy.config))
+        for frame, mask in seen:
+            self.occupancy.mark_unanswered(unanswered_points(frame, mask.robot_depth, self.occupancy.config))
         self._carry(robot)
         if robot is not None:
             pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]

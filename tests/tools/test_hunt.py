@@ -307,14 +307,25 @@ def test_a_thin_target_that_no_image_shows_is_not_observable_and_a_wide_one_is(
     for radius, expected in ((0.01, (False, "no depth from it")), (0.05, (True, "space never seen"))):
         world = world_of(ball(np.array([0.55, 0.1, 0.05]), radius))
         shown = shown_of(world, Fault(dark=1.0), model, tmp_path)
-        unseen = replace(shown, target_outline=np.zeros_like(shown.target_outline))
+        nothing = np.zeros_like(shown.target_outline)
+        unseen = replace(shown, target_outline=nothing, target_hole=nothing)
         assert judged(draft_of(Fault()), world, unseen, model) == expected
 
 
-def test_a_target_that_images_show_and_that_returns_no_depth_is_disclaimed(model: RobotModel, tmp_path: Path) -> None:
+def test_a_target_that_returns_no_depth_is_a_hole_or_disclaimed(model: RobotModel, tmp_path: Path) -> None:
     world = world_of(in_view())
     shown = shown_of(world, Fault(dark=1.0), model, tmp_path)
-    assert judged(draft_of(Fault()), world, shown, model) == (False, "returns no depth")
+    assert judged(draft_of(Fault()), world, shown, model) == (True, "a hole")
+    beside = replace(shown, target_hole=np.zeros_like(shown.target_hole))
+    assert judged(draft_of(Fault()), world, beside, model) == (False, "returns no depth")
+
+
+def test_what_is_narrower_than_half_a_pixel_is_disclaimed(model: RobotModel, tmp_path: Path) -> None:
+    for radius, expected in ((0.002, False), (0.006, True)):
+        world = world_of(ball(np.array([0.55, 0.1, 0.05]), radius))
+        shown = shown_of(world, Fault(), model, tmp_path)
+        seen = replace(shown, target=np.full_like(shown.target, 10))
+        assert judged(draft_of(Fault()), world, seen, model)[0] is expected
 
 
 # --- the table ---

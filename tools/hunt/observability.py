@@ -5,13 +5,14 @@
 2. Clocks: an image of a wrong camera shows the arm while it moves.
 3. The robot's model: too few or too small spheres always (the URDF has the surface); what else is wrong with the
    model or the joints only where images show the arm.
-4. The target: what stands there from the beginning has returned depth in two frame sets (or the only one)
-   before the arm came nearest; or no image shows it, and it is so wide (4 cm) that it stands in unknown space: what
-   images show and what returns no depth is disclaimed. What comes later has returned depth in a frame set taken while
-   the arm was inside the margin; or it stood there for `STALE_S` without returning any, or no camera returned any
-   depth for as long: then the map is too old. In closed loop, where nobody knows beforehand when the arm is near,
-   what appears or leaves has returned depth in two frame sets, and what moves is disclaimed: at 1 m/s it goes ten
-   margins between two frame sets.
+4. The target: what stands there from the beginning has returned depth in two frame sets (or the only one) before
+   the arm came nearest; or it is wide (4 cm), returns none, and is a hole in two frame sets, with depth of other
+   things all around it; or no image shows it, and it is so wide that it stands in unknown space. Disclaimed is what
+   returns no depth before something else that returns none, or beside the arm; and what is narrower than half a
+   pixel. What comes later has returned depth in a frame set taken while the arm was inside the margin; or it stood
+   there for `STALE_S` without returning any, or no camera returned any depth for as long: then the map is too old.
+   In closed loop, where nobody knows beforehand when the arm is near, what appears or leaves has returned depth in
+   two frame sets, and what moves is disclaimed: at 1 m/s it goes ten margins between two frame sets.
 """
 
 from dataclasses import dataclass
@@ -82,12 +83,17 @@ def _of_target(world: World, shown: Shown, frame_clearance: np.ndarray, least_ns
     seen = (pixels >= NUM_PIXELS) & is_before
     first_ns = max(target.from_ns for target in world.targets)
     num_enough = min(2, int(np.count_nonzero(is_before)))
+    width = min(min(_widths(target.kind, target.size)) for target in world.targets)
+    if width < 0.5 * _pixel(world):
+        return Observable(holds=False, rule="narrower than half a pixel")
     if all(target.track is None for target in world.targets) and first_ns <= shown.stamps[0]:
         if np.count_nonzero(seen) >= num_enough:
             return Observable(holds=True, rule="seen before")
+        is_wide = width >= WIDE
+        if is_wide and np.count_nonzero(shown.target_hole.max(axis=0)[is_before] >= NUM_PIXELS) >= num_enough:
+            return Observable(holds=True, rule="a hole")
         if shown.target_outline[:, is_before].sum() >= NUM_PIXELS:
             return Observable(holds=False, rule="returns no depth")
-        is_wide = min(min(_widths(target.kind, target.size)) for target in world.targets) >= WIDE
         return Observable(holds=is_wide, rule="space never seen" if is_wide else "no depth from it")
     if not is_audit and any(target.track is not None for target in world.targets):
         return Observable(holds=False, rule="moves between two frame sets")
@@ -103,6 +109,14 @@ def _of_target(world: World, shown: Shown, frame_clearance: np.ndarray, least_ns
     if since_ns < least_ns - STALE_S * 1e9 and np.all(pixels[recent] < NUM_PIXELS):
         return Observable(holds=True, rule="not seen for long")
     return Observable(holds=False, rule="between two frame sets")
+
+
+def _pixel(world: World) -> float:
+    """How wide [m] a pixel of the nearest camera is at the target."""
+    place = world.targets[0].T_world_shape[:3, 3]
+    return min(
+        float(np.linalg.norm(camera.T_world_camera[:3, 3] - place)) / camera.intrinsics.fx for camera in world.cameras
+    )
 
 
 def _at_its_place_since(target: Primitive, stamp_ns: int) -> int:

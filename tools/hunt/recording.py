@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
@@ -21,15 +22,18 @@ from tools.hunt.faults import Fault
 from tools.hunt.world import DURATION_S, FPS, HEIGHT, NS, NUM_FRAMES, WIDTH, World, at_s
 
 PATCH = 3  # [px] over which the noise of depth agrees
+RING = 3  # [px]
+MOST_OF_RING = 0.9  # a few pixels beside edges are lost by any camera
 ARM_TEXTURE = Texture(pattern="checks", feature=0.05, dark=PALETTE["shell"][0], bright=PALETTE["shell"][1], seed=20)
 SAME_SURFACE = 0.02  # [m] two cameras see the same place
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """Pixels (C, F) with depth, as recorded, of the arm, of the target and in all, and `target_outline` with or
-    without it; 0 where the image is missing. overlap (C, C): pixels of one camera's first image that another one
-    sees, too; stamps (F,) [ns] when the images were truly taken.
+    """Pixels (C, F) with depth, as recorded, of the arm, of the target and in all; `target_outline` with or without
+    it; `target_hole`, of its outline where that has depth of other things all around; 0 where the image is missing.
+    overlap (C, C): pixels of one camera's first image that another one sees, too; stamps (F,) [ns] when the images
+    were truly taken.
     """
 
     cameras: tuple[str, ...]
@@ -37,6 +41,7 @@ class Shown:
     arm: np.ndarray
     target: np.ndarray
     target_outline: np.ndarray
+    target_hole: np.ndarray
     depth: np.ndarray
     overlap: np.ndarray
 
@@ -48,7 +53,9 @@ class Recorder:
         self._world, self._fault, self._model, self._seed = world, fault, model, seed
         self._renderers = [Renderer(camera, world.things, color_rays=0) for camera in world.cameras]
         shape = (len(world.cameras), NUM_FRAMES)
-        self._arm, self._target, self._outline, self._depth = (np.zeros(shape, dtype=np.int64) for _ in range(4))
+        self._arm, self._target, self._outline, self._hole, self._depth = (
+            np.zeros(shape, dtype=np.int64) for _ in range(5)
+        )
         self._first: list[Float32] = [np.zeros((HEIGHT, WIDTH), np.float32)] * len(world.cameras)
 
     def write(self, path: Path) -> Shown:
@@ -67,6 +74,7 @@ class Recorder:
             arm=self._arm,
             target=self._target,
             target_outline=self._outline,
+            target_hole=self._hole,
             depth=self._depth,
             overlap=self._overlap(),
         )
@@ -118,6 +126,8 @@ class Recorder:
         self._target[number, index] = np.count_nonzero(is_target & (depth > 0))
         self._depth[number, index] = np.count_nonzero(depth > 0)
         self._outline[number, index] = np.count_nonzero(is_target)
+        if _is_enclosed(is_target, (depth > 0) & ~is_arm):
+            self._hole[number, index] = np.count_nonzero(is_target)
         if index == 0:
             self._first[number] = exact
         people = [target for target in targets if target.name in self._world.people]
@@ -178,6 +188,14 @@ def _num_seen(camera: Camera, depth: Float32, points_world: Float64) -> int:
 
 def _nearer(depth: Float32, without: Float32) -> np.ndarray:
     return np.asarray((depth > 0) & ((without == 0) | (depth < without)))
+
+
+def _is_enclosed(inner: np.ndarray, around: np.ndarray) -> bool:
+    """Whether pixels (H, W) are inside of the image, and most of what is within `RING` of them is `around`."""
+    if not inner.any() or inner[[0, -1]].any() or inner[:, [0, -1]].any():
+        return False
+    ring = cv2.dilate(inner.astype(np.uint8), np.ones((2 * RING + 1, 2 * RING + 1), np.uint8)).astype(bool) & ~inner
+    return bool(np.count_nonzero(ring & around) >= MOST_OF_RING * np.count_nonzero(ring))
 
 
 def _lost(fault: Fault, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
