@@ -1,5 +1,6 @@
 """The documentation says what the code does: generated pages, names of functions, commands and links are checked."""
 
+import argparse
 import ast
 import importlib.util
 import re
@@ -20,6 +21,11 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])
 CODE = re.compile(r"`([^`\n]+)`")
 PLACE = re.compile(r"([\w/]+\.(?:py|h|cpp))(?:: (.+))?")
+FOREIGN = {  # options of other programs
+    "benchmarks.md": {"--demo"},
+    "hunt.md": {"--continue"},
+    "reliability.md": {"--always-decode-chunk"},
+}
 EXAMPLE = ROOT / "docs" / "start.md"
 SETTING = re.compile(r"((?:scene|gaussians|occupancy|human|field|control|planner|verdict)\.\w+)(?: = (.+))?")
 
@@ -55,6 +61,27 @@ def test_every_option_that_help_shows_is_in_the_page() -> None:
     for command, parser in subparsers.choices.items():
         for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", parser.format_help())) - {"--help"}:
             assert option in sections[command], f"{command} {option}"
+
+
+def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """The parsers that take options: of commands, and of the actions of those that have some."""
+    nested = [choice for a in parser._actions if isinstance(a.choices, dict) for choice in a.choices.values()]
+    yield from (leaf for below in nested for leaf in leaves(below)) if nested else (parser,)
+
+
+def options_in(text: str) -> set[str]:
+    """What a page's code marks name that looks like an option of splatctrl."""
+    marked = [code for code in CODE.findall(text) if not code.startswith(("python ", "pip "))]
+    return {option for code in marked for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", code)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_option_that_a_page_names_is_one_that_a_command_takes(page: Path) -> None:
+    taken = {
+        option for leaf in leaves(build_parser()) for action in leaf._actions for option in action.option_strings
+    }
+    assert len(taken) > 100
+    assert options_in(page.read_text(encoding="utf-8")) <= taken | FOREIGN.get(page.name, set())
 
 
 def places() -> Iterator[tuple[Path, str]]:
