@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print, write JSON and plots."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.field_accuracy", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="solids made here only, fewer points")
-    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the plots of docs/field.md here")
+    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the plots of docs/results.md here")
     parser.add_argument("--json", type=Path, default=Path("bench_output/field_accuracy.json"), metavar="FILE")
     args = parser.parse_args(argv)
     num = NUM_QUICK if args.quick else NUM_POINTS

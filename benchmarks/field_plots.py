@@ -1,4 +1,4 @@
-"""The plots of docs/field.md, each of what the code reads now."""
+"""The plots of docs/results.md, each of what the code reads now."""
 
 from collections.abc import Sequence
 from itertools import pairwise

@@ -6,6 +6,9 @@ the version of Python.
 
 import argparse
 import inspect
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -17,6 +20,8 @@ from splatctrl_cli.config.load import type_name
 
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
+SHARED_BY = 3  # commands with the same option, in the same words, from which on it is explained once
+SIMPLE = ("int", "float", "str")  # types that a default shows
 
 
 def main() -> None:
@@ -51,21 +56,41 @@ def cli_page() -> str:
         "",
         EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
     ]
+    counts = Counter(row for parser in _leaves(commands.choices.values()) for row in _rows(parser))
+    shared = [row for row, count in counts.items() if count >= SHARED_BY]
     for name, command in commands.choices.items():
-        lines += _command_section("##", name, command)
-    return "\n".join(lines) + "\n"
+        lines += _command_section("##", name, command, set(shared))
+    lines += ["", "## Options of several commands", "", "The same in every command that lists them."]
+    return "\n".join([*lines, "", *_table(("argument", "meaning"), shared)]) + "\n"
 
 
-def _command_section(level: str, name: str, parser: argparse.ArgumentParser) -> list[str]:
+def _leaves(parsers: Iterable[argparse.ArgumentParser]) -> Iterator[argparse.ArgumentParser]:
+    """The parsers of commands, those of actions in the place of the command that has them."""
+    for parser in parsers:
+        nested = _nested(parser)
+        yield from [parser] if nested is None else _leaves(nested.choices.values())
+
+
+def _nested(parser: argparse.ArgumentParser) -> "argparse._SubParsersAction[Any] | None":
+    return next((a for a in parser._actions if isinstance(a, argparse._SubParsersAction)), None)
+
+
+def _command_section(
+    level: str, name: str, parser: argparse.ArgumentParser, shared: set[tuple[str, str]]
+) -> list[str]:
     """Heading, usage, summary and arguments; of a command with actions, a section for each action below it."""
     lines = ["", f"{level} {name}", "", _usage(name, parser), "", parser.description, ""]
-    nested = next((a for a in parser._actions if isinstance(a, argparse._SubParsersAction)), None)
+    nested = _nested(parser)
     if nested is None:
-        return [*lines, *_table(("argument", "meaning"), _rows(parser))]
-    rows = [(f"`{name} {action.dest}`", action.help) for action in nested._choices_actions]
-    lines += _table(("action", "what it does"), rows)
+        rows = _rows(parser)
+        lines += _table(("argument", "meaning"), [row for row in rows if row not in shared])
+        names = re.findall(r"--[a-z][a-z-]*", " ".join(row[0] for row in rows if row in shared))
+        common = ", ".join(f"`{name}`" for name in names)
+        return [*lines, "", f"[Shared options](#options-of-several-commands): {common}."]
+    actions = [(f"`{name} {action.dest}`", action.help) for action in nested._choices_actions]
+    lines += _table(("action", "what it does"), actions)
     for action, below in nested.choices.items():
-        lines += _command_section(f"{level}#", f"{name} {action}", below)
+        lines += _command_section(f"{level}#", f"{name} {action}", below, shared)
     return lines
 
 
@@ -110,7 +135,7 @@ def config_page() -> str:
         "Give a TOML file with `--config FILE.toml`, single values with `--set section.key=value` (these win). An",
         "unknown key is an error that names the nearest good one. A value of another type, out of its range, not",
         "finite, or in contradiction to another one is refused (exit 2) before any work. What a run used stands in",
-        "its `run.json`.",
+        "its `run.json`. A default without a decimal point or exponent is an integer.",
         "",
         "```toml",
         "[scene]",
@@ -122,7 +147,7 @@ def config_page() -> str:
         "",
         "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it.",
     ]
-    header = ("key", "default", "type", "range", "meaning, and reason for the range")
+    header = ("key", "default", "range", "meaning, and reason for the range")
     for section in fields(config.Config):
         kind: Any = type(getattr(config.Config(), section.name))
         rows = [_setting_row(kind, key) for key in kind.declared]
@@ -135,8 +160,7 @@ def _setting_row(section: type[Section], key: str) -> tuple[str, ...]:
     quoted = isinstance(declared, OneOf) and " or ".join(f'`"{word}"`' for word in declared.words)
     return (
         f"`{key}`",
-        f"`{_toml(getattr(section, key))}`",
-        type_name(hint),
+        f"`{_toml(getattr(section, key))}`" + ("" if type_name(hint) in SIMPLE else f" ({type_name(hint)})"),
         quoted or declared.expected,
         declared.reason,
     )

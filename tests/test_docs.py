@@ -1,5 +1,6 @@
 """The documentation says what the code does: generated pages, names of functions, commands and links are checked."""
 
+import argparse
 import ast
 import importlib.util
 import re
@@ -20,7 +21,12 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])
 CODE = re.compile(r"`([^`\n]+)`")
 PLACE = re.compile(r"([\w/]+\.(?:py|h|cpp))(?:: (.+))?")
-EXAMPLE = ROOT / "docs" / "replay_example.md"
+FOREIGN = {  # options of other programs
+    "benchmarks.md": {"--demo"},
+    "hunt.md": {"--continue"},
+    "reliability.md": {"--always-decode-chunk"},
+}
+EXAMPLE = ROOT / "docs" / "start.md"
 SETTING = re.compile(r"((?:scene|gaussians|occupancy|human|field|control|planner|verdict)\.\w+)(?: = (.+))?")
 
 
@@ -57,15 +63,35 @@ def test_every_option_that_help_shows_is_in_the_page() -> None:
             assert option in sections[command], f"{command} {option}"
 
 
+def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """The parsers that take options: of commands, and of the actions of those that have some."""
+    nested = [choice for a in parser._actions if isinstance(a.choices, dict) for choice in a.choices.values()]
+    yield from (leaf for below in nested for leaf in leaves(below)) if nested else (parser,)
+
+
+def options_in(text: str) -> set[str]:
+    """What a page's code marks name that looks like an option of splatctrl."""
+    marked = [code for code in CODE.findall(text) if not code.startswith(("python ", "pip "))]
+    return {option for code in marked for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", code)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_option_that_a_page_names_is_one_that_a_command_takes(page: Path) -> None:
+    taken = {
+        option for leaf in leaves(build_parser()) for action in leaf._actions for option in action.option_strings
+    }
+    assert len(taken) > 100
+    assert options_in(page.read_text(encoding="utf-8")) <= taken | FOREIGN.get(page.name, set())
+
+
 def places() -> Iterator[tuple[Path, str]]:
     """Every (file, name) that docs/paper.md puts in code marks; the name is empty for a file alone."""
     text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     for code in CODE.findall(text):
         match = PLACE.fullmatch(code)
         if match:
-            path = ROOT / match[1] if match[1].startswith("tests/") else ROOT / "splatctrl_cli" / match[1]
             for name in (match[2] or "").split(", "):
-                yield path, name
+                yield ROOT / match[1], name
 
 
 def names_in(path: Path) -> set[str]:
@@ -104,24 +130,74 @@ def test_every_setting_that_the_paper_page_names_can_be_given() -> None:
             load_config(None, [f"{match[1]}={match[2]}"])
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_leads_somewhere(page: Path) -> None:
-    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
-        if link.startswith(("http://", "https://")):
-            continue
+def without_code(text: str) -> str:
+    """A page's text without its fenced code, whose comments look like headings."""
+    return re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def links_on(page: Path) -> list[str]:
+    """The targets of a page's links and pictures that lie in the repository."""
+    links = re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text(encoding="utf-8")))
+    return [link for link in links if not link.startswith(("http://", "https://"))]
+
+
+def anchors_on(page: Path) -> set[str]:
+    """What a link to a heading of the page is called where the code is hosted; the second of a name ends in -1."""
+    anchors: list[str] = []
+    for title in re.findall(r"^#+ (.+)$", without_code(page.read_text(encoding="utf-8")), flags=re.MULTILINE):
+        anchor = re.sub(r"[^\w -]", "", title).strip().lower().replace(" ", "-")
+        num_before = sum(bool(re.fullmatch(rf"{re.escape(anchor)}(-\d+)?", other)) for other in anchors)
+        anchors.append(f"{anchor}-{num_before}" if num_before else anchor)
+    return set(anchors)
+
+
+def broken_links(page: Path) -> list[str]:
+    """The links of a page whose file, or whose heading in it, is not there."""
+    broken = []
+    for link in links_on(page):
         file, _, heading = link.partition("#")
-        target = page if not file else page.parent / file
-        assert target.exists(), link
-        if heading:
-            titles = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
-            assert heading in {re.sub(r"[^\w -]", "", title).strip().lower().replace(" ", "-") for title in titles}
+        target = page.parent / file if file else page
+        if not target.exists() or (heading and heading not in anchors_on(target)):
+            broken.append(link)
+    return broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_to_a_file_and_a_heading_that_are_there(page: Path) -> None:
+    assert broken_links(page) == []
+
+
+def test_a_link_to_a_missing_file_or_heading_is_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# One\n```\n# no heading\n```\n## One\n[a](#one) [b](#one-1) [c](#no-heading) [d](none.md)\n")
+    assert broken_links(page) == ["#no-heading", "none.md"]
+
+
+def test_the_index_leads_to_every_page_and_the_pages_to_every_picture_and_table() -> None:
+    listed = {(ROOT / "docs" / link.partition("#")[0]).resolve() for link in links_on(ROOT / "docs" / "README.md")}
+    assert set(ROOT.glob("docs/*.md")) - listed == {ROOT / "docs" / "README.md"}
+    linked = {(page.parent / link).resolve() for page in PAGES for link in links_on(page)}
+    assert {*ROOT.glob("docs/images/*"), *ROOT.glob("docs/*.csv")} - linked == set()
+
+
+def test_every_page_and_heading_that_the_code_names_is_there() -> None:
+    named = [
+        (path.relative_to(ROOT), *found)
+        for folder in ("splatctrl_cli", "benchmarks", "tools", "tests")
+        for path in ROOT.glob(f"{folder}/**/*.py")
+        for found in re.findall(r"\bdocs/([a-z]+\.md|\w+\.csv)(?:, ([A-Z]\w+))?", path.read_text(encoding="utf-8"))
+    ]
+    assert len(named) > 30
+    for path, page, heading in named:
+        assert (ROOT / "docs" / page).is_file(), f"{path}: {page}"
+        assert not heading or heading.lower() in anchors_on(ROOT / "docs" / page), f"{path}: {page}, {heading}"
 
 
 def commands_on(page: Path) -> list[str]:
     """Command lines of indented or fenced code, continuation lines joined, shell variables as the page sets them."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     variables: dict[str, str] = {}
-    for name, value in re.findall(r'^\$ ([A-Z]+)="(.*)"$', text, flags=re.MULTILINE):
+    for name, value in re.findall(r'^(?: {4}|\$ )([A-Z]+)="(.*)"$', text, flags=re.MULTILINE):
         variables[name] = Template(value).safe_substitute(variables)
     lines = re.findall(r"^(?: {4}|\$ )?(?:\.venv/bin/)?splatctrl ([a-z].*)$", text, flags=re.MULTILINE)
     return [Template(line).safe_substitute(variables) for line in lines]
@@ -149,7 +225,7 @@ def shown_after(page: Path) -> list[list[str]]:
     ]
 
 
-def test_the_replay_example_knows_its_settings_gates_and_figures() -> None:
+def test_the_first_page_knows_its_settings_gates_and_figures() -> None:
     commands, shown = commands_on(EXAMPLE), shown_after(EXAMPLE)
     assert len(commands) == len(shown)
     num_figures = 0
@@ -169,7 +245,7 @@ def test_the_replay_example_knows_its_settings_gates_and_figures() -> None:
     assert num_figures > 15
 
 
-def test_the_replay_example_shows_what_info_prints(
+def test_the_first_page_shows_what_info_prints(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(ROOT)

@@ -91,7 +91,7 @@ def add_declare(parser: argparse.ArgumentParser) -> None:
         "--declare",
         type=Path,
         metavar="FILE.toml",
-        help="what the robot carries, and contact that is meant (docs/formats.md)",
+        help="what the robot carries, and contact that is meant (docs/declare.md)",
     )
 
 

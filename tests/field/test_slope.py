@@ -1,4 +1,4 @@
-"""How steep the Gaussian kernel field can be: the bound of docs/planner.md, tried in and between splats."""
+"""How steep the Gaussian kernel field can be: the bound of docs/paper.md, tried in and between splats."""
 
 import numpy as np
 import pytest
