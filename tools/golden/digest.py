@@ -8,8 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-# What may differ between two runs of the same code: times, and the machine and libraries that run.json records.
-LEFT_OUT = frozenset({"seconds", "versions", "splatctrl", "python", "machine"})
+# Keys whose values may differ between two runs of the same code: times; the machine and the libraries of a run.json;
+# and what follows from these, the digests and sizes of files with times in them.
+LEFT_OUT = frozenset(
+    {"seconds", "birrt_planning_time_s", "versions", "splatctrl", "python", "machine", "parts", "bytes"}
+)
 ALIKE = 12  # more files than this of one suffix in one folder are one line
 
 Stamps = Mapping[str, tuple[int, int]]
@@ -51,6 +54,8 @@ def written(folder: Path, before: Stamps, places: Mapping[str, str]) -> dict[str
         for name, data in found.items():
             if Path(name).name == "run.json":
                 digests.update(of_run_file(name, data, places))
+            elif Path(name).suffix == ".json":
+                digests[name] = of_json(data.decode(), places)
             else:
                 digests[name] = digest(_placed(data, places))
     return digests
