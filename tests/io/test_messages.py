@@ -67,6 +67,7 @@ def test_float_depth_is_metres_and_what_was_not_measured_is_zero() -> None:
     values = np.array([[1.5, np.nan], [np.inf, -2.0]], dtype=np.float32)
     image = read_image(message(values, "32FC1"), IMAGE)
     assert np.array_equal(depth_of(image, None), np.array([[1.5, 0], [0, 0]], dtype=np.float32))
+    assert np.array_equal(depth_of(image, 0.5), np.array([[0.75, 0], [0, 0]], dtype=np.float32))
 
 
 def test_too_few_bytes_are_refused_not_padded() -> None:

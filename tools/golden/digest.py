@@ -11,7 +11,17 @@ from typing import Any
 # Keys whose values may differ between two runs of the same code: times; the machine and the libraries of a run.json;
 # and what follows from these, the digests and sizes of files with times in them.
 LEFT_OUT = frozenset(
-    {"seconds", "birrt_planning_time_s", "versions", "splatctrl", "python", "machine", "parts", "bytes"}
+    {
+        "seconds",
+        "planning_time_s",
+        "birrt_planning_time_s",
+        "versions",
+        "splatctrl",
+        "python",
+        "machine",
+        "parts",
+        "bytes",
+    }
 )
 ALIKE = 12  # more files than this of one suffix in one folder are one line
 
