@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.control.advancement import check_edges
+from splatctrl_cli.control import planner
+from splatctrl_cli.control.advancement import EdgeCheck, check_edges
 from splatctrl_cli.control.clearance import Clearance, OnlyDistance
 from splatctrl_cli.control.path import joint_length, resampled
 from splatctrl_cli.control.planner import PlanOutcome, plan
@@ -46,6 +47,21 @@ def test_a_goal_behind_a_closed_wall_runs_out_of_iterations() -> None:
     assert found.num_iterations == 60
     assert not found.is_solved
     assert len(found.waypoints) == 0
+
+
+def test_trees_join_only_where_the_whole_edge_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    num_asked = []
+
+    def checked(_: Clearance, start: Float64, end: Float64, *, only_whole: bool, **__: object) -> EdgeCheck:
+        num_asked.append(len(start))
+        share = (
+            0.999 if not only_whole else float(len(num_asked) > 1)
+        )  # the straight edge is not free, the trees' are
+        return EdgeCheck(free_share=np.full(len(start), share), num_checks=len(start))
+
+    monkeypatch.setattr(planner, "check_edges", checked)
+    found = plan(clearance(one_wall()), START, GOAL, replace(CONFIG, max_iterations=5))
+    assert found.outcome is PlanOutcome.OUT_OF_ITERATIONS
 
 
 def test_the_clock_ends_a_search() -> None:

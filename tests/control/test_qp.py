@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import Barrier, can_bind
-from splatctrl_cli.control.ladder import descend
+from splatctrl_cli.control.ladder import Rung, descend
 from splatctrl_cli.control.problem import assemble, assemble_hard
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QuadraticProgram, residuals, solver_named
 from splatctrl_cli.control.tasks import Cost, eliminated_weight, posture_task, velocity_task
@@ -35,6 +35,16 @@ def test_eliminating_the_end_effector_velocity_leaves_the_literal_solution(seed:
     literal = ClarabelSolver().solve(literal_program(J, u, Q, R, (0.1 * np.ones(7), 1e-3), (G, h), (1e3, 100.0)))
     assert reduced.is_solved and literal.is_solved
     np.testing.assert_allclose(reduced.z[:7], literal.z[:7], atol=2e-5)
+
+
+def test_slack_costs_what_its_barrier_says() -> None:
+    slack = np.array([0.3, 0.0, 2.0])
+    program = assemble(
+        [posture_task(np.zeros(2), 1.0)], -np.ones(2), np.ones(2), [barrier(np.ones((3, 2)), np.ones(3))]
+    )
+    z = np.concatenate([np.zeros(2), slack])
+    cost = 0.5 * z @ program.H @ z + program.c @ z
+    assert cost == pytest.approx(np.sum(1e3 * slack + 100.0 * slack**2))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -73,6 +83,14 @@ def test_rows_that_contradict_each_other_give_way_by_what_is_missing() -> None:
     assert solution.z[1] + solution.z[2] == pytest.approx(0.4, abs=1e-6)
 
 
+def test_one_row_dearer_than_its_slack_gives_way_whatever_the_others_cost() -> None:
+    rows = replace(barrier(np.ones((2, 1)), np.array([0.0, 5.0])), slack_cost=0.1)
+    wanted = [posture_task(np.ones(1), 1e3)]
+    choice = descend(DaqpSolver(), wanted, (np.array([-1.0]), np.array([1.0])), [rows], ControlConfig())
+    assert choice.rung is Rung.RELAXED
+    assert choice.velocity[0] > 0.5
+
+
 def test_a_degenerate_box_is_solved() -> None:
     solution = ClarabelSolver().solve(
         assemble([posture_task(np.zeros(2), 1.0)], np.array([-1.5, -1.0]), np.array([-1.5, 1.0]), [])
@@ -89,6 +107,7 @@ def test_residuals_vanish_at_the_optimum_and_nowhere_else() -> None:
     assert residuals(program, np.array([1.5]), np.array([1.0])).primal == pytest.approx(0.5)
     assert residuals(program, np.array([1.0]), np.array([1.0])).dual > 0.1
     assert residuals(program, np.array([0.0]), np.array([4.0])).gap > 0.1
+    assert residuals(program, np.array([0.0]), np.array([4.0])).worst > 0.1
     assert residuals(program, np.array([2.0]), np.array([-1.0])).dual > 0.1
     assert residuals(program, np.array([np.nan]), np.array([2.0])).worst == np.inf
 

@@ -113,7 +113,7 @@ def test_the_rotation_vector_of_a_half_turn_has_length_pi() -> None:
 
 def test_the_pose_error_carries_the_frame_to_the_goal() -> None:
     start = transform_from([1.0, 2, 3], [0.1, 0.2, -0.3, 0.9])
-    goal = transform_from([1.5, 2, 2], [0.0, 0.0, 0.0, 1.0])
+    goal = transform_from([1.5, 2, 2], [0.3, 0.0, 0.1, 1.0])  # in the world's axes: not turned about the start's
     error = pose_error(start, goal)
     angle = np.linalg.norm(error[3:])
     turn = np.append(np.sin(angle / 2) * error[3:] / angle, np.cos(angle / 2))

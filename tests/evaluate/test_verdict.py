@@ -35,6 +35,11 @@ def test_a_failure_outranks_missing_evidence_which_outranks_a_pass(
         )
 
 
+@pytest.mark.parametrize(("found", "code"), [(PASSED, 3), (UNKNOWN, 5), (FAILED, 1)])
+def test_damage_is_in_the_exit_code_of_what_passed_alone(found: Reason, code: int) -> None:
+    assert verdict_of("reconstruct", [found], is_damaged=True).exit_code == code
+
+
 def test_nothing_judged_is_not_evaluable() -> None:
     verdict = verdict_of("replay", [], passed="safe")
     assert (verdict.outcome, verdict.label, verdict.exit_code) == (Outcome.NOT_EVALUABLE, "not evaluable", 5)

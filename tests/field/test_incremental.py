@@ -87,6 +87,26 @@ def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distanc
         assert (changes.num_baked > 0) == (kind != "order")
 
 
+@pytest.mark.parametrize("length", [0.03, 0.05])
+def test_an_edit_is_baked_as_far_as_its_kernel_reaches(length: float) -> None:
+    before = splat_set(*cloud(400))
+    is_kept = np.ones(len(before), bool)
+    is_kept[np.argsort(before.centers[:, 0])[-3:]] = False
+    after, config, channels = (
+        before.select(is_kept),
+        replace(CONFIG, distance="se", length_scale=length),
+        ("sdf", "se"),
+    )
+    old, new = (Baker(splats, LAYOUT, config, channels=channels) for splats in (before, after))
+    arrays = whole(old)
+    changes = changed_blocks(before, old, after, new)
+    assert changes.mask is not None
+    assert 0.5 < changes.num_baked / changes.num_blocks < 1.0
+    new.bake(0, LAYOUT.shape[0], arrays, changes.mask)
+    for name, values in whole(Baker(after, LAYOUT, config, channels=channels)).items():
+        assert arrays[name].tobytes() == values.tobytes(), name
+
+
 def test_a_far_edit_of_many_bakes_everything_it_must() -> None:
     before = splat_set(*cloud(300))
     after = replace(before, centers=(before.centers + np.float32(0.07)).astype(np.float32))
@@ -120,6 +140,7 @@ def test_what_reaches_every_cell_bakes_everything_and_says_why() -> None:
     ):
         old, new = (Baker(splats, LAYOUT, config, channels=channels) for splats in (before, after))
         assert words in changed_blocks(before, old, after, new).reason
-    moved = replace(before, centers=before.centers * np.float32(1.5))
-    old, new = (Baker(splats, LAYOUT, CONFIG) for splats in (before, moved))
-    assert "bound's margin" in changed_blocks(before, old, moved, new).reason
+    for scale in (1.5, 0.5):
+        moved = replace(before, centers=before.centers * np.float32(scale))
+        old, new = (Baker(splats, LAYOUT, CONFIG) for splats in (before, moved))
+        assert "bound's margin" in changed_blocks(before, old, moved, new).reason

@@ -92,6 +92,15 @@ def test_field_of_the_full_process_is_that_of_the_dense_one() -> None:
     np.testing.assert_allclose(se[has_value], expected[has_value], atol=2e-5)
 
 
+def test_weights_of_either_sign_are_cut_off_later_than_sums_that_cannot_cancel() -> None:
+    centers, radii = cloud(600)
+    coarse, fine = (
+        GpdfField(centers, radii, 0.05, weights="cg", noise=1e-2, truncation=truncation).query_raw(queries(2000))[0]
+        for truncation in (1e-2, 1e-6)
+    )
+    np.testing.assert_allclose(coarse, fine, atol=1e-6)
+
+
 def test_the_full_process_is_zero_on_each_sphere_where_lumping_is_not() -> None:
     centers, radii = cloud(500)
     occupied = {

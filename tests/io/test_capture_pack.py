@@ -54,6 +54,15 @@ def test_unpacking_gives_the_same_bytes(tmp_path: Path, recipe: LogRecipe, optio
     assert len(contents(folder)) > 12
 
 
+def test_a_capture_of_a_capture_keeps_its_depth_unit(tmp_path: Path) -> None:
+    folder = captured(tmp_path, replace(RECIPE, depth_counts=12503), SourceOptions(depth_scale=1e-4))
+    write_capture(tmp_path / "again.capture", open_source(folder))
+    first, again = contents(folder), contents(tmp_path / "again.capture")
+    assert {name: data for name, data in first.items() if name.startswith("depth/")} == {
+        name: data for name, data in again.items() if name.startswith("depth/")
+    }
+
+
 def test_a_foreign_reader_finds_standard_messages(tmp_path: Path) -> None:
     folder, packed = captured(tmp_path, RECIPE), tmp_path / "packed.mcap"
     pack_capture(folder, packed)

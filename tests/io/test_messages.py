@@ -67,6 +67,7 @@ def test_float_depth_is_metres_and_what_was_not_measured_is_zero() -> None:
     values = np.array([[1.5, np.nan], [np.inf, -2.0]], dtype=np.float32)
     image = read_image(message(values, "32FC1"), IMAGE)
     assert np.array_equal(depth_of(image, None), np.array([[1.5, 0], [0, 0]], dtype=np.float32))
+    assert np.array_equal(depth_of(image, 0.5), np.array([[0.75, 0], [0, 0]], dtype=np.float32))
 
 
 def test_too_few_bytes_are_refused_not_padded() -> None:
@@ -322,15 +323,18 @@ def test_other_pixels_in_a_file_are_neither_colour_nor_depth() -> None:
         read_image(recorded, COMPRESSED_IMAGE)
 
 
-def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_memory_is_taken() -> None:
+def test_a_png_that_announces_more_than_its_bytes_unpack_to_is_refused_before_memory_is_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     png = bytes(cv2.imencode(".png", np.zeros((64, 64), np.uint16))[1])
     assert decode_file(png, color=False) is not None  # a flat image, packed as well as can be
     head = struct.pack(">II", 30_000, 30_000) + png[24:29]
     bomb = png[:16] + head + struct.pack(">I", zlib.crc32(b"IHDR" + head)) + png[33:]
+    assert decode_file(png + b"behind the end", color=False) is not None
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     assert decode_file(bomb, color=False) is None
     assert decode_file(png[:20] + png[-12:], color=False) is None
     assert decode_file(png[:33] + b"\x7f" + png[34:], color=False) is None  # a chunk of two gigabytes
-    assert decode_file(png + b"behind the end", color=False) is not None
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:

@@ -85,15 +85,17 @@ def test_a_log_with_cameras_gives_frames_and_states(tmp_path: Path) -> None:
 
 
 def test_joints_are_taken_by_name_in_whatever_order_a_message_has_them(tmp_path: Path) -> None:
-    q = ramp(20)
-    messages = states_of(q, AB)
+    q, v = ramp(20), np.full((20, 2), [1.0, 2.0])
+    messages = states_of(q, AB, velocity=v)
     messages[7] = Message(
         log_ns=messages[7].log_ns,
         topic="/joint_states",
         type_name="sensor_msgs/msg/JointState",
-        content=joint_state(messages[7].log_ns, ("b", "a"), q[7, ::-1]),
+        content=joint_state(messages[7].log_ns, ("b", "a"), q[7, ::-1], v[7, ::-1]),
     )
-    assert np.array_equal(columns(opened(write_mcap(tmp_path / "x.mcap", messages)), AB)[0], q)
+    position, velocity = columns(opened(write_mcap(tmp_path / "x.mcap", messages)), AB)
+    assert np.array_equal(position, q)
+    assert np.array_equal(velocity, v)
 
 
 def test_joints_of_two_topics_are_brought_together_at_the_stamps_of_one(tmp_path: Path) -> None:

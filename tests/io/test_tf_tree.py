@@ -25,6 +25,10 @@ def test_a_moving_frame_is_interpolated_and_a_static_one_holds_always() -> None:
     angle = np.pi / 4
     assert T[:3, 3] == pytest.approx([0.5, 0, 0.5])
     assert T[:2, :2] == pytest.approx(np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]))
+    early = moving_tree().lookup("world", "camera", 200_000_000)
+    assert early is not None
+    assert early[:3, 3] == pytest.approx([0.2, 0, 0.5])
+    assert early[1, 0] == pytest.approx(np.sin(0.2 * np.pi / 2))
 
 
 def test_the_inverse_lookup_is_the_inverse_transform() -> None:

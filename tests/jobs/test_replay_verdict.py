@@ -107,6 +107,13 @@ def test_what_stands_at_the_mount_from_the_start_is_only_said(stage: Stage) -> N
     assert any("fixed spheres stand within the margin" in note for note in verdict["notes"])
 
 
+def test_what_comes_nearer_to_a_fixed_sphere_that_stood_free_counts(stage: Stage) -> None:
+    stage.balls = [FAR, beside_the_mount(stage.arm, 0.042)]
+    stage.later = [beside_the_mount(stage.arm, 0.0155)]  # by less than what a mount's map grows
+    code, verdict = stage.judged()
+    assert (code, verdict["label"], decisive(verdict)) == (1, "margin broken", {"static clearance": "failed"})
+
+
 @pytest.mark.parametrize(("gap", "code"), [(-0.010, 0), (-0.016, 1)])
 def test_at_a_mount_only_what_comes_much_nearer_counts(stage: Stage, gap: float, code: int) -> None:
     stage.balls = [FAR, beside_the_mount(stage.arm, 0.015)]
@@ -201,6 +208,7 @@ def test_a_value_of_the_grid_below_the_margin_is_red(stage: Stage) -> None:
     stage.desk.source.states = stage.states
     code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR, ball), voxel=0.04)))
     assert (code, verdict["label"], decisive(verdict)["clearance"]) == (1, "contact", "failed")
+    assert decisive(verdict)["certified clearance"] == "failed"
 
 
 def test_after_a_long_lead_in_the_rest_can_be_judged_as_the_remedy_says(stage: Stage) -> None:

@@ -134,6 +134,8 @@ def test_nothing_is_seeded_beside_a_live_splat() -> None:
     again = seeds_at([source], half, density, CONFIG).centers
     assert len(again) > 0.4 * len(first)
     assert np.linalg.norm(again[:, None] - half[None], axis=2).min() >= 0.7 * 0.05 - 1e-6
+    beside = first + np.float32([0.015, 0.0, 0.0])
+    assert len(seeds_at([source], beside, density, CONFIG).centers) == 0
 
 
 def test_the_radius_is_that_of_the_cube_within_its_limits() -> None:

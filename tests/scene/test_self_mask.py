@@ -128,6 +128,14 @@ def test_the_residual_has_the_median_and_sign_of_the_offset(offset: float) -> No
     assert found.num_pixels > 2 * 500
 
 
+@pytest.mark.parametrize("offset", [-0.25, 0.25])
+def test_what_is_seen_far_before_or_behind_the_robot_says_nothing_of_its_residual(offset: float) -> None:
+    depth = ball_depth()
+    depth[:, :90] += offset  # most of the ball
+    found = link_residuals([self_mask(frame(depth), robot(), CONFIG)])["arm"]
+    assert found.median == pytest.approx(0.0, abs=2e-4)
+
+
 def test_spheres_that_stand_for_a_link_enclose_it() -> None:
     """They may be larger than the link by any amount: what lies inside them is the robot."""
     for extra in (0.0, 0.05):

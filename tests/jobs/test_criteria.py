@@ -1,0 +1,115 @@
+"""Criteria of a replay's verdict on made-up figures: those that a whole run seldom breaks alone."""
+
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.explain import EventKind
+from splatctrl_cli.evaluate.conformal import ConformalBound
+from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.jobs import evidence_criteria as evidence
+from splatctrl_cli.jobs.motion_criteria import controller
+
+NUM = 11
+UNKNOWN = np.full(NUM, np.nan)
+
+
+def judged(**replay: Any) -> Any:
+    """What the criteria look at, of a run with nothing broken but `replay`."""
+    stamps = np.arange(NUM, dtype=np.int64) * 100_000_000
+    run = {
+        "audit": SimpleNamespace(stamp_ns=stamps, clearance={}, unknown_share=np.zeros(NUM)),
+        "between": {"unbounded": np.zeros(NUM - 1), "surface": np.full(NUM, 0.1)},
+        "near": {"unseen": UNKNOWN, "age": UNKNOWN},
+        "map_age_s": np.zeros(NUM),
+        "events": [],
+        "lead_in_s": 0.0,
+        "num_before_scene": 0,
+        "map_error": None,
+        "closed_loop": None,
+    }
+    return SimpleNamespace(
+        replay=SimpleNamespace(**run | replay),
+        request=SimpleNamespace(
+            max_map_age=1.0, max_unknown=0.05, config=Config(), field=None, follow=True, twist_topic=None
+        ),
+        inputs=SimpleNamespace(source=SimpleNamespace(loss=SimpleNamespace(conflicting_states=0), has_clock=True)),
+        metrics={"unknown_share": 0.0, "num_scene_hits": 0},
+        num_states=NUM,
+    )
+
+
+def outcomes(criterion: Callable[[Any], Iterator[Reason]], of: Any) -> list[Outcome]:
+    return [reason.outcome for reason in criterion(of)]
+
+
+def event(kind: EventKind) -> SimpleNamespace:
+    return SimpleNamespace(
+        kind=kind, source="", first_ns=0, start_s=0.2, end_s=0.4, worst_s=0.3, worst=1.5, worst_name="", obstacle=None
+    )
+
+
+@pytest.mark.parametrize(("residual", "outcome"), [(4.9, Outcome.PASSED), (5.1, Outcome.NOT_EVALUABLE)])
+def test_a_robot_seen_off_where_its_joints_put_it_is_no_evidence(residual: float, outcome: Outcome) -> None:
+    run = judged()
+    links = {"hand": {"median_mm": -residual, "sign": -1, "num_pixels": 500}}
+    run.inputs.scene = SimpleNamespace(figures=lambda: {"self_mask_residual_mm": residual, "self_mask": links})
+    (reason,) = evidence.calibration(run)
+    assert reason.outcome is outcome
+    assert outcome is Outcome.PASSED or (reason.who, reason.count) == ("hand", 500)
+
+
+@pytest.mark.parametrize("what", ["relaxed", "minimum_violation", "hold"])
+def test_a_step_of_any_kind_that_is_not_solved_fails_the_controller(what: str) -> None:
+    run = judged(closed_loop=SimpleNamespace(steps=[None] * 5), events=[event(EventKind(what.replace("_", "-")))])
+    run.metrics |= {f"num_{name}": 0 for name in ("relaxed", "minimum_violation", "hold")} | {f"num_{what}": 2}
+    (reason,) = controller(run)
+    assert reason.outcome is Outcome.FAILED
+    assert f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
+
+
+def test_one_state_judged_by_an_old_map_is_enough() -> None:
+    ages = np.array([0.1] * 10 + [1.5])
+    assert outcomes(evidence.evidence_age, judged(map_age_s=ages, events=[event(EventKind.STALE_MAP)])) == [
+        Outcome.NOT_EVALUABLE
+    ]
+
+
+def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
+    near = {"unseen": UNKNOWN, "age": np.full(NUM, 1.5)}
+    assert outcomes(evidence.evidence_age, judged(near=near)) == [Outcome.NOT_EVALUABLE, Outcome.PASSED]
+
+
+def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:
+    run = judged()
+    there, blank = np.full(NUM, 0.2), np.full(NUM, 0.2)
+    blank[3] = np.nan
+    for fields in ((there, blank), (blank, there)):
+        run.replay.audit.clearance = {
+            name: SimpleNamespace(distance=of) for name, of in zip("ab", fields, strict=True)
+        }
+        (reason,) = evidence.judged_time(run)
+        assert (reason.outcome, reason.time_s) == (Outcome.NOT_EVALUABLE, pytest.approx(0.3))
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_lead_in_longer_than_is_allowed_is_not_judged(share: float) -> None:
+    run = judged(lead_in_s=share * Config().verdict.lead_in)
+    assert outcomes(evidence.judged_time, run) == ([Outcome.NOT_EVALUABLE] if share > 1 else [])
+
+
+def test_space_that_was_not_recorded_is_not_known() -> None:
+    run = judged()
+    run.metrics["unknown_share"] = None
+    assert outcomes(evidence.known_space, run) == [Outcome.NOT_EVALUABLE]
+
+
+@pytest.mark.parametrize(("miss", "outcome"), [(0.09, Outcome.PASSED), (0.11, Outcome.NOT_EVALUABLE)])
+def test_the_surface_must_keep_the_whole_map_error(miss: float, outcome: Outcome) -> None:
+    bound = ConformalBound(bound=miss, confidence=0.9, num_stretches=9, length=1, at=0)
+    found = SimpleNamespace(bound=bound, num_points=5, time_s=0.1, place=None, source="cam3")
+    assert outcomes(evidence.map_error, judged(map_error=found)) == [outcome]

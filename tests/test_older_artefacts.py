@@ -1,0 +1,67 @@
+"""Captures, scenes, fields and replays that an earlier version wrote are still read.
+
+`data/older.zip` was written by version 0.1.0 from one second of a simulated log, two cameras of 64 x 48 pixels.
+"""
+
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.cli.here import splatctrl
+
+OLDER = Path(__file__).parent / "data" / "older.zip"
+
+
+@pytest.fixture(scope="module")
+def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("older")
+    with zipfile.ZipFile(OLDER) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("artefact", "said"),
+    [
+        ("tabletop.capture", {"kind": "capture", "has_clock": True, "joints": [f"joint{n}" for n in range(1, 8)]}),
+        ("scene", {"kind": "scene folder"}),
+        ("field", {"kind": "field folder", "shape": [11, 11, 11], "distance": "safe", "length_scale": 0.02}),
+        ("audit", {"kind": "run folder"}),
+    ],
+)
+def test_an_older_artefact_is_described(older: Path, artefact: str, said: dict[str, object]) -> None:
+    told = splatctrl("info", older / artefact, "--json")
+    assert told.returncode == 0, told.stderr
+    answer = json.loads(told.stdout)
+    assert said.items() <= answer.items(), answer
+
+
+def test_an_older_capture_and_scene_replay_as_they_did(older: Path, tmp_path: Path) -> None:
+    robot = ["--urdf", older / "robot.urdf", "--spheres", older / "robot_spheres.yaml"]
+    told = splatctrl(
+        "replay", older / "tabletop.capture", "--scene", older / "scene", "--mode", "open-loop", *robot,
+        "--golden", older / "audit", "--worst-frames", "0", "--report-only", "--json", "-o", tmp_path / "replay",
+    )  # fmt: skip
+    assert told.returncode == 0, told.stderr
+    answer = json.loads(told.stdout)
+    assert answer["min_clearance"] == pytest.approx(0.0158572, abs=1e-6)
+    assert answer["num_states"] == 51
+
+
+def test_an_older_field_is_updated_with_an_older_scene(older: Path, tmp_path: Path) -> None:
+    told = splatctrl(
+        "sdf-bake", older / "scene", "--update", older / "field", "--at", "0.6", "--json", "-o", tmp_path / "f"
+    )
+    assert told.returncode == 0, told.stderr
+    assert json.loads(told.stdout)["shape"] == [11, 11, 11]
+
+
+def test_an_older_scene_is_scored_on_an_older_capture(older: Path, tmp_path: Path) -> None:
+    told = splatctrl(
+        "score", older / "scene", "--reference", older / "tabletop.capture", "--allow-training", "--json",
+        "-o", tmp_path / "score",
+    )  # fmt: skip
+    assert told.returncode == 0, told.stderr
+    assert json.loads(told.stdout)["metrics"]["psnr_seen"] == pytest.approx(15.333, abs=0.01)

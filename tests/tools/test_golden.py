@@ -1,0 +1,69 @@
+"""The golden runs: what their table covers, and what their digests leave out."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from tools.golden.__main__ import lines, main, ordered, parse, read_cases
+from tools.golden.digest import of_json, stamps, written
+
+README = Path(__file__).parent.parent.parent / "README.md"
+
+
+def test_every_command_of_the_readme_is_run() -> None:
+    text = README.read_text().replace("\\\n", " ")
+    shown = [shlex.split(line, comments=True) for line in re.findall(r"^\$ splatctrl (.*)$", text, re.MULTILINE)]
+    run = [shlex.split(case.run) for case in read_cases().values()]
+    assert len(shown) >= 9
+    assert [command for command in shown if command not in run] == []
+
+
+def test_a_case_runs_after_all_that_it_needs() -> None:
+    cases = read_cases()
+    order = ordered(cases, ["readme-replay", "capture-unpack"])
+    assert order == ["readme-ingest", "readme-reconstruct", "readme-replay", "capture-pack", "capture-unpack"]
+    assert set(ordered(cases, [])) == set(cases)
+
+
+def test_an_unknown_case_is_refused() -> None:
+    with pytest.raises(SystemExit, match="no case 'readme-repaly'"):
+        main(["readme-repaly"])
+
+
+def test_times_and_places_do_not_change_a_digest() -> None:
+    def answer(seconds: float, folder: str, clearance: float = 0.1) -> str:
+        parts = {
+            "seconds": seconds,
+            "files": [f"{folder}/scene"],
+            "nested": {"seconds": seconds, "clearance": clearance},
+        }
+        return of_json(json.dumps(parts), {folder: "SCRATCH"})
+
+    assert answer(1.0, "/tmp/a") == answer(2.0, "/tmp/longer")
+    assert answer(1.0, "/tmp/a") != answer(1.0, "/tmp/a", clearance=0.2)
+
+
+def test_only_new_and_changed_files_are_artefacts(tmp_path: Path) -> None:
+    for name in ("kept.csv", "changed.csv"):
+        (tmp_path / name).write_text("1")
+    before = stamps(tmp_path)
+    (tmp_path / "changed.csv").write_text("12")
+    (tmp_path / "run.json").write_text('{"metrics": {"a": 1}, "seconds": {"fit": 1}}')
+    assert list(written(tmp_path, before, {})) == ["changed.csv", "run.json:metrics"]
+
+
+def test_many_files_alike_are_one_artefact_that_each_of_them_changes(tmp_path: Path) -> None:
+    for number in range(20):
+        (tmp_path / f"{number:06d}.png").write_bytes(bytes([number]))
+    (whole,) = written(tmp_path, {}, {}).items()
+    assert whole[0] == "./*.png (20)"
+    (tmp_path / "000007.png").write_bytes(b"other")
+    assert written(tmp_path, {}, {})[whole[0]] != whole[1]
+
+
+def test_digests_read_back_as_written() -> None:
+    digests = {"a --json": "0123", "a out/x y.png": "4567", "a exit code": "0"}
+    assert parse("# header\n" + "\n".join(lines(digests))) == digests

@@ -1,0 +1,1 @@
+"""Digests of what the commands write, kept in digests.txt: whether a change of the code moves a figure."""
