@@ -28,11 +28,13 @@ LastSeen = Callable[[Float64], NDArray[np.int64]]
 @dataclass(frozen=True, kw_only=True)
 class NearFigures:
     """Of one state: unseen, the share of the points in space that is new to the motion that no camera had ever seen;
-    age [s] within which `FRESH_SHARE` of the seen points were last seen. NaN where there are too few points.
+    age [s] within which `FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
+    after the state. NaN where there are too few points.
     """
 
     unseen: float
     age: float
+    ahead: float
 
 
 class NearSpace:
@@ -67,12 +69,13 @@ class NearSpace:
         seen = last_seen(points)
         is_never = seen < 0
         is_new = _is_outside(points, self._first, self._radii + NEW)
-        unseen = age = np.nan
+        unseen = age = ahead = np.nan
         if is_new.sum() >= fewest:
             unseen = float(is_never[is_new].mean())
         if (~is_never).sum() >= fewest:
-            age = float(np.quantile((stamp_ns - seen[~is_never]) * 1e-9, FRESH_SHARE))
-        return NearFigures(unseen=unseen, age=age)
+            ages = (stamp_ns - seen[~is_never]) * 1e-9
+            age, ahead = float(np.quantile(ages, FRESH_SHARE)), max(-float(ages.min()), 0.0)
+        return NearFigures(unseen=unseen, age=age, ahead=ahead)
 
 
 def _is_outside(points: Float64, centers: Float64, radii: Float64, owners: NDArray[np.integer] | None = None) -> Bool:

@@ -38,9 +38,9 @@ class ReplayRecord:
 
     between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), the time [s] that
     nobody can bound (`unbounded`), the clearance [m] of the body at the state (`surface`), and that of the spheres to
-    the splats alone (`represented`). near: what was known about the arm (`unseen`, `age` as `NearFigures` has them),
-    NaN at states that were not looked at. strain: velocity and acceleration as shares of their limits. statics: by
-    sphere that no joint moves, its clearance [m] in the first scene and the least in any.
+    the splats alone (`represented`). near: what was known about the arm (the columns of `NearFigures`), NaN at states
+    that were not looked at. strain: velocity and acceleration as shares of their limits. statics: by sphere that no
+    joint moves, its clearance [m] in the first scene and the least in any.
     """
 
     def __init__(
@@ -193,14 +193,14 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states."""
         num = len(part.stamp_ns)
-        unseen, age = np.full(num, np.nan), np.full(num, np.nan)
+        unseen, age, ahead = np.full((3, num), np.nan)
         for at in self._near.due(part.stamp_ns):
             stamp = int(part.stamp_ns[at])
             known = self._scene.voxels_at(stamp)
             if known is not None:
                 figures = self._near.look(stamp, part.position[at], known.last_seen_ns)
-                unseen[at], age[at] = figures.unseen, figures.age
-        self.near.append(unseen=unseen, age=age)
+                unseen[at], age[at], ahead[at] = figures.unseen, figures.age, figures.ahead
+        self.near.append(unseen=unseen, age=age, ahead=ahead)
 
     def _tell_represented(self, part: AuditTrace) -> None:
         """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""

@@ -100,7 +100,7 @@ def bare_forearm(stage: Stage) -> None:
 
 def never_seen_where_it_goes(stage: Stage) -> None:
     stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]), num=11)
-    stage.last_seen = voxels(SECOND, is_seen=False)
+    stage.last_seen = voxels(is_seen=False)
 
 
 def frames_that_renew_nothing(stage: Stage) -> None:
@@ -109,10 +109,14 @@ def frames_that_renew_nothing(stage: Stage) -> None:
     stage.last_seen = voxels(0)
 
 
+def frames_of_the_future(stage: Stage) -> None:
+    stage.last_seen = voxels(2 * SECOND)
+
+
 def no_new_map(stage: Stage) -> None:
     stage.states = resting(num=21)
     stage.map_stamps = [0, QUARTER]
-    stage.last_seen = voxels(2 * SECOND)
+    stage.last_seen = voxels(is_seen=False)  # nothing about the arm, which comes to no new space
 
 
 def gap_in_the_log(stage: Stage) -> None:
@@ -168,6 +172,7 @@ ALONE: dict[str, Broken] = {
         "100 % of the space about the arm",
     ),
     "evidence age": (frames_that_renew_nothing, (), "evidence age", "not evaluable", "frames without depth renew"),
+    "frames ahead": (frames_of_the_future, (), "evidence age", "not evaluable", "returned 2.00 s after the state"),
     "map age": (no_new_map, (), "map age", "not evaluable", "1.75 s old, allowed 1 s"),
     "gap": (gap_in_the_log, (), "judged time", "not evaluable", "0.50 s of 1.00 s lie between states"),
     "three stamps": (three_stamps, (), "judged time", "not evaluable", "2 gaps"),

@@ -129,7 +129,7 @@ def test_acceleration_limits_count_where_they_are_set(stage: Stage) -> None:
 @pytest.mark.parametrize("height", [0.35, 0.6])
 def test_unknown_space_counts_from_the_share_that_is_allowed(stage: Stage, height: float) -> None:
     above = grid_seen().origin[2] + 0.1 * np.arange(40) > height
-    stage.last_seen = voxels(SECOND, is_known=~above)
+    stage.last_seen = voxels(is_known=~above)
     scene = stage.scene()
     stage.judged(scene=scene)
     share = stage.desk.metrics()["unknown_share"]
@@ -145,7 +145,7 @@ def test_half_of_the_space_that_the_motion_comes_to_must_have_been_seen(stage: S
     shares, codes = [], []
     for number, height in enumerate((0.25, 0.35, 0.45, 0.55, 0.65)):
         above = grid_seen().origin[2] + 0.1 * np.arange(40) > height
-        stage.last_seen = voxels(SECOND, is_seen=~above)
+        stage.last_seen = voxels(is_seen=~above)
         codes.append(stage.judged(scene=stage.scene(f"scene{number}"))[0])
         shares.append(stage.desk.metrics()["max_unseen_share"])
     assert [5 if share > 0.5 else 0 for share in shares] == codes
