@@ -9,6 +9,7 @@ from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.jobs.replay_request import ReplayRequest
 from splatctrl_cli.records import LossReport
+from splatctrl_cli.robot.declared import carried_words
 from splatctrl_cli.scene.audit import AuditRow
 from splatctrl_cli.scene.self_mask import MIN_PIXELS
 
@@ -45,6 +46,7 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
         "reconstruct",
         [*reasons, *loss_notes(made.loss), *gate_reasons(require, {name: metrics[name] for name in GATED})],
         scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
+        notes=[carried_words(entry) for entry in metrics["carried"]],
         is_damaged=bool(made.loss.damaged),
     )
 

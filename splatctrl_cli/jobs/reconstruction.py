@@ -245,6 +245,7 @@ class Reconstruction:
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.disagreement,
             **self_mask_metrics(self.rows),
+            "carried": self.declared.carried_uses(),
             "first_frames": list(self.first_frames.values()),
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }

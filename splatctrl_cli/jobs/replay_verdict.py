@@ -23,6 +23,7 @@ from splatctrl_cli.jobs.motion_criteria import (
 from splatctrl_cli.jobs.replay_golden import Golden, golden_reason
 from splatctrl_cli.jobs.replay_judged import CONTACT, SAFE, Judged
 from splatctrl_cli.jobs.replay_metrics import first_time
+from splatctrl_cli.robot.declared import carried_words
 
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
 CRITERIA = (
@@ -87,13 +88,15 @@ def _notes(judged: Judged) -> tuple[str, ...]:
 
 
 def _declared_notes(judged: Judged) -> list[str]:
-    """Every contact that was declared, and entries that nothing used."""
+    """Declared contact, what the map was told that the robot carries, and entries that nothing used."""
     declared, notes = judged.inputs.declared, []
     for index, entry in enumerate(declared.expected_contact):
         num = declared.num_uses.get(("expected_contact", index), 0)
         used = f"{num} times" if num else "warning: not used by any state"
         notes.append(f"contact of {entry.link} declared ({entry.reason}): {used}")
-    for index, carried in enumerate(declared.carried):
-        is_used = declared.num_uses.get(("carried", index)) or not judged.request.lockstep
-        notes.append(f"{carried.link} carries a box" + ("" if is_used else ": warning: no pixel needed it"))
+    of_map = judged.inputs.scene.figures().get("carried", [])
+    notes += [carried_words(made) for made in of_map]
+    for given in declared.carried_uses():
+        if not any(given | {"num_uses": 0} == made | {"num_uses": 0} for made in of_map):
+            notes.append(f"{given['link']} carries a box: warning: the map was made without this declaration")
     return notes

@@ -43,6 +43,7 @@ def made(*rows: AuditRow, loss: LossReport | None = None, is_seeded: bool = Fals
         "psnr": 20.0,
         "inside_robot_first_ns": None,
         "inside_robot_first_link": None,
+        "carried": [],
         "frames_without_depth": sum(row.without_depth for row in rows),
     }
     return Reconstructed(
