@@ -196,10 +196,12 @@ class ReplayRecord:
         unseen, age, ahead = np.full((3, num), np.nan)
         for at in self._near.due(part.stamp_ns):
             stamp = int(part.stamp_ns[at])
-            known = self._scene.voxels_at(stamp)
-            if known is not None:
-                figures = self._near.look(stamp, part.position[at], known.last_seen_ns)
-                unseen[at], age[at], ahead[at] = figures.unseen, figures.age, figures.ahead
+            last_seen = self._scene.last_seen_at(stamp)
+            if last_seen is not None:
+                figures = self._near.look(stamp, part.position[at], last_seen)
+                unseen[at] = figures.unseen
+                if self._scene.has_seen_times:
+                    age[at], ahead[at] = figures.age, figures.ahead
         self.near.append(unseen=unseen, age=age, ahead=ahead)
 
     def _tell_represented(self, part: AuditTrace) -> None:

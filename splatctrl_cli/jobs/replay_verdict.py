@@ -21,7 +21,7 @@ from splatctrl_cli.jobs.motion_criteria import (
     surface_clearance,
 )
 from splatctrl_cli.jobs.replay_golden import Golden, golden_reason
-from splatctrl_cli.jobs.replay_judged import CONTACT, SAFE, Judged
+from splatctrl_cli.jobs.replay_judged import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay_metrics import first_time
 from splatctrl_cli.robot.declared import carried_words
 
@@ -78,6 +78,8 @@ def _notes(judged: Judged) -> tuple[str, ...]:
         notes.append(f"{len(close)} fixed spheres stand within the margin of their surroundings")
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         notes.append(f"{judged.replay.lead_in_s:.2f} s before the first map are left out")
+    if nearby(judged, "age") is None:
+        notes.append("age of the evidence about the arm not judged")
     notes += _declared_notes(judged)
     inside = judged.inputs.scene.figures().get("inside_robot_points")
     if inside:

@@ -9,10 +9,10 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
-from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.io.grid import read_npz, write_npz
 from splatctrl_cli.io.state_offset import ClockOffset
 from splatctrl_cli.jobs import replay as job
-from splatctrl_cli.records import Box
+from splatctrl_cli.records import Box, VoxelState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.jobs.broken import (
@@ -194,6 +194,25 @@ def test_a_field_that_does_not_say_of_what_time_it_is_is_no_evidence(stage: Stag
     code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR))))
     assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
     assert "does not say of what time it is" in verdict["sentence"]
+
+
+def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:
+    stage.states = stage.desk.source.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    field = baked(stage, splats=splats_of(FAR), moment=SECOND)
+    code, verdict = stage.replayed("--field", str(field))
+    assert (code, decisive(verdict)) == (0, {})
+    assert "age of the evidence about the arm not judged" in verdict["sentence"]
+    grid = read_npz(field / "field.npz")
+    for state, channels in (
+        (VoxelState.SWEPT_BY_ROBOT, {"observed": np.full_like(grid.channels["observed"], VoxelState.SWEPT_BY_ROBOT)}),
+        (None, {}),
+    ):
+        kept = {name: values for name, values in grid.channels.items() if name != "observed"} | channels
+        write_npz(field / "field.npz", replace(grid, channels=kept))
+        code, verdict = stage.replayed("--field", str(field))
+        assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
+        words = "what cameras saw is not recorded" if state is None else "100 % of the space about the arm"
+        assert words in verdict["sentence"]
 
 
 def test_a_value_of_the_grid_below_the_margin_is_red(stage: Stage) -> None:
