@@ -117,7 +117,9 @@ def _verdict(report: "CheckReport", *, fail_on: str) -> "Verdict":
         for finding in report.sorted_findings
     ]
     counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in report.counts.items())
-    return verdict_of("check", [read, *found], scope=f"{Path(report.path).name}: {counts}")
+    return verdict_of(
+        "check", [read, *found], scope=f"{Path(report.path).name}: {counts}", counts={"messages": report.num_messages}
+    )
 
 
 def _robot(args: argparse.Namespace) -> "RobotModel | None":

@@ -20,6 +20,7 @@ from splatctrl_cli.jobs.motion_criteria import (
     static_clearance,
     surface_clearance,
 )
+from splatctrl_cli.jobs.replay_counts import counts_of
 from splatctrl_cli.jobs.replay_golden import Golden, golden_reason
 from splatctrl_cli.jobs.replay_judged import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay_metrics import first_time
@@ -53,8 +54,9 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     for criterion in CRITERIA:
         reasons += criterion(judged)
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
+    counts = counts_of(replay, judged.logged, judged.metrics, request.config.control)
     reasons += gate_reasons(
-        request.require, judged.metrics, first_time=lambda name, holds: first_time(replay, name, holds)
+        request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
     )
     if golden is not None:
         reasons.append(golden_reason(golden, replay, request.golden_tolerance))
@@ -67,6 +69,7 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
         scope=f"{motion} motion from {first:.2f} to {last:.2f} s of the log, {len(stamps)} states",
         passed=SAFE,
         notes=_notes(judged),
+        counts=counts,
     )
 
 

@@ -303,6 +303,21 @@ def test_a_gate_turns_the_verdict_with_report_only_too(stage: Stage, gate: str, 
         assert set(decisive(verdict)) == ({f"--require {gate}"} if code else set())
 
 
+@pytest.mark.parametrize(
+    ("gate", "passes"), [("max_acceleration_share<=1", ("--set", "control.max_acceleration=9")), ("num_poses<=0", ())]
+)
+def test_a_gate_on_what_nothing_was_measured_of_is_not_evaluable(
+    stage: Stage, gate: str, passes: tuple[str, ...]
+) -> None:
+    scene = stage.scene()
+    code, verdict = stage.judged("--require", gate, scene=scene)
+    assert verdict["counts"]["min_clearance"] == 11 and set(verdict["counts"]) == set(stage.desk.metrics())
+    if passes:
+        assert (code, decisive(verdict)) == (5, {f"--require {gate}": "not evaluable"})
+        assert "as it rests on nothing" in verdict["sentence"]
+    assert stage.judged("--require", gate, *passes, scene=scene)[0] == 0
+
+
 def test_a_misspelled_metric_is_refused_before_anything_is_read(
     stage: Stage, capsys: pytest.CaptureFixture[str]
 ) -> None:
