@@ -36,11 +36,12 @@ class ReplayRecord:
     """The audit of states (T,) in the scenes as they were known, what is nearest to the nearest sphere of each, in
     words, the age (T,) [s] of each state's scene, and what happened.
 
-    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), the time [s] that
-    nobody can bound (`unbounded`), the clearance [m] of the body at the state (`surface`), and that of the spheres to
-    the splats alone (`represented`). near: what was known about the arm (the columns of `NearFigures`), NaN at states
-    that were not looked at. strain: velocity and acceleration as shares of their limits. statics: by sphere that no
-    joint moves, its clearance [m] in the first scene and the least in any.
+    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), 1 where that is
+    the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
+    clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
+    near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at. strain:
+    velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in
+    the first scene and the least in any.
     """
 
     def __init__(
@@ -175,10 +176,11 @@ class ReplayRecord:
         unbounded = np.where(between.is_bounded | (not self._is_continuous), 0.0, np.diff(stamps) * 1e-9)
         lower = np.where(between.is_bounded & self._is_continuous, between.lower, np.nan)
         surface = at_states.min(axis=1) if is_first else at_states[1:].min(axis=1)
+        met = between.is_met.astype(np.float64)
         if is_first:
-            lower, unbounded = np.concatenate([[np.nan], lower]), np.concatenate([[0.0], unbounded])
+            lower, unbounded, met = np.insert(lower, 0, np.nan), np.insert(unbounded, 0, 0.0), np.insert(met, 0, 0.0)
         self._lower, self._unbounded = lower, unbounded
-        self.between.append(lower=lower, unbounded=unbounded, surface=surface)
+        self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
 
     def _look_at_statics(self, part: AuditTrace) -> None:
         """The clearance of spheres that no joint moves, once a scene."""

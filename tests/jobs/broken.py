@@ -160,7 +160,7 @@ ALONE: dict[str, Broken] = {
         ("--set", "verdict.longest_interval=0.3"),
         "clearance between states",
         "not evaluable",
-        "between two states",
+        "on the straight way between two states the arm comes to at most",
     ),
     "surface deficit": (little_covered, (), "surface clearance", "not evaluable", "the spheres keep 3"),
     "bare link": (bare_forearm, (), "surface clearance", "not evaluable", "no sphere on link5"),
