@@ -30,6 +30,9 @@ def known_space(judged: Judged) -> Iterator[Reason]:
             remedy="add a camera that sees where the arm goes",
             count=near[2],
         )
+    elif near is not None:
+        words = f"{100 * near[0]:.0f} % of the space about the arm that the motion comes to never seen"
+        yield held("known space", words, near[0], UNSEEN, "", near[2])
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
         yield Reason(
@@ -89,6 +92,9 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="frames without depth renew nothing: check the cameras ('splatctrl check')",
             count=near[2],
         )
+    elif near is not None:
+        words = f"depth from about the arm at most {near[0]:.2f} s before"
+        yield held("evidence age", words, near[0], judged.request.max_map_age, "s", near[2])
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
     known = ages[np.isfinite(ages)]
     if not len(known):

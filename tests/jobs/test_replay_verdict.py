@@ -152,6 +152,20 @@ def test_half_of_the_space_that_the_motion_comes_to_must_have_been_seen(stage: S
     assert set(codes) == {0, 5} and min(abs(share - 0.5) for share in shares) < 0.15
 
 
+def test_what_was_known_about_the_arm_is_a_criterion_where_it_suffices_too(stage: Stage) -> None:
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    code, verdict = stage.judged()
+    metrics, passed = stage.desk.metrics(), [r for r in verdict["reasons"] if r["outcome"] == "passed"]
+    assert code == 0
+    for criterion, figure, allowed in (
+        ("known space", "max_unseen_share", 0.5),
+        ("known space", "unknown_share", 0.05),
+        ("evidence age", "max_evidence_age_s", 1.0),
+    ):
+        values = [(r["value"], r["threshold"]) for r in passed if r["criterion"] == criterion]
+        assert (metrics[figure], allowed) in values
+
+
 def test_a_map_may_be_as_old_as_is_said(stage: Stage) -> None:
     no_new_map(stage)
     scene = stage.scene()
