@@ -146,7 +146,7 @@ def _seven(text: str) -> tuple[float, ...]:
 def _agreement(report: "CheckReport") -> list["Finding"]:
     """Whether views agree on where the surfaces are that both see."""
     from splatctrl_cli.io.finding import Finding, error, note
-    from splatctrl_cli.scene.consistency import agreements
+    from splatctrl_cli.scene.consistency import CAUSES, agreements
 
     findings: list[Finding] = []
     good: list[float] = []
@@ -158,7 +158,7 @@ def _agreement(report: "CheckReport") -> list["Finding"]:
             good.append(pair.median)
             continue
         text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
-        remedy = "calibrate the cameras' poses again (hand-eye)"
+        remedy = f"{CAUSES}: calibrate the cameras' poses again (hand-eye), or widen the range of depth"
         remedy += f", or keep one with --cameras {both[0]}" if len(both) > 1 else ": is it the pose of another frame?"
         findings.append(error("agreement", where, text, remedy, value=round(1e3 * pair.median, 2), unit="mm"))
     if good:
