@@ -136,11 +136,12 @@ def bake_verdict(
                 count=num_cells,
             )
         )
-    cells = " x ".join(map(str, summary["shape"]))
+    cells, counts = " x ".join(map(str, summary["shape"])), counts_of(figures)
     return verdict_of(
         "sdf-bake",
-        [*reasons, *(noted("field", text) for text in report.warnings), *gate_reasons(require, figures)],
+        [*reasons, *(noted("field", text) for text in report.warnings), *gate_reasons(require, figures, counts)],
         scope=f"{cells} cells of {summary['voxel']:g} m, {summary['num_splats']} splats",
+        counts=counts,
     )
 
 
@@ -168,6 +169,17 @@ def metrics(summary: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> d
                 place = f"{where}.{name}.{band_name(band['lower'], band['upper'])}"
                 figures |= {f"{place}.{key}": band[key] for key in band if key not in {"lower", "upper"}}
     return figures | {f"over_estimate.{name}": value for name, value in accuracy["over_estimate"].items()}
+
+
+def counts_of(figures: Mapping[str, float | None]) -> dict[str, int]:
+    """The cells that each of `metrics` rests on: those of its band or of the over-estimate, else all."""
+    num_cells = int(figures["num_cells"] or 0)
+    counts = {}
+    for name in figures:
+        place, _, figure = name.rpartition(".")
+        is_told = figure == "count" or f"{place}.count" not in figures
+        counts[name] = num_cells if is_told else int(figures[f"{place}.count"] or 0)
+    return counts
 
 
 def reference_lines(accuracy: "FieldAccuracy", what: str) -> list[str]:

@@ -117,7 +117,9 @@ def _verdict(report: "CheckReport", *, fail_on: str) -> "Verdict":
         for finding in report.sorted_findings
     ]
     counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in report.counts.items())
-    return verdict_of("check", [read, *found], scope=f"{Path(report.path).name}: {counts}")
+    return verdict_of(
+        "check", [read, *found], scope=f"{Path(report.path).name}: {counts}", counts={"messages": report.num_messages}
+    )
 
 
 def _robot(args: argparse.Namespace) -> "RobotModel | None":
@@ -144,7 +146,7 @@ def _seven(text: str) -> tuple[float, ...]:
 def _agreement(report: "CheckReport") -> list["Finding"]:
     """Whether views agree on where the surfaces are that both see."""
     from splatctrl_cli.io.finding import Finding, error, note
-    from splatctrl_cli.scene.consistency import agreements
+    from splatctrl_cli.scene.consistency import CAUSES, agreements
 
     findings: list[Finding] = []
     good: list[float] = []
@@ -156,7 +158,7 @@ def _agreement(report: "CheckReport") -> list["Finding"]:
             good.append(pair.median)
             continue
         text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
-        remedy = "calibrate the cameras' poses again (hand-eye)"
+        remedy = f"{CAUSES}: calibrate the cameras' poses again (hand-eye), or widen the range of depth"
         remedy += f", or keep one with --cameras {both[0]}" if len(both) > 1 else ": is it the pose of another frame?"
         findings.append(error("agreement", where, text, remedy, value=round(1e3 * pair.median, 2), unit="mm"))
     if good:

@@ -50,12 +50,14 @@ def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box:
             "background": list(fitter.background),
             "workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()],
         }
-        gates = gate_reasons(args.require, {name: _number(metrics[name]) for name in GATED})
+        counts = dict.fromkeys(GATED, len(frames))
+        gates = gate_reasons(args.require, {name: _number(metrics[name]) for name in GATED}, counts)
         verdict = verdict_of(
             "reconstruct",
             [map_reason(rows[-1].gaussians), *loss_notes(source.loss), *gates],
             scope=f"{len(frames)} views, {rows[-1].gaussians} Gaussians",
             is_damaged=bool(source.loss.damaged),
+            counts=counts,
         )
         write_run(
             partial,

@@ -8,7 +8,7 @@ from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_gates
 from splatctrl_cli.cli.numbers import MAX_SEED, real, whole
 from splatctrl_cli.cli.robot_options import add_lock, add_robot, locked_joints
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.gates import check_gate_names, check_gates
+from splatctrl_cli.evaluate.gates import check_gate_names
 
 if TYPE_CHECKING:
     from splatctrl_cli.records import SphereSet
@@ -100,7 +100,7 @@ def _register_info(actions: Subparsers) -> None:
 
 def run_spheres(args: argparse.Namespace) -> int:
     """Fit, write, measure what was written, and return the exit code."""
-    from splatctrl_cli.cli.robot_report import METRICS, coverage_json, coverage_lines, metrics_of
+    from splatctrl_cli.cli.robot_report import METRICS, coverage_json, coverage_lines, coverage_verdict
     from splatctrl_cli.io.output import output_path
     from splatctrl_cli.robot.coverage import coverage_of_solids
     from splatctrl_cli.robot.solids import read_solids
@@ -123,20 +123,22 @@ def run_spheres(args: argparse.Namespace) -> int:
         report = coverage_of_solids(urdf, solids, fitted)
         partial.write_text(spheres_yaml(fitted, _comments(args.urdf, report)), encoding="utf-8")
     spheres = read_spheres(out)
-    metrics = metrics_of(report)
+    verdict = coverage_verdict(report, "robot spheres", args.require)
     if args.picture is not None:
         _draw(args.picture, urdf, solids, spheres)
-    console.result(
+    console.concluded(
+        verdict,
         {"urdf": str(args.urdf), "spheres": str(out), "seed": args.seed, **coverage_json(report)},
         [*coverage_lines(report), "", f"written: {out}"],
+        verdict.exit_code,
+        has_findings=True,
     )
-    check_gates(args.require, metrics)
-    return 0
+    return verdict.exit_code
 
 
 def run_check(args: argparse.Namespace) -> int:
     """Measure a set of spheres and return the exit code."""
-    from splatctrl_cli.cli.robot_report import METRICS, coverage_json, coverage_lines, metrics_of
+    from splatctrl_cli.cli.robot_report import METRICS, coverage_json, coverage_lines, coverage_verdict
     from splatctrl_cli.robot.coverage import coverage_of_solids
     from splatctrl_cli.robot.solids import read_solids
     from splatctrl_cli.robot.sphere_files import read_sphere_file
@@ -162,9 +164,10 @@ def run_check(args: argparse.Namespace) -> int:
         lines.append(RENAMED)
     if left_out:
         lines.append(f"spheres of {', '.join(left_out)} are left out: {args.urdf.name} has no such link")
-    console.result({**facts, **notes, **coverage_json(report)}, lines)
-    check_gates(args.require, metrics_of(report))
-    return 0
+    verdict = coverage_verdict(report, "robot check", args.require)
+    result = {**facts, **notes, **coverage_json(report)}
+    console.concluded(verdict, result, lines, verdict.exit_code, has_findings=True)
+    return verdict.exit_code
 
 
 def run_pairs(args: argparse.Namespace) -> int:

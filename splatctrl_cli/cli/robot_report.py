@@ -1,12 +1,13 @@
 """What ``splatctrl robot`` prints: coverage by link, self-collision pairs, joints with their limits."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from splatctrl_cli.cli.common import table
 
 if TYPE_CHECKING:
+    from splatctrl_cli.evaluate.verdict import Verdict
     from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage
     from splatctrl_cli.robot.model import RobotModel
     from splatctrl_cli.robot.self_collision import LinkPair, SelfCollisionPairs
@@ -33,6 +34,30 @@ def metrics_of(report: "CoverageReport") -> dict[str, float | None]:
         "num_open_links": len(report.open_links),
         "num_stray_spheres": report.stray_spheres,
     }
+
+
+def coverage_verdict(report: "CoverageReport", command: str, require: Sequence[str]) -> "Verdict":
+    """The verdict on a set of spheres: what they leave uncovered, links without any, and each ``--require``."""
+    from splatctrl_cli.evaluate.gates import gate_reasons
+    from splatctrl_cli.evaluate.verdict import Outcome, Reason, noted, verdict_of
+
+    num, bare = len(report.links), ", ".join(report.bare_links)
+    counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)
+    covered = Reason(
+        criterion="coverage",
+        outcome=Outcome.PASSED,
+        sentence=_summary(report),
+        value=report.max_deficit,
+        unit="m",
+        count=num,
+    )
+    bare_links = [noted("coverage", f"no sphere stands for {bare}: nothing is said of these links")] if bare else []
+    return verdict_of(
+        command,
+        [covered, *bare_links, *gate_reasons(require, metrics_of(report), counts)],
+        scope=f"{report.num_spheres} spheres on {num} links",
+        counts=counts,
+    )
 
 
 def coverage_json(report: "CoverageReport") -> dict[str, Any]:

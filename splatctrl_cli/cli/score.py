@@ -127,8 +127,10 @@ def score_scene(args: argparse.Namespace, console: Console, folder: Path | None)
     cloud = cloud_settings(args)
     lpips = None if args.lpips is None else Lpips(args.lpips)
     scene = open_scene(args.scene)
-    if not scene.is_anisotropic:
-        field_splats(scene.splats())  # raises where there is none to compare
+    if scene.is_anisotropic:
+        scene.gaussians()  # either raises where there is none to compare
+    else:
+        field_splats(scene.splats())
     reference = open_reference(args, console)
     cloud = None if cloud is None else cloud.of_scan(reference.scan)
     cameras = cameras_to_score(args, reference, scene.cameras)

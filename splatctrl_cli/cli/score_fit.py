@@ -135,14 +135,16 @@ def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
 
 def _verdict(result: dict[str, Any], fits: Sequence[Fitted], require: Sequence[str]) -> Verdict:
     num_views = min(fit.score["metrics"]["num_views"] for fit in fits)
+    counts = dict.fromkeys(GATED, int(num_views))
     return verdict_of(
         "score",
         [
             views_reason(num_views),
             *(noted("score", line) for line in result["warnings"]),
-            *gate_reasons(require, dict.fromkeys(GATED, None) | result["metrics"]),
+            *gate_reasons(require, dict.fromkeys(GATED, None) | result["metrics"], counts),
         ],
         scope=f"{len(fits)} fits of {', '.join(result['scans'])}",
+        counts=counts,
     )
 
 

@@ -106,7 +106,7 @@ def score_verdict(result: Mapping[str, Any], require: Sequence[str], *, is_damag
     from splatctrl_cli.evaluate.gates import gate_reasons
     from splatctrl_cli.evaluate.verdict import noted, verdict_of
 
-    metrics = result["metrics"]
+    metrics, counts = result["metrics"], counts_of(result)
     num_scans = metrics.get("num_scans")
     of_scans = "" if num_scans is None else f" of {_count(num_scans, 'scan')}"
     return verdict_of(
@@ -114,11 +114,25 @@ def score_verdict(result: Mapping[str, Any], require: Sequence[str], *, is_damag
         [
             views_reason(metrics["num_views"]),
             *(noted("score", line) for line in result["warnings"]),
-            *gate_reasons(require, dict.fromkeys(gated_names(with_changes=True), None) | metrics),
+            *gate_reasons(require, dict.fromkeys(gated_names(with_changes=True), None) | metrics, counts),
         ],
         scope=f"{_count(metrics['num_views'], 'view')}{of_scans}",
         is_damaged=is_damaged,
+        counts=counts,
     )
+
+
+def counts_of(result: Mapping[str, Any]) -> dict[str, int]:
+    """How many views each metric rests on: those that have the figure; of a change, those of the metric now."""
+    metrics = result["metrics"]
+    each = [result] if "views" in result else list(result["results"].values())
+    views = [view for one in each for view in one["views"]]
+    num_views = int(metrics["num_views"])
+    counts = {}
+    for name in metrics:
+        figure = name.removeprefix(PREFIX)
+        counts[name] = sum(view[figure] is not None for view in views) if figure in views[0] else num_views
+    return counts
 
 
 def views_reason(num_views: float) -> "Reason":

@@ -43,11 +43,14 @@ class Reach:
 
 @dataclass(frozen=True, kw_only=True)
 class Between:
-    """Of T - 1 intervals: lower (T - 1,) [m], a bound of the clearance within, ends included; is_bounded (T - 1,),
-    False where the states say too little of what the arm did in between.
+    """Of T - 1 intervals: lower (T - 1,) [m], a bound that the clearance within, ends included, is not below. Where
+    is_met (T - 1,) it is no bound but a witness: the clearance of a posture in between that is below the margin, so
+    that the least clearance is at most that. is_bounded (T - 1,): False where the states say too little of what the
+    arm did in between.
     """
 
     lower: Float64
+    is_met: Bool
     is_bounded: Bool
 
 
@@ -86,15 +89,17 @@ def between_states(
     is_open = ~is_long & (lower.min(axis=1) < margin) & (ends >= margin)
     least = np.minimum(lower.min(axis=1), ends)
     chosen = np.flatnonzero(is_open)
+    is_met = np.zeros(len(least), dtype=np.bool_)
     if len(chosen):
-        refined = _refined(
+        refined, is_met[chosen] = _refined(
             model, reach, positions[chosen], positions[chosen + 1], first[chosen], last[chosen], distance_to, margin
         )
-        least[chosen] = np.minimum(refined - 0.5 * beyond[chosen].max(axis=1), ends[chosen])
+        away = np.where(is_met[chosen], 0.0, 0.5 * beyond[chosen].max(axis=1))
+        least[chosen] = np.minimum(refined - away, ends[chosen])
     short = ~is_long & ~is_open & (ends < margin)
     least[short] = ends[short]  # the ends are below already; how far it is below in between does not turn it
     is_bounded = np.isfinite(least) & (~is_long | (least >= margin) | (ends < margin))
-    return Between(lower=least, is_bounded=is_bounded)
+    return Between(lower=least, is_met=is_met, is_bounded=is_bounded)
 
 
 def _refined(
@@ -106,9 +111,11 @@ def _refined(
     last: Float64,
     distance_to: DistanceFunction,
     margin: float,
-) -> Float64:
-    """Least clearance bound (K,) of K straight motions: halved until every piece is above the margin, or short."""
-    least = np.full(len(q_first), np.inf)
+) -> tuple[Float64, Bool]:
+    """Least clearance bound (K,) of K straight motions: halved until every piece is above the margin, or short; and
+    (K,) whether a posture on the way is below the margin: then the least clearance of such postures.
+    """
+    least, is_met = np.full(len(q_first), np.inf), np.zeros(len(q_first), dtype=np.bool_)
     owner = np.arange(len(q_first))
     for level in range(MAX_HALVINGS + 1):
         travel = np.abs(q_last - q_first) @ reach.levers.T
@@ -124,6 +131,9 @@ def _refined(
             np.inf
         )  # left out at an end: on the way, too
         reached = at_middle.min(axis=1) < margin  # a sample below the margin settles its interval
+        is_first = reached & ~is_met[owner[open_]]
+        least[owner[open_[is_first]]] = np.inf  # of pieces that were settled: bounds, not postures
+        is_met[owner[open_[reached]]] = True
         np.minimum.at(least, owner[open_[reached]], at_middle[reached].min(axis=1))
         settled = np.isin(owner[open_], owner[open_[reached]])
         keep = open_[~settled]
@@ -131,7 +141,7 @@ def _refined(
         q_first, q_last = np.concatenate([q_first[keep], middle]), np.concatenate([middle, q_last[keep]])
         first, last = np.concatenate([first[keep], at_middle]), np.concatenate([at_middle, last[keep]])
         owner = np.concatenate([owner[keep], owner[keep]])
-    return least
+    return least, is_met
 
 
 def clearances(model: PlanningArm, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:

@@ -6,7 +6,7 @@ other spheres of the arm.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,24 +18,31 @@ EVERY_NS = 200_000_000  # between states that are looked at: cameras that stop a
 APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
 NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
 FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
-NOWHERE: Float64 = np.empty((0, 3))
 LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
 
 
-LastSeen = Callable[[Float64], NDArray[np.int64]]
-"""points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera last returned depth through or on them, -1 never."""
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What cameras had seen at one moment. last_ns: points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera
+    last returned depth through or on them, -1 never; unanswered: centres (K, 3) [m], world, of the voxels that
+    cameras looked at and got no depth from.
+    """
+
+    last_ns: Callable[[Float64], NDArray[np.int64]]
+    unanswered: Float64 = field(default_factory=lambda: np.empty((0, 3)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class NearFigures:
     """Of one state: unseen, the share of the points in space that is new to the motion that no camera had ever seen;
-    age [s] within which `FRESH_SHARE` of the seen points were last seen. NaN where there are too few points.
-    unanswered [m]: the distance of the nearest voxel's centre that cameras looked at without an answer, and its place
-    (3,) [m]; infinite and NaN where there is none.
+    age [s] within which `FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
+    after the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel's centre
+    that cameras looked at without an answer, and its place (3,) [m]; infinite and NaN where there is none.
     """
 
     unseen: float
     age: float
+    ahead: float
     unanswered: float
     place: Float64
 
@@ -61,24 +68,25 @@ class NearSpace:
                 self._next_ns = stamp_ns + EVERY_NS
         return chosen
 
-    def look(self, stamp_ns: int, q: Float64, last_seen: LastSeen, unanswered: Float64 = NOWHERE) -> NearFigures:
-        """What was known about the posture q (J,) at a stamp; unanswered: centres (K, 3) [m], world."""
+    def look(self, stamp_ns: int, q: Float64, known: Seen) -> NearFigures:
+        """What was known about the posture q (J,) at a stamp."""
         centers = self._model.sphere_centers(q)
         if self._first is None:
             self._first = centers
         points = (centers[self._moving][:, None] + self._offsets).reshape(-1, 3)
         points = points[_is_outside(points, centers, self._radii + APART, self._owners)]
         fewest = LEAST_SHARE * len(self._owners)
-        seen = last_seen(points)
+        seen = known.last_ns(points)
         is_never = seen < 0
         is_new = _is_outside(points, self._first, self._radii + NEW)
-        unseen = age = np.nan
+        unseen = age = ahead = np.nan
         if is_new.sum() >= fewest:
             unseen = float(is_never[is_new].mean())
         if (~is_never).sum() >= fewest:
-            age = float(np.quantile((stamp_ns - seen[~is_never]) * 1e-9, FRESH_SHARE))
-        distance, place = self._nearest(unanswered, centers)
-        return NearFigures(unseen=unseen, age=age, unanswered=distance, place=place)
+            ages = (stamp_ns - seen[~is_never]) * 1e-9
+            age, ahead = float(np.quantile(ages, FRESH_SHARE)), max(-float(ages.min()), 0.0)
+        distance, place = self._nearest(known.unanswered, centers)
+        return NearFigures(unseen=unseen, age=age, ahead=ahead, unanswered=distance, place=place)
 
     def _nearest(self, points: Float64, centers: Float64) -> tuple[float, Float64]:
         """The least distance [m] of points (K, 3) near the arm to its moving spheres, and that point (3,)."""

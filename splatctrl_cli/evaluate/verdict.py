@@ -1,8 +1,8 @@
 """What a judging command concludes: one outcome, and each criterion that it rests on."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -58,7 +58,8 @@ class Verdict:
     """The outcome of a command and its reasons: those that decided it first.
 
     label: the outcome in the command's own word, such as "safe"; scope: what was judged; notes: what a person should
-    know and that decides nothing. is_damaged: part of the input was lost.
+    know and that decides nothing. is_damaged: part of the input was lost. counts: how many states, views or points
+    each metric of the command rests on.
     """
 
     command: str
@@ -68,6 +69,7 @@ class Verdict:
     reasons: tuple[Reason, ...]
     notes: tuple[str, ...] = ()
     is_damaged: bool = False
+    counts: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -111,6 +113,7 @@ class Verdict:
             "exit_code": self.exit_code,
             "reasons": [_plain(reason) for reason in self.reasons],
             "notes": list(self.notes),
+            "counts": dict(self.counts),
         }
 
 
@@ -122,6 +125,7 @@ def verdict_of(
     passed: str = "passed",
     notes: Iterable[str] = (),
     is_damaged: bool = False,
+    counts: Mapping[str, int] | None = None,
 ) -> Verdict:
     """The verdict that reasons make: failed where any failed, else not evaluable where any is, else passed.
 
@@ -144,6 +148,7 @@ def verdict_of(
         reasons=tuple(ordered),
         notes=tuple(notes),
         is_damaged=is_damaged,
+        counts=counts or {},
     )
 
 

@@ -171,8 +171,14 @@ class SceneFolder:
         return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
 
     def gaussians(self) -> GaussianSet:
-        """The Gaussians of a scene that is anisotropic."""
-        return read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
+        """The Gaussians of a scene that is anisotropic. Raises InputError where it has none."""
+        gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
+        if not len(gaussians):
+            raise InputError(
+                f"{self.path}: expected Gaussians, got none: there is nothing to render",
+                remedy="reconstruct again with views that have depth; splats.ply is empty",
+            )
+        return gaussians
 
     def splats(self) -> SplatSet:
         """The final splats."""

@@ -10,6 +10,7 @@ from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replay_judged import SLOW, Judged, counted, events_of, held, least_of, mm, nearby, seconds_at
 
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
+AHEAD = 0.02  # [s] that the frames of one time step may lie apart
 UNSEEN = 0.5  # of the points about the arm: three cameras about a table leave 0.02 to 0.3
 MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a calibrated rig
 
@@ -29,6 +30,9 @@ def known_space(judged: Judged) -> Iterator[Reason]:
             remedy="add a camera that sees where the arm goes",
             count=near[2],
         )
+    elif near is not None:
+        words = f"{100 * near[0]:.0f} % of the space about the arm that the motion comes to never seen"
+        yield held("known space", words, near[0], UNSEEN, "", near[2])
     yield from _unanswered(judged)
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
@@ -84,6 +88,19 @@ def _unanswered(judged: Judged) -> Iterator[Reason]:
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
     """How old the map was that a state was judged by, and the evidence about the arm."""
+    ahead = nearby(judged, "ahead")
+    if ahead is not None and ahead[0] > AHEAD:
+        yield Reason(
+            criterion="evidence age",
+            outcome=Outcome.NOT_EVALUABLE,
+            sentence=f"depth from about the arm was returned {ahead[0]:.2f} s after the state that it judges",
+            value=-ahead[0],
+            threshold=-AHEAD,
+            unit="s",
+            time_s=ahead[1],
+            remedy="a state is judged by what was known then: reconstruct with snapshots, or check the clocks",
+            count=ahead[2],
+        )
     near = nearby(judged, "age")
     if near is not None and near[0] > judged.request.max_map_age:
         yield Reason(
@@ -98,6 +115,9 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
             remedy="frames without depth renew nothing: check the cameras ('splatctrl check')",
             count=near[2],
         )
+    elif near is not None:
+        words = f"depth from about the arm at most {near[0]:.2f} s before"
+        yield held("evidence age", words, near[0], judged.request.max_map_age, "s", near[2])
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
     known = ages[np.isfinite(ages)]
     if not len(known):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction, Observed, observed_lookup
 from splatctrl_cli.control.explain import UNREPRESENTED, Obstacle
+from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.control.people import guarded
 from splatctrl_cli.control.rates import SceneStep
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
@@ -36,11 +37,13 @@ from splatctrl_cli.records import (
     Label,
     OccupancyGrid,
     SplatSet,
+    VoxelState,
 )
 
 Index = NDArray[np.int64]
 
 Key = TypeVar("Key", bound=Hashable)
+BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
 HELD = 2  # scenes whose fields are kept: a rate of change needs two
 NEXT_NS = 500_000_000  # after a motion, in which the next scene is looked for
 
@@ -65,8 +68,8 @@ def _nothing(_: int) -> None:
     """For a scene that is all there from the beginning."""
 
 
-def _nothing_known(_: int) -> KnownVoxels | None:
-    """For a scene without records of what was seen when."""
+def _nothing_known(_: int) -> Seen | None:
+    """For a scene without records of what was seen."""
     return None
 
 
@@ -75,17 +78,18 @@ class KnownScene:
     """`at(stamp_ns)` gives the same object for the same scene as long as it is in use; nothing is known before
     `first_ns` (None: always).
 
-    cameras: the cameras that made it, None where that is not recorded. stamps_ns: of the scenes that are there one
-    after the other (so far, where they are made on the way: `advance` to a stamp makes those known then), empty for
-    one scene for all times; each is known `latency_ns` after its stamp. finish: to be called when the replay is done.
-    box: of the centres of a grid's cells, None for splats. moment_ns: the one time that a baked field is of, None
-    where it has none. voxels_at: what was known of voxels at a stamp, None where that is not recorded. figures: what
-    the reconstruction reported of itself, once the replay is done. has_people_margin: whether people are kept at
-    another distance than things.
+    observed: None where what cameras saw is not recorded. cameras: the cameras that made it, None where that is not
+    recorded. stamps_ns: of the scenes that are there one after the other (so far, where they are made on the way:
+    `advance` to a stamp makes those known then), empty for one scene for all times; each is known `latency_ns` after
+    its stamp. finish: to be called when the replay is done. box: of the centres of a grid's cells, None for splats.
+    moment_ns: the one time that a baked field is of, None where it has none. seen_at: what was known at a stamp
+    of when space was last seen, None where nothing is recorded; without has_seen_times only of whether it ever was.
+    figures: what the reconstruction reported of itself, once the replay is done. has_people_margin: whether people
+    are kept at another distance than things.
     """
 
     at: Callable[[int], KnownFields]
-    observed: "Observed"
+    observed: "Observed | None"
     first_ns: int | None
     cameras: tuple[str, ...] | None
     digests: dict[str, str]
@@ -95,7 +99,8 @@ class KnownScene:
     finish: Callable[[], None] = lambda: None
     box: "Box | None" = None
     moment_ns: int | None = None
-    voxels_at: Callable[[int], KnownVoxels | None] = _nothing_known
+    seen_at: Callable[[int], Seen | None] = _nothing_known
+    has_seen_times: bool = True
     figures: Callable[[], Mapping[str, Any]] = dict
     has_people_margin: bool = False
 
@@ -155,6 +160,14 @@ def from_grid(path: Path) -> KnownScene:
     file = path / "field.npz" if path.is_dir() else path
     grid = read_npz(Parts.beside(file).checked(file))
     barrier = GridField(grid)
+    states = grid.channels.get("observed")
+    observed = None if states is None else observed_lookup(states.astype("uint8"), grid.origin, grid.voxel)
+
+    def seen_at(_: int) -> Seen | None:
+        if observed is None:
+            return None
+        return Seen(last_ns=lambda points: np.where(np.isin(observed(points), BY_CAMERA), 0, -1))
+
     fields = KnownFields(
         barrier=barrier,
         distances={
@@ -167,12 +180,14 @@ def from_grid(path: Path) -> KnownScene:
     )
     return KnownScene(
         at=lambda stamp_ns: fields,
-        observed=observed_lookup(grid.channels["observed"].astype("uint8"), grid.origin, grid.voxel),
+        observed=observed,
+        seen_at=seen_at,
+        has_seen_times=False,
         first_ns=None,
         cameras=None,
         digests={file.name: sha256(file)},
         moment_ns=moment if isinstance(moment := grid.header.get("stamp_ns"), int) else None,
-        box=Box(lower=grid.origin, upper=grid.origin + grid.voxel * (np.array(grid.channels["observed"].shape) - 1)),
+        box=barrier.box,
     )
 
 
@@ -202,9 +217,10 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         is_last = not has_times or index == len(stamps) - 1
         return scene.known() if is_last else scene.snapshot_at(stamps[index]).known()
 
-    def voxels_at(stamp_ns: int) -> KnownVoxels | None:
+    def seen_at(stamp_ns: int) -> Seen | None:
         index = bisect_right(stamps, stamp_ns - latency_ns) - 1 if has_times else 0
-        return None if index < 0 else voxels(index)
+        known = None if index < 0 else voxels(index)
+        return None if known is None else Seen(last_ns=known.last_seen_ns, unanswered=known.unanswered)
 
     always = stamps if has_times else [-(2**63)]
     return KnownScene(
@@ -215,7 +231,7 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         digests={"splats.ply": sha256(path / "splats.ply")},
         stamps_ns=tuple(stamps) if has_times else (),
         latency_ns=latency_ns,
-        voxels_at=voxels_at,
+        seen_at=seen_at,
         figures=lambda: scene.run.get("metrics", {}),
         has_people_margin=config.control.human_margin > config.control.margin,
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import Observed
+from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.io.capture import CaptureSource
 from splatctrl_cli.io.output import Stopwatch, write_run
@@ -30,7 +31,7 @@ from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruct import check_pose_jumps
 from splatctrl_cli.jobs.replay_evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP, ReplayRequest
-from splatctrl_cli.records import Float64, KnownVoxels, UInt8
+from splatctrl_cli.records import Float64, UInt8
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 
@@ -153,14 +154,15 @@ class Lockstep:
             self._advance(stamp_ns)
             return known_at(stamp_ns)
 
-        def voxels_at(stamp_ns: int) -> KnownVoxels | None:
+        def seen_at(stamp_ns: int) -> Seen | None:
             self._advance(stamp_ns)
             index = bisect_right(self._stamps_ns, stamp_ns - self._latency_ns) - 1
-            return None if index < 0 else voxels(self._files[index])
+            known = None if index < 0 else voxels(self._files[index])
+            return None if known is None else Seen(last_ns=known.last_seen_ns, unanswered=known.unanswered)
 
         return KnownScene(
             at=at,
-            voxels_at=voxels_at,
+            seen_at=seen_at,
             figures=self._fitted.metrics,
             observed=self._observed,
             first_ns=self._stamps_ns[0] + self._latency_ns,

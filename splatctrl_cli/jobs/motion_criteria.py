@@ -160,10 +160,13 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
             count=judged.num_states,
         )
     elif between is not None and between < judged.threshold:
+        is_met = bool(replay.between["met"][int(np.nanargmin(replay.between["lower"]))])
         yield Reason(
             criterion="clearance between states",
             outcome=Outcome.NOT_EVALUABLE,
-            sentence=f"the arm may have come within {mm(between)} between two states",
+            sentence=f"on the straight way between two states the arm comes to at most {mm(between)}"
+            if is_met
+            else f"the arm may have come within {mm(between)} between two states",
             value=between,
             threshold=replay.margin,
             unit="m",

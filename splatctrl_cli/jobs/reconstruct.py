@@ -74,6 +74,9 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
     robot = _robot(request)
     for doubt in () if robot is None else robot.doubts:
         progress.log(f"warning: {doubt}")
+    if robot is not None and robot.surface.by_spheres:
+        links = ", ".join(robot.surface.by_spheres)
+        progress.log(f"warning: spheres stand for {links}: their collision geometry is missing or cannot be read")
     declared = declarations_of(request.declare, robot)
     stopwatch = Stopwatch()
     checkpoint_file = partial_path(request.out) / CHECKPOINT

@@ -9,6 +9,7 @@ from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.jobs.replay_request import ReplayRequest
 from splatctrl_cli.records import LossReport
+from splatctrl_cli.robot.declared import carried_words
 from splatctrl_cli.scene.audit import AuditRow
 from splatctrl_cli.scene.self_mask import MIN_PIXELS
 
@@ -39,14 +40,28 @@ class Reconstructed:
 
 def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
     """The verdict on a reconstruction: every criterion, and each ``--require``."""
-    metrics = made.metrics
+    metrics, counts = made.metrics, counts_of(made)
     reasons = [reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(made)]
     return verdict_of(
         "reconstruct",
-        [*reasons, *loss_notes(made.loss), *gate_reasons(require, {name: metrics[name] for name in GATED})],
+        [*reasons, *loss_notes(made.loss), *gate_reasons(require, {name: metrics[name] for name in GATED}, counts)],
         scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
+        notes=[carried_words(entry) for entry in metrics["carried"]],
         is_damaged=bool(made.loss.damaged),
+        counts=counts,
     )
+
+
+def counts_of(made: Reconstructed) -> dict[str, int]:
+    """What each of `GATED` rests on: time steps, or pixels of the robot."""
+    seen = [row["num_pixels"] for row in made.metrics["self_mask"].values()]
+    return dict.fromkeys(GATED, len(made.rows)) | {
+        "robot_splats": sum(seen),
+        "inside_robot_points": sum(seen),
+        "self_mask_residual_mm": sum(num for num in seen if num >= MIN_PIXELS),
+        "loss": sum(row.loss is not None for row in made.rows),
+        "psnr": sum(row.psnr is not None for row in made.rows),
+    }
 
 
 def loss_notes(loss: LossReport) -> Iterator[Reason]:

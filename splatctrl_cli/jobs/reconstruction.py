@@ -20,7 +20,7 @@ from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.audit import AuditRow
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspace_of
-from splatctrl_cli.scene.consistency import agreements
+from splatctrl_cli.scene.consistency import CAUSES, agreements
 from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
@@ -177,7 +177,9 @@ class Reconstruction:
             )
             if not self.allow_disagreement:
                 others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
-                raise InputError(line, remedy=f"correct the poses,{others} or give --allow-disagreement")
+                raise InputError(
+                    line, remedy=f"{CAUSES}: correct poses or depth,{others} or give --allow-disagreement"
+                )
             console.log(f"warning: {line}")
 
     def _keep_first_frames(self, step: "TimeStep") -> None:
@@ -245,6 +247,7 @@ class Reconstruction:
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.disagreement,
             **self_mask_metrics(self.rows),
+            "carried": self.declared.carried_uses(),
             "first_frames": list(self.first_frames.values()),
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }

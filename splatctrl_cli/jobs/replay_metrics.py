@@ -99,7 +99,7 @@ def metrics_of(replay: "Replay") -> Metrics:
         "min_unanswered": least(replay.near["unanswered"]),
         "max_evidence_age_s": _largest(replay.near["age"]),
         "unjudged_s": float(replay.between["unbounded"].sum()) + replay.lead_in_s,
-        "unknown_share": float(np.mean(audit.unknown_share)),
+        "unknown_share": _mean(audit.unknown_share),
         "num_without_distance": int(np.sum(_is_blank(replay))),
         "num_static_violations": len(replay.static_violations),
         "max_map_age_s": _largest(np.asarray(replay.map_age_s)),

@@ -36,11 +36,12 @@ class ReplayRecord:
     """The audit of states (T,) in the scenes as they were known, what is nearest to the nearest sphere of each, in
     words, the age (T,) [s] of each state's scene, and what happened.
 
-    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), the time [s] that
-    nobody can bound (`unbounded`), the clearance [m] of the body at the state (`surface`), and that of the spheres to
-    the splats alone (`represented`). near: what was known about the arm, as `NearFigures` has it,
-    NaN at states that were not looked at. strain: velocity and acceleration as shares of their limits. statics: by
-    sphere that no joint moves, its clearance [m] in the first scene and the least in any.
+    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), 1 where that is
+    the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
+    clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
+    near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at. strain:
+    velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in
+    the first scene and the least in any.
     """
 
     def __init__(
@@ -175,10 +176,11 @@ class ReplayRecord:
         unbounded = np.where(between.is_bounded | (not self._is_continuous), 0.0, np.diff(stamps) * 1e-9)
         lower = np.where(between.is_bounded & self._is_continuous, between.lower, np.nan)
         surface = at_states.min(axis=1) if is_first else at_states[1:].min(axis=1)
+        met = between.is_met.astype(np.float64)
         if is_first:
-            lower, unbounded = np.concatenate([[np.nan], lower]), np.concatenate([[0.0], unbounded])
+            lower, unbounded, met = np.insert(lower, 0, np.nan), np.insert(unbounded, 0, 0.0), np.insert(met, 0, 0.0)
         self._lower, self._unbounded = lower, unbounded
-        self.between.append(lower=lower, unbounded=unbounded, surface=surface)
+        self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
 
     def _look_at_statics(self, part: AuditTrace) -> None:
         """The clearance of spheres that no joint moves, once a scene."""
@@ -193,15 +195,17 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states."""
         num = len(part.stamp_ns)
-        unseen, age, unanswered, place = (np.full(shape, np.nan) for shape in (num, num, num, (num, 3)))
+        unseen, age, ahead, unanswered = np.full((4, num), np.nan)
+        place = np.full((num, 3), np.nan)
         for at in self._near.due(part.stamp_ns):
             stamp = int(part.stamp_ns[at])
-            known = self._scene.voxels_at(stamp)
+            known = self._scene.seen_at(stamp)
             if known is not None:
-                figures = self._near.look(stamp, part.position[at], known.last_seen_ns, known.unanswered)
-                unseen[at], age[at] = figures.unseen, figures.age
-                unanswered[at], place[at] = figures.unanswered, figures.place
-        self.near.append(unseen=unseen, age=age, unanswered=unanswered, place=place)
+                figures = self._near.look(stamp, part.position[at], known)
+                unseen[at], unanswered[at], place[at] = figures.unseen, figures.unanswered, figures.place
+                if self._scene.has_seen_times:
+                    age[at], ahead[at] = figures.age, figures.ahead
+        self.near.append(unseen=unseen, age=age, ahead=ahead, unanswered=unanswered, place=place)
 
     def _tell_represented(self, part: AuditTrace) -> None:
         """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""

@@ -25,7 +25,9 @@ def read_robot(request: ReplayRequest, config: "ControlConfig") -> "RobotModel":
     """
 
     T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
-    model = RobotModel.from_urdf(request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked)
+    model = RobotModel.from_urdf(
+        request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked, packages=request.packages
+    )
     if request.srdf is not None:
         disabled, _ = read_srdf(request.srdf, model.urdf)
         model = model.with_self_pairs(without_disabled(model, disabled))

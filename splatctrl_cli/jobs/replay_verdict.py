@@ -20,9 +20,11 @@ from splatctrl_cli.jobs.motion_criteria import (
     static_clearance,
     surface_clearance,
 )
+from splatctrl_cli.jobs.replay_counts import counts_of
 from splatctrl_cli.jobs.replay_golden import Golden, golden_reason
-from splatctrl_cli.jobs.replay_judged import CONTACT, SAFE, Judged
+from splatctrl_cli.jobs.replay_judged import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replay_metrics import first_time
+from splatctrl_cli.robot.declared import carried_words
 
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
 CRITERIA = (
@@ -52,8 +54,9 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     for criterion in CRITERIA:
         reasons += criterion(judged)
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
+    counts = counts_of(replay, judged.logged, judged.metrics, request.config.control)
     reasons += gate_reasons(
-        request.require, judged.metrics, first_time=lambda name, holds: first_time(replay, name, holds)
+        request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
     )
     if golden is not None:
         reasons.append(golden_reason(golden, replay, request.golden_tolerance))
@@ -66,6 +69,7 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
         scope=f"{motion} motion from {first:.2f} to {last:.2f} s of the log, {len(stamps)} states",
         passed=SAFE,
         notes=_notes(judged),
+        counts=counts,
     )
 
 
@@ -77,6 +81,8 @@ def _notes(judged: Judged) -> tuple[str, ...]:
         notes.append(f"{len(close)} fixed spheres stand within the margin of their surroundings")
     if judged.replay.num_before_scene and judged.replay.lead_in_s > 0:
         notes.append(f"{judged.replay.lead_in_s:.2f} s before the first map are left out")
+    if nearby(judged, "age") is None:
+        notes.append("age of the evidence about the arm not judged")
     notes += _declared_notes(judged)
     inside = judged.inputs.scene.figures().get("inside_robot_points")
     if inside:
@@ -87,13 +93,15 @@ def _notes(judged: Judged) -> tuple[str, ...]:
 
 
 def _declared_notes(judged: Judged) -> list[str]:
-    """Every contact that was declared, and entries that nothing used."""
+    """Declared contact, what the map was told that the robot carries, and entries that nothing used."""
     declared, notes = judged.inputs.declared, []
     for index, entry in enumerate(declared.expected_contact):
         num = declared.num_uses.get(("expected_contact", index), 0)
         used = f"{num} times" if num else "warning: not used by any state"
         notes.append(f"contact of {entry.link} declared ({entry.reason}): {used}")
-    for index, carried in enumerate(declared.carried):
-        is_used = declared.num_uses.get(("carried", index)) or not judged.request.lockstep
-        notes.append(f"{carried.link} carries a box" + ("" if is_used else ": warning: no pixel needed it"))
+    of_map = judged.inputs.scene.figures().get("carried", [])
+    notes += [carried_words(made) for made in of_map]
+    for given in declared.carried_uses():
+        if not any(given | {"num_uses": 0} == made | {"num_uses": 0} for made in of_map):
+            notes.append(f"{given['link']} carries a box: warning: the map was made without this declaration")
     return notes

@@ -1,7 +1,7 @@
 """Contact that is meant: what a robot carries and what it touches on purpose, from a TOML file (`--declare`)."""
 
 import tomllib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -83,11 +83,28 @@ class Declarations:
         if count:
             self.num_uses[table, index] = self.num_uses.get((table, index), 0) + count
 
+    def carried_uses(self) -> list[dict[str, Any]]:
+        """What is carried, with how many points needed each entry, for JSON."""
+        return [
+            {
+                **{"link": entry.link, "start": entry.start, "end": entry.end},
+                "box": [*entry.box.lower.tolist(), *entry.box.upper.tolist()],
+                "num_uses": self.num_uses.get(("carried", index), 0),
+            }
+            for index, entry in enumerate(self.carried)
+        ]
+
     def unused(self) -> list[tuple[str, int]]:
         """(table, index) of the entries that nothing used."""
         counts = {"carried": len(self.carried), "expected_contact": len(self.expected_contact)}
         entries = [(table, index) for table, count in counts.items() for index in range(count)]
         return [entry for entry in entries if not self.num_uses.get(entry)]
+
+
+def carried_words(entry: Mapping[str, Any]) -> str:
+    """One of `Declarations.carried_uses` in words, a warning where nothing used it."""
+    used = f"{entry['num_uses']} points" if entry["num_uses"] else "warning: no pixel of any frame needed it"
+    return f"{entry['link']} carries a box from {entry['start']:g} to {entry['end']:g} s: {used}"
 
 
 def read_declarations(path: Path, links: Collection[str] | None = None) -> Declarations:

@@ -42,6 +42,7 @@ class RobotModel:
         left_out: Sequence[str],
         *,
         are_links_renamed: bool,
+        packages: Sequence[Path] = (),
     ) -> None:
         self._model = model
         self._data = model.createData()
@@ -57,6 +58,7 @@ class RobotModel:
         self.coverage_unknown = "the collision geometry was not read"
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
         self._surface: RobotSurface | None = None
+        self._packages = packages
         self._chosen_pairs: Index | None = None
         self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
         rows = [joint.idx_q for joint in model.joints][1:]
@@ -81,12 +83,14 @@ class RobotModel:
         *,
         T_world_base: Float64 | None = None,
         locked: Mapping[str, float] | None = None,
+        packages: Sequence[Path] = (),
     ) -> "RobotModel":
         """The robot of a URDF file with the spheres of a file or a set, else with those that the URDF itself has.
 
         T_world_base (4, 4) places the URDF's root link (default: at the world's origin); locked holds joints still
-        at a value [rad or m], e.g. fingers that no log moves, and with each the joints that mimic it. Raises
-        InputError, naming file and remedy.
+        at a value [rad or m], e.g. fingers that no log moves, and with each the joints that mimic it; packages: where
+        ``package://`` paths of `surface` are looked for, before the folders above the URDF. Raises InputError, naming
+        file and remedy.
         """
         file = read_urdf(urdf)
         try:
@@ -96,11 +100,11 @@ class RobotModel:
         model = _without(model, file.with_followers(locked or {}), urdf)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
-            return cls(file, model, spheres_of(file), T, (), are_links_renamed=False)
+            return cls(file, model, spheres_of(file), T, (), are_links_renamed=False, packages=packages)
         asked = spheres if isinstance(spheres, SphereSet) else read_spheres(spheres)
         sphere_set, left_out = matched_links(asked, file, "sphere set" if asked is spheres else str(spheres))
         is_renamed = are_links_renamed(asked, file)
-        return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed)
+        return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed, packages=packages)
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
         """The same robot with its spheres' coverage measured; `unknown` says why there is no report."""
@@ -113,7 +117,7 @@ class RobotModel:
     def surface(self) -> RobotSurface:
         """The collision geometry, read when first asked for; spheres for links without any that can be read."""
         if self._surface is None:
-            self._surface = RobotSurface.of(self.urdf, self.sphere_set)
+            self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface
 
     def with_self_pairs(self, pairs: Index) -> "RobotModel":

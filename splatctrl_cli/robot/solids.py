@@ -50,7 +50,7 @@ def read_solids(urdf: UrdfFile, folders: Sequence[Path] = ()) -> dict[str, tuple
     if urdf.other_shapes:
         link, tag = urdf.other_shapes[0]
         raise InputError(
-            f"{urdf.path}: link '{link}': expected mesh, box, cylinder or sphere, got <{tag}>",
+            f"{urdf.path}: link '{link}': expected mesh, box, cylinder, capsule or sphere, got <{tag}>",
             remedy="write it as a cylinder and spheres",
         )
     found: dict[str, list[Solid]] = {link: [] for link in urdf.collision_links}

@@ -26,7 +26,7 @@ class RobotSurface:
     kinds (P,) as `kernels.surface` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
     T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,).
     by_spheres: links that collision spheres stand for, because their geometry is missing or cannot be read. fixed:
-    links that no joint moves.
+    links that no joint moves. num_carried: the last of `links` again, one for each box around what they carry.
     """
 
     links: tuple[str, ...]
@@ -38,6 +38,7 @@ class RobotSurface:
     triangle_links: Int16
     by_spheres: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
+    num_carried: int = 0
 
     @classmethod
     def of(cls, urdf: UrdfFile, spheres: SphereSet, folders: Sequence[Path] = ()) -> "RobotSurface":
@@ -105,26 +106,31 @@ class RobotSurface:
         return cls.from_parts(balls, by_spheres=("spheres",))
 
     def with_boxes(self, boxes: Sequence[tuple[str, Box]]) -> "RobotSurface":
-        """The same with more boxes, each fixed to a link that has geometry, in its frame: what the robot carries."""
+        """The same with boxes around what the robot carries, each fixed to a link, in its frame."""
         shapes = [
             Shape(link=link, kind="box", size=tuple(box.upper - box.lower), T_link_shape=_shifted(box))
             for link, box in boxes
         ]
-        links = tuple(dict.fromkeys([*self.links, *(s.link for s in shapes)]))
-        added = [links.index(s.link) for s in shapes]
         return RobotSurface(
-            links=links,
+            links=(*self.links, *(s.link for s in shapes)),
             kinds=np.append(self.kinds, [BOX] * len(shapes)),
             sizes=np.concatenate([self.sizes, np.array([_sizes(s) for s in shapes]).reshape(-1, 3)]),
             T_link_solid=np.concatenate(
                 [self.T_link_solid, np.array([s.T_link_shape for s in shapes]).reshape(-1, 4, 4)]
             ),
-            solid_links=np.append(self.solid_links, added).astype(np.int16),
+            solid_links=np.append(self.solid_links, len(self.links) + np.arange(len(shapes))).astype(np.int16),
             triangles=self.triangles,
             triangle_links=self.triangle_links,
             by_spheres=self.by_spheres,
             fixed=self.fixed,
+            num_carried=len(shapes),
         )
+
+    @property
+    def vague(self) -> list[int]:
+        """Numbers of the links whose solids only enclose what is there: spheres, and boxes around what is carried."""
+        first = len(self.links) - self.num_carried
+        return [k for k, name in enumerate(self.links) if k >= first or name in self.by_spheres]
 
     def poses(self, T_world_link: Mapping[str, Float64]) -> Float64:
         """(L, 4, 4) of `links`, from poses by name."""

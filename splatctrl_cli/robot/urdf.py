@@ -1,6 +1,6 @@
 """What a URDF says apart from its kinematics: links, joints and collision shapes. Untrusted XML is read safely."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,8 @@ class Joint:
 class UrdfFile:
     """The checked text of a URDF, its link names, joints and collision shapes.
 
-    other_shapes: (link, tag) of collision elements that are neither a primitive nor a mesh, such as a capsule.
+    A capsule is a cylinder and a sphere at either end of it. other_shapes: (link, tag) of collision elements that are
+    neither a primitive nor a mesh.
     solid_links have a collision or visual element: there is something to bump into.
     """
 
@@ -131,9 +132,10 @@ def read_urdf(path: Path) -> UrdfFile:
         )
     _check_tree(path, links, joints)
     found = [
-        _shape(path, str(link.get("name")), collision)
+        shape
         for link in root.findall("link")
         for collision in link.findall("collision")
+        for shape in _shapes(path, str(link.get("name")), collision)
     ]
     solid = tuple(
         str(link.get("name"))
@@ -221,8 +223,8 @@ def _check_limits(where: str, kind: str, limit: Any) -> None:
         raise InputError(f"{where}: limits: expected a velocity above 0, got {limit.get('velocity')}", remedy=remedy)
 
 
-def _shape(path: Path, link: str, collision: Any) -> Shape | MeshShape | tuple[str, str]:
-    """A primitive, a mesh, or (link, tag) of what is neither."""
+def _shapes(path: Path, link: str, collision: Any) -> Sequence[Shape | MeshShape | tuple[str, str]]:
+    """A primitive or more, a mesh, or (link, tag) of what is neither."""
     geometry = collision.find("geometry")
     element = None if geometry is None else next(iter(geometry), None)
     if element is None:
@@ -234,18 +236,31 @@ def _shape(path: Path, link: str, collision: Any) -> Shape | MeshShape | tuple[s
         if 0 in scale:
             raise InputError(f"{where}: scale: expected three numbers that are not 0, got {scale}")
         filename = _attribute(path, element, "filename")
-        return MeshShape(link=link, filename=filename, scale=scale, T_link_mesh=T_link_shape)
+        return [MeshShape(link=link, filename=filename, scale=scale, T_link_mesh=T_link_shape)]
     if element.tag == "box":
         size = _numbers(where, element.get("size"), 3)
-    elif element.tag == "cylinder":
+    elif element.tag in {"cylinder", "capsule"}:
         size = _numbers(where, element.get("radius"), 1) + _numbers(where, element.get("length"), 1)
     elif element.tag == "sphere":
         size = _numbers(where, element.get("radius"), 1)
     else:
-        return link, str(element.tag)
+        return [(link, str(element.tag))]
     if min(size) <= 0:
         raise InputError(f"{where}: expected sizes above 0, got {size}")
-    return Shape(link=link, kind=element.tag, size=size, T_link_shape=T_link_shape)
+    if element.tag == "capsule":
+        return _capsule(link, size, T_link_shape)
+    return [Shape(link=link, kind=element.tag, size=size, T_link_shape=T_link_shape)]
+
+
+def _capsule(link: str, size: tuple[float, ...], T_link_shape: Float64) -> list[Shape]:
+    """A cylinder of a radius and a length [m], without the caps, and a sphere at either end of it."""
+    radius, length = size
+    parts = [Shape(link=link, kind="cylinder", size=size, T_link_shape=T_link_shape)]
+    for z in (-0.5 * length, 0.5 * length):
+        T = T_link_shape.copy()
+        T[:3, 3] += z * T[:3, 2]
+        parts.append(Shape(link=link, kind="sphere", size=(radius,), T_link_shape=T))
+    return parts
 
 
 def _origin(where: str, origin: Any) -> Float64:

@@ -45,6 +45,12 @@ class Agreement:
         return self.median <= self.limit or self.quartile <= 0.5 * self.limit
 
 
+CAUSES = (
+    "poses are off, or so little depth is left (a short range, a clip, holes) that each sees other sides of things"
+)
+"""Of views that disagree: the depths alone do not tell one from the other."""
+
+
 def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) -> list[Agreement]:
     """One for each pair of cameras with enough pixels that both see, from views of one moment or a still scene.
 

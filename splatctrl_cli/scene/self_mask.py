@@ -48,8 +48,9 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     A pixel is robot where its depth z lies within `self_mask_tolerance` + 2 `depth_error` z^2 of the depths that the
     rendered robot has within a few pixels: as many as the tolerance is wide at the robot's depth, so that a slanted
     surface and an outline that is off by the calibration are explained too. Spheres that stand for a link enclose its
-    surface and are not it: what lies inside them is robot. At the outline, what is behind the robot and before
-    everything that is seen beside it is mixed: the pixel sees both. Everything else with a depth is an object.
+    surface and are not it, as boxes do what it carries: what lies inside them is robot. At the outline, what is
+    behind the robot and before everything that is seen beside it is mixed: the pixel sees both. Everything else with
+    a depth is an object.
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     shown = surface.render(
@@ -74,14 +75,13 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     nearest = nearest_within(rendered, is_robot, reach) - tolerance
     is_explained = has_depth & (depth >= nearest)
     is_explained &= depth <= farthest_within(rendered, is_robot, reach) + tolerance
-    vague = [number for number, name in enumerate(surface.links) if name in surface.by_spheres]
-    if vague:
-        is_explained |= np.isin(inside, vague)
+    if surface.vague:
+        is_explained |= np.isin(inside, surface.vague)
     kinds[is_explained] = PixelKind.ROBOT
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
     offset = depth - rendered
-    is_told = core & has_depth & (np.abs(offset) <= FAR_OFF)
+    is_told = core & has_depth & (np.abs(offset) <= FAR_OFF) & (link < len(surface.links) - surface.num_carried)
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,

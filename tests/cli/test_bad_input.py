@@ -104,6 +104,7 @@ def test_cameras_that_disagree_are_refused_before_anything_is_fitted(
     err = capsys.readouterr().err
     assert "camera cam0 and cam1: depths disagree by 90 mm" in err
     assert "expected at most 30 mm" in err
+    assert "poses are off, or so little depth is left (a short range, a clip, holes)" in err
     assert "--cameras cam0" in err
     assert "--allow-disagreement" in err
     assert err.count("\n") == 1

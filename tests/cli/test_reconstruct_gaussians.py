@@ -1,12 +1,14 @@
 """``splatctrl reconstruct --method 3dgs`` on the small DTU scan of the sample data."""
 
 import json
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
+from splatctrl_cli.io.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"
 DTU = ["--dtu", str(SAMPLES / "dtu"), "--holdout", "2,5"]
@@ -48,6 +50,20 @@ def test_score_renders_the_held_out_views(scene: Path, capsys: pytest.CaptureFix
     assert result["metrics"]["psnr_all"] > 5
     assert main(["score", str(scene), "--dtu", str(SAMPLES / "dtu"), "--holdout", "3", "-q"]) == 2
     assert "trained the scene" in said(capsys)
+
+
+def test_score_refuses_a_scene_without_gaussians(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty"
+    shutil.copytree(scene, empty)
+    gaussians, comments = read_gaussian_ply(scene / "splats.ply")
+    write_gaussian_ply(empty / "splats.ply", gaussians.select(np.zeros(len(gaussians), dtype=np.bool_)), comments)
+    run = json.loads((scene / "run.json").read_text())
+    (empty / "run.json").write_text(json.dumps({name: run[name] for name in run if name != "parts"}))
+    assert main(["score", str(empty), *DTU, "-q", "-o", str(tmp_path / "scores")]) == 4
+    assert "empty: expected Gaussians, got none: there is nothing to render" in said(capsys)
+    assert not (tmp_path / "scores").exists()
 
 
 def test_what_needs_distances_is_refused_in_one_line(

@@ -10,7 +10,8 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.geometry import transform_points
-from splatctrl_cli.jobs.replay_robot import doubts_of
+from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replay_robot import doubts_of, read_robot
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.coverage import coverage_deficit, refined
 from splatctrl_cli.robot.model import RobotModel
@@ -18,6 +19,7 @@ from splatctrl_cli.robot.solids import read_solids
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_scene
 from tests.control.fakes import Balls
+from tests.robot.shapes import arm_of, l_shape, written
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -163,3 +165,16 @@ def test_a_margin_that_no_posture_keeps_between_two_links_is_said(
     )
     assert desk.replay(*drive, *wide) == 0
     assert "cannot be kept" not in capsys.readouterr().err
+
+
+def test_a_replay_finds_the_meshes_of_the_self_mask_where_its_packages_are(tmp_path: Path) -> None:
+    mesh = tmp_path / "elsewhere" / "far" / "ell.stl"
+    mesh.parent.mkdir(parents=True)
+    l_shape().export(mesh)
+    shapes = arm_of('<mesh filename="package://far/ell.stl"/>', '<sphere radius="0.02"/>')
+    urdf = written(tmp_path / "robot", shapes)
+    spheres = SphereSet(links=("base", "tip"), centers=np.zeros((2, 3)), radii=np.full(2, 0.3))
+    file = written(tmp_path, spheres_yaml(spheres, ()), "spheres.yaml")
+    for packages, missing in (((), ("base",)), ((tmp_path / "elsewhere",), ())):
+        request = ReplayRequest(log=tmp_path, out=tmp_path, urdf=urdf, spheres=file, packages=packages)
+        assert read_robot(request, ControlConfig()).surface.by_spheres == missing

@@ -102,6 +102,11 @@ def test_a_contact_between_two_free_states_is_found() -> None:
     assert ends.min() > MARGIN
     found = bounds(arm, balls, states)
     assert found.is_bounded.all() and found.lower[0] < 0
+    assert found.is_met.all() and found.lower[0] >= least_on_the_way(arm, balls, states, 401)[0] - 1e-12, "a witness"
+    moving = bounds(arm, balls, states, velocities=np.array([[8.0, 0.0], [8.0, 0.0]]))  # more than the straight way
+    assert moving.is_met.all() and moving.lower == pytest.approx(found.lower, abs=1e-12)
+    far = Balls([[1.2, 0.0, 0.0]], [0.005])
+    assert not bounds(arm, far, states).is_met.any()
 
 
 def test_a_state_that_breaks_the_margin_settles_both_of_its_intervals() -> None:

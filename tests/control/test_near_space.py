@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splatctrl_cli.control.near_space import EVERY_NS, NearSpace
+from splatctrl_cli.control.near_space import EVERY_NS, NearSpace, Seen
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
 from tests.reference.intervals import near_figures
@@ -21,9 +21,9 @@ def half_seen(points: Float64) -> NDArray[np.int64]:
 
 def test_figures_are_those_of_the_reference() -> None:
     arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
-    first = space.look(0, FIRST, half_seen)
+    first = space.look(0, FIRST, Seen(last_ns=half_seen))
     assert np.isnan(first.unseen)  # the arm was there from the start
-    found = space.look(5 * SECOND, LATER, half_seen)
+    found = space.look(5 * SECOND, LATER, Seen(last_ns=half_seen))
     unseen, age, num = near_figures(arm, LATER, FIRST, 0.03, half_seen, 5 * SECOND)
     assert num > 60
     assert (found.unseen, found.age) == (pytest.approx(unseen), pytest.approx(age))
@@ -33,8 +33,8 @@ def test_figures_are_those_of_the_reference() -> None:
 @pytest.mark.parametrize(("stamp", "unseen"), [(-1, 1.0), (0, 0.0), (SECOND, 0.0)])
 def test_a_stamp_of_zero_is_seen_and_minus_one_never(stamp: int, unseen: float) -> None:
     space = NearSpace(PlanarArm(), 0.03)
-    space.look(0, FIRST, lambda points: np.zeros(len(points), np.int64))
-    found = space.look(2 * SECOND, LATER, lambda points: np.full(len(points), stamp))
+    space.look(0, FIRST, Seen(last_ns=lambda points: np.zeros(len(points), np.int64)))
+    found = space.look(2 * SECOND, LATER, Seen(last_ns=lambda points: np.full(len(points), stamp)))
     assert found.unseen == unseen
     assert np.isnan(found.age) if stamp < 0 else found.age == pytest.approx(2 - stamp / SECOND)
 
@@ -49,7 +49,7 @@ def test_the_age_is_that_of_three_in_four(old: float, age: float) -> None:
         stamps[: round(old * len(points))] = SECOND
         return stamps
 
-    assert space.look(10 * SECOND, FIRST, seen).age == pytest.approx(age)
+    assert space.look(10 * SECOND, FIRST, Seen(last_ns=seen)).age == pytest.approx(age)
 
 
 def test_points_that_are_not_outside_of_the_arm_are_not_asked_for() -> None:
@@ -61,7 +61,7 @@ def test_points_that_are_not_outside_of_the_arm_are_not_asked_for() -> None:
         asked.append(points)
         return np.zeros(len(points), np.int64)
 
-    space.look(0, LATER, remember)
+    space.look(0, LATER, Seen(last_ns=remember))
     (points,) = asked
     gap = np.linalg.norm(points[:, None] - arm.sphere_centers(LATER), axis=2) - arm.sphere_set.radii
     assert gap.min() > 0.01 and (gap.min(axis=1) < 0.03 + 1e-12).all()
@@ -79,5 +79,18 @@ def test_states_are_thinned_by_time_across_blocks() -> None:
 def test_too_few_points_say_nothing() -> None:
     arm = PlanarArm()
     arm.sphere_set.radii[0] = 5.0  # the base swallows all of the arm
-    found = NearSpace(arm, 0.03).look(0, FIRST, half_seen)
+    found = NearSpace(arm, 0.03).look(0, FIRST, Seen(last_ns=half_seen))
     assert np.isnan(found.unseen) and np.isnan(found.age)
+
+
+def test_the_nearest_place_without_an_answer_is_told_with_its_distance() -> None:
+    arm = PlanarArm()
+    centers, radii = arm.sphere_centers(LATER), np.asarray(arm.sphere_set.radii)
+    place = centers[-1] + np.array([0.0, 0.0, radii[-1] + 0.02])
+    far = centers[-1] + np.array([0.0, 0.0, radii[-1] + 1.0])
+    known = Seen(last_ns=half_seen, unanswered=np.array([far, place]))
+    found = NearSpace(arm, 0.03).look(0, LATER, known)
+    want = np.min(np.linalg.norm(centers - place, axis=1) - radii)
+    assert (found.unanswered, found.place.tolist()) == (pytest.approx(want), place.tolist())
+    nothing = NearSpace(arm, 0.03).look(0, LATER, Seen(last_ns=half_seen, unanswered=far[None]))
+    assert nothing.unanswered == np.inf and np.isnan(nothing.place).all()

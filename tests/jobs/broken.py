@@ -100,13 +100,13 @@ def bare_forearm(stage: Stage) -> None:
 
 def never_seen_where_it_goes(stage: Stage) -> None:
     stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]), num=11)
-    stage.last_seen = voxels(SECOND, is_seen=False)
+    stage.last_seen = voxels(is_seen=False)
 
 
 def no_answer_beside_it(stage: Stage) -> None:
     """Nobody got depth from the voxel that the arm ends beside."""
     center, _ = stage.ball_at_the_end(0.01, radius=0.0)
-    stage.last_seen = voxels(SECOND)
+    stage.last_seen = voxels()
     grid = stage.last_seen.grid
     grid.origin[:] = center - grid.voxel * np.round((center - grid.origin) / grid.voxel)
     stage.last_seen.last_seen[tuple(np.round((center - grid.origin) / grid.voxel).astype(int))] = UNANSWERED
@@ -118,10 +118,14 @@ def frames_that_renew_nothing(stage: Stage) -> None:
     stage.last_seen = voxels(0)
 
 
+def frames_of_the_future(stage: Stage) -> None:
+    stage.last_seen = voxels(2 * SECOND)
+
+
 def no_new_map(stage: Stage) -> None:
     stage.states = resting(num=21)
     stage.map_stamps = [0, QUARTER]
-    stage.last_seen = voxels(2 * SECOND)
+    stage.last_seen = voxels(is_seen=False)  # nothing about the arm, which comes to no new space
 
 
 def gap_in_the_log(stage: Stage) -> None:
@@ -165,7 +169,7 @@ ALONE: dict[str, Broken] = {
         ("--set", "verdict.longest_interval=0.3"),
         "clearance between states",
         "not evaluable",
-        "between two states",
+        "on the straight way between two states the arm comes to at most",
     ),
     "surface deficit": (little_covered, (), "surface clearance", "not evaluable", "the spheres keep 3"),
     "bare link": (bare_forearm, (), "surface clearance", "not evaluable", "no sphere on link5"),
@@ -178,6 +182,7 @@ ALONE: dict[str, Broken] = {
     ),
     "no answer": (no_answer_beside_it, (), "known space", "not evaluable", "a place 10.0 mm from the arm"),
     "evidence age": (frames_that_renew_nothing, (), "evidence age", "not evaluable", "frames without depth renew"),
+    "frames ahead": (frames_of_the_future, (), "evidence age", "not evaluable", "returned 2.00 s after the state"),
     "map age": (no_new_map, (), "map age", "not evaluable", "1.75 s old, allowed 1 s"),
     "gap": (gap_in_the_log, (), "judged time", "not evaluable", "0.50 s of 1.00 s lie between states"),
     "three stamps": (three_stamps, (), "judged time", "not evaluable", "2 gaps"),

@@ -16,6 +16,7 @@ from splatctrl_cli.jobs.motion_criteria import controller
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)
+NOTHING_NEAR = dict.fromkeys(("unseen", "age", "ahead", "unanswered"), UNKNOWN)
 
 
 def judged(**replay: Any) -> Any:
@@ -24,7 +25,8 @@ def judged(**replay: Any) -> Any:
     run = {
         "audit": SimpleNamespace(stamp_ns=stamps, clearance={}, unknown_share=np.zeros(NUM)),
         "between": {"unbounded": np.zeros(NUM - 1), "surface": np.full(NUM, 0.1)},
-        "near": {"unseen": UNKNOWN, "age": UNKNOWN},
+        "margin": 0.02,
+        "near": NOTHING_NEAR,
         "map_age_s": np.zeros(NUM),
         "events": [],
         "lead_in_s": 0.0,
@@ -80,7 +82,7 @@ def test_one_state_judged_by_an_old_map_is_enough() -> None:
 
 
 def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
-    near = {"unseen": UNKNOWN, "age": np.full(NUM, 1.5)}
+    near = NOTHING_NEAR | {"age": np.full(NUM, 1.5)}
     assert outcomes(evidence.evidence_age, judged(near=near)) == [Outcome.NOT_EVALUABLE, Outcome.PASSED]
 
 

@@ -26,7 +26,7 @@ def row(step: int, *blind: str) -> AuditRow:
         unrepresented=0,
         without_depth=len(blind),
         loss=None,
-        psnr=None,
+        psnr=20.0,
         blind=blind,
     )
 
@@ -43,6 +43,7 @@ def made(*rows: AuditRow, loss: LossReport | None = None, is_seeded: bool = Fals
         "psnr": 20.0,
         "inside_robot_first_ns": None,
         "inside_robot_first_link": None,
+        "carried": [],
         "frames_without_depth": sum(row.without_depth for row in rows),
     }
     return Reconstructed(
@@ -139,3 +140,11 @@ def test_a_gate_on_a_figure_that_is_not_there_is_not_evaluable_by_name(value: fl
 def test_a_gate_on_an_unknown_figure_names_the_nearest() -> None:
     with pytest.raises(UsageError, match="did you mean unrepresented_voxels"):
         reconstruct_verdict(made(*STEPS), ["unrepresented_voxel<=0"])
+
+
+def test_a_gate_on_points_inside_a_robot_that_no_pixel_showed_is_not_evaluable() -> None:
+    gate = ["inside_robot_points<=0"]
+    assert reconstruct_verdict(made(*STEPS), gate).exit_code == 0
+    verdict = reconstruct_verdict(made(*STEPS, self_mask={}, self_mask_residual_mm=None), gate)
+    assert verdict.exit_code == 5 and "inside_robot_points is unknown, as it rests on nothing" in verdict.sentence
+    assert verdict.as_dict()["counts"]["splats"] == len(STEPS)

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("without_plots")
 def stage(desk: Desk, arm: RobotModel) -> Stage:
     """Whose map is a plate of splats on occupied voxels, behind the arm."""
     cells = np.array([[4, j, 20 + k] for j in range(10, 16) for k in range(4)])
-    voxels = known(grid_seen(), 5 * SECOND)
+    voxels = known(grid_seen())
     voxels.grid.log_odds[tuple(cells.T)] = 4.0
     centers = voxels.grid.origin + voxels.grid.voxel * cells
     balls = [((float(x), float(y), float(z)), 0.05) for x, y, z in centers]

@@ -9,10 +9,10 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
-from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.io.grid import read_npz, write_npz
 from splatctrl_cli.io.state_offset import ClockOffset
 from splatctrl_cli.jobs import replay as job
-from splatctrl_cli.records import Box
+from splatctrl_cli.records import Box, VoxelState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.jobs.broken import (
@@ -136,7 +136,7 @@ def test_acceleration_limits_count_where_they_are_set(stage: Stage) -> None:
 @pytest.mark.parametrize("height", [0.35, 0.6])
 def test_unknown_space_counts_from_the_share_that_is_allowed(stage: Stage, height: float) -> None:
     above = grid_seen().origin[2] + 0.1 * np.arange(40) > height
-    stage.last_seen = voxels(SECOND, is_known=~above)
+    stage.last_seen = voxels(is_known=~above)
     scene = stage.scene()
     stage.judged(scene=scene)
     share = stage.desk.metrics()["unknown_share"]
@@ -152,11 +152,25 @@ def test_half_of_the_space_that_the_motion_comes_to_must_have_been_seen(stage: S
     shares, codes = [], []
     for number, height in enumerate((0.25, 0.35, 0.45, 0.55, 0.65)):
         above = grid_seen().origin[2] + 0.1 * np.arange(40) > height
-        stage.last_seen = voxels(SECOND, is_seen=~above)
+        stage.last_seen = voxels(is_seen=~above)
         codes.append(stage.judged(scene=stage.scene(f"scene{number}"))[0])
         shares.append(stage.desk.metrics()["max_unseen_share"])
     assert [5 if share > 0.5 else 0 for share in shares] == codes
     assert set(codes) == {0, 5} and min(abs(share - 0.5) for share in shares) < 0.15
+
+
+def test_what_was_known_about_the_arm_is_a_criterion_where_it_suffices_too(stage: Stage) -> None:
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    code, verdict = stage.judged()
+    metrics, passed = stage.desk.metrics(), [r for r in verdict["reasons"] if r["outcome"] == "passed"]
+    assert code == 0
+    for criterion, figure, allowed in (
+        ("known space", "max_unseen_share", 0.5),
+        ("known space", "unknown_share", 0.05),
+        ("evidence age", "max_evidence_age_s", 1.0),
+    ):
+        values = [(r["value"], r["threshold"]) for r in passed if r["criterion"] == criterion]
+        assert (metrics[figure], allowed) in values
 
 
 def test_a_map_may_be_as_old_as_is_said(stage: Stage) -> None:
@@ -201,6 +215,25 @@ def test_a_field_that_does_not_say_of_what_time_it_is_is_no_evidence(stage: Stag
     code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR))))
     assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
     assert "does not say of what time it is" in verdict["sentence"]
+
+
+def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:
+    stage.states = stage.desk.source.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    field = baked(stage, splats=splats_of(FAR), moment=SECOND)
+    code, verdict = stage.replayed("--field", str(field))
+    assert (code, decisive(verdict)) == (0, {})
+    assert "age of the evidence about the arm not judged" in verdict["sentence"]
+    grid = read_npz(field / "field.npz")
+    for state, channels in (
+        (VoxelState.SWEPT_BY_ROBOT, {"observed": np.full_like(grid.channels["observed"], VoxelState.SWEPT_BY_ROBOT)}),
+        (None, {}),
+    ):
+        kept = {name: values for name, values in grid.channels.items() if name != "observed"} | channels
+        write_npz(field / "field.npz", replace(grid, channels=kept))
+        code, verdict = stage.replayed("--field", str(field))
+        assert (code, decisive(verdict)) == (5, {"known space": "not evaluable"})
+        words = "what cameras saw is not recorded" if state is None else "100 % of the space about the arm"
+        assert words in verdict["sentence"]
 
 
 def test_a_value_of_the_grid_below_the_margin_is_red(stage: Stage) -> None:
@@ -302,6 +335,21 @@ def test_a_gate_turns_the_verdict_with_report_only_too(stage: Stage, gate: str, 
         found, verdict = stage.judged("--require", gate, *more, scene=scene)
         assert found == code, verdict["sentence"]
         assert set(decisive(verdict)) == ({f"--require {gate}"} if code else set())
+
+
+@pytest.mark.parametrize(
+    ("gate", "passes"), [("max_acceleration_share<=1", ("--set", "control.max_acceleration=9")), ("num_poses<=0", ())]
+)
+def test_a_gate_on_what_nothing_was_measured_of_is_not_evaluable(
+    stage: Stage, gate: str, passes: tuple[str, ...]
+) -> None:
+    scene = stage.scene()
+    code, verdict = stage.judged("--require", gate, scene=scene)
+    assert verdict["counts"]["min_clearance"] == 11 and set(verdict["counts"]) == set(stage.desk.metrics())
+    if passes:
+        assert (code, decisive(verdict)) == (5, {f"--require {gate}": "not evaluable"})
+        assert "as it rests on nothing" in verdict["sentence"]
+    assert stage.judged("--require", gate, *passes, scene=scene)[0] == 0
 
 
 def test_a_misspelled_metric_is_refused_before_anything_is_read(

@@ -1,10 +1,11 @@
 """Float64 references of what the verdict takes from motions: one formula, one plain loop each."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.near_space import LastSeen
 from splatctrl_cli.records import Float64
 
 
@@ -34,7 +35,12 @@ def velocity_shares(
 
 
 def near_figures(
-    arm: ArmModel, q: Float64, q_first: Float64, margin: float, last_seen: LastSeen, now_ns: int
+    arm: ArmModel,
+    q: Float64,
+    q_first: Float64,
+    margin: float,
+    last_seen: Callable[[Float64], NDArray[np.int64]],
+    now_ns: int,
 ) -> tuple[float, float, int]:
     """Share of the points on the shells in new space that were never seen, the age [s] within which three quarters of
     the seen ones were seen, and how many points there are.

@@ -103,8 +103,8 @@ def test_a_missing_mesh_is_named_with_its_link(tmp_path: Path) -> None:
 
 
 def test_shapes_of_another_kind_and_no_shapes_are_refused(tmp_path: Path) -> None:
-    urdf = read_urdf(written(tmp_path, arm_of('<capsule radius="0.1" length="1"/>', BALL)))
-    with pytest.raises(InputError, match="link 'base': expected mesh, box, cylinder or sphere, got <capsule>"):
+    urdf = read_urdf(written(tmp_path, arm_of('<cone radius="0.1" length="1"/>', BALL)))
+    with pytest.raises(InputError, match="link 'base': expected mesh, box, cylinder, capsule or sphere, got <cone>"):
         read_solids(urdf)
     bare = arm_of(BALL, BALL).replace("collision>", "visual>")
     with pytest.raises(InputError, match="expected collision geometry, got none"):

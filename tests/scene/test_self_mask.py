@@ -154,5 +154,9 @@ def test_a_carried_box_is_the_robots() -> None:
     assert posture.surface is not None
     assert (kinds(depth)[100:110, 70:90] == PixelKind.OBJECT).all()
     held = Box(lower=np.array([-0.1, 0.2, 1.0]), upper=np.array([0.1, 0.4, 1.1]))
-    holding = replace(posture, surface=posture.surface.with_boxes([("arm", held)]))
+    at_frame = {5: np.tile(np.eye(4), (2, 1, 1))}  # the link's pose, and the box's
+    holding = replace(posture, surface=posture.surface.with_boxes([("arm", held)]), T_world_surface=at_frame)
+    assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()
+    larger = Box(lower=held.lower - [0.0, 0.0, 0.05], upper=held.upper)  # what it holds need not fill the box
+    holding = replace(holding, surface=posture.surface.with_boxes([("arm", larger)]))
     assert (kinds(depth, holding)[101:109, 71:89] == PixelKind.ROBOT).all()

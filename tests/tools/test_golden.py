@@ -1,12 +1,12 @@
 """The golden runs: what their table covers, and what their digests leave out."""
 
 import json
-import re
 import shlex
 from pathlib import Path
 
 import pytest
 
+from tests.test_docs import commands_on
 from tools.golden.__main__ import lines, main, ordered, parse, read_cases
 from tools.golden.digest import of_json, stamps, written
 
@@ -14,8 +14,7 @@ README = Path(__file__).parent.parent.parent / "README.md"
 
 
 def test_every_command_of_the_readme_is_run() -> None:
-    text = README.read_text().replace("\\\n", " ")
-    shown = [shlex.split(line, comments=True) for line in re.findall(r"^\$ splatctrl (.*)$", text, re.MULTILINE)]
+    shown = [shlex.split(line, comments=True) for line in commands_on(README)]
     run = [shlex.split(case.run) for case in read_cases().values()]
     assert len(shown) >= 9
     assert [command for command in shown if command not in run] == []

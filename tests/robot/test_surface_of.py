@@ -1,0 +1,42 @@
+"""What a robot's own surface is made of: a capsule's parts, and meshes of packages elsewhere."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.records import Float64, SphereSet
+from splatctrl_cli.robot.model import RobotModel
+from tests.robot.shapes import arm_of, l_shape, written
+
+BALL = '<sphere radius="0.02"/>'
+CAPSULE = '<capsule radius="0.1" length="0.4"/>'
+ORIGIN = '<origin xyz="0.1 0.2 0.3" rpy="0 1.5707963267948966 0"/>'
+SPHERES = SphereSet(links=("base", "tip"), centers=np.zeros((2, 3)), radii=np.full(2, 0.3))
+
+
+def distance(model: RobotModel, points: Float64) -> Float64:
+    surface, q = model.surface, np.zeros(1)
+    return surface.distance(surface.poses({link: model.frame_pose(q, link) for link in surface.links}), points)
+
+
+def test_a_capsule_is_a_cylinder_with_round_ends(tmp_path: Path) -> None:
+    """Along x here: from (-0.1, 0.2, 0.3) to (0.3, 0.2, 0.3)."""
+    model = RobotModel.from_urdf(written(tmp_path, arm_of(CAPSULE, BALL, origin=ORIGIN)), SPHERES)
+    assert model.surface.by_spheres == ()
+    points = np.random.default_rng(0).uniform([-0.5, -0.2, 0.4], [0.6, 0.6, 0.9], (200, 3))
+    ends = np.array([[-0.1, 0.2, 0.3], [0.3, 0.2, 0.3]])
+    nearest = np.clip(points[:, :1], ends[0, 0], ends[1, 0]) * [1, 0, 0] + [0, 0.2, 0.3]
+    expected = np.linalg.norm(points - nearest, axis=1) - 0.1
+    to_ball = np.linalg.norm(points - [0, 0, 0.3], axis=1) - 0.02  # of the other link
+    assert distance(model, points) == pytest.approx(np.minimum(expected, to_ball), abs=1e-9)
+
+
+def test_meshes_of_packages_elsewhere_are_the_surface_where_their_folder_is_given(tmp_path: Path) -> None:
+    mesh = tmp_path / "elsewhere" / "far" / "ell.stl"
+    mesh.parent.mkdir(parents=True)
+    l_shape().export(mesh)
+    urdf = written(tmp_path / "robot", arm_of('<mesh filename="package://far/ell.stl"/>', BALL))
+    assert RobotModel.from_urdf(urdf, SPHERES).surface.by_spheres == ("base",)
+    found = RobotModel.from_urdf(urdf, SPHERES, packages=[tmp_path / "elsewhere"]).surface
+    assert found.by_spheres == () and len(found.triangles) == len(l_shape().faces)
