@@ -166,8 +166,8 @@ def _run(arguments: list[str], box: Path) -> None:
 
 def _states(path: Path) -> int:
     """What `replay` reads of a log."""
-    from splatctrl_cli.io.options import SourceOptions
-    from splatctrl_cli.io.state_source import open_states
+    from splatctrl_cli.logs.options import SourceOptions
+    from splatctrl_cli.states.state_source import open_states
 
     try:
         source = open_states(path, SourceOptions(), JOINTS)

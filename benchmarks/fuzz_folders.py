@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.datasets.dtu import DtuView, write_dtu
+from splatctrl_cli.datasets.idr import write_idr
+from splatctrl_cli.files.output import write_json
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.io.dtu import DtuView, write_dtu
-from splatctrl_cli.io.idr import write_idr
-from splatctrl_cli.io.output import write_json
-from splatctrl_cli.io.scene_writer import SceneWriter
 from splatctrl_cli.records import Intrinsics, OccupancyGrid, SplatSet
-from tests.io.test_layouts import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
+from splatctrl_cli.scene_files.scene_writer import SceneWriter
+from tests.datasets.test_layouts import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
 from tests.known_voxels import known
 
 Commands = tuple[tuple[str, ...], ...]

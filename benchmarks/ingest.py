@@ -17,10 +17,10 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks.long_log import measured
 from benchmarks.measure import SAMPLE, Limit, Options, Result, medians
 from benchmarks.scenes import enlarged
-from splatctrl_cli.io.capture import CaptureSource, write_capture
-from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.source import open_source
+from splatctrl_cli.captures.capture import CaptureSource, write_capture
+from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.sources.source import open_source
 
 NUM_IMAGES = 12  # that differ; a log repeats them
 PERIOD_NS = 33_333_333

@@ -27,11 +27,11 @@ from pathlib import Path
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.main import COMMANDS, main
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.io.describe import describe
-from splatctrl_cli.io.output import partial_path
-from splatctrl_cli.io.source import open_source
-from splatctrl_cli.io.splat_formats import FORMATS
-from tests.io.test_gaussian_ply import gaussian_set
+from splatctrl_cli.files.output import partial_path
+from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.splat_files.splat_formats import FORMATS
+from tests.splat_files.test_gaussian_ply import gaussian_set
 
 SAMPLE = Path(__file__).parent.parent / "sample_data" / "tabletop"
 _OWN = ("seconds", "arguments")  # of run.json

@@ -14,40 +14,40 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 
 from benchmarks.fuzz_samples import ROBOT, capture_of, plain_log
+from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.containers.bag1_log import Bag1Log
+from splatctrl_cli.containers.db3_log import Db3Log
+from splatctrl_cli.containers.mcap_log import McapLog
+from splatctrl_cli.containers.protobuf import MessageTypes
+from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.datasets.folder_description import read_description
+from splatctrl_cli.datasets.poses import read_nerfstudio, read_trajectory_log, read_tum
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.io.arrays import DAMAGE, npy_of, read_arrays, savez
-from splatctrl_cli.io.bag1_log import Bag1Log
-from splatctrl_cli.io.capture import CaptureSource
-from splatctrl_cli.io.db3_log import Db3Log
-from splatctrl_cli.io.decoder import IMAGE, UndecodableMessageError
-from splatctrl_cli.io.folder_description import read_description
-from splatctrl_cli.io.gaussian_ply import read_gaussian_ply
-from splatctrl_cli.io.gltf import read_gltf
-from splatctrl_cli.io.grid import read_npz
-from splatctrl_cli.io.grid_formats import write_grid
-from splatctrl_cli.io.image_file import image_head
-from splatctrl_cli.io.mcap_log import McapLog
-from splatctrl_cli.io.messages import read_image
-from splatctrl_cli.io.nrrd import read_nrrd_head
-from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.pfm import read_pfm, write_pfm
-from splatctrl_cli.io.poses import read_nerfstudio, read_trajectory_log, read_tum
-from splatctrl_cli.io.protobuf import MessageTypes
-from splatctrl_cli.io.raw_log import Damage
-from splatctrl_cli.io.rvl import decode_rvl
-from splatctrl_cli.io.splat_file import read_splat
-from splatctrl_cli.io.splat_formats import FORMATS
-from splatctrl_cli.io.spz import read_spz
-from splatctrl_cli.io.vti import read_vti
+from splatctrl_cli.files.arrays import DAMAGE, npy_of, read_arrays, savez
+from splatctrl_cli.files.image_file import image_head
+from splatctrl_cli.files.pfm import read_pfm, write_pfm
+from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.grid_files.grid_formats import write_grid
+from splatctrl_cli.grid_files.nrrd import read_nrrd_head
+from splatctrl_cli.grid_files.vti import read_vti
+from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError
+from splatctrl_cli.logs.messages import read_image
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.rvl import decode_rvl
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
-from tests.io.make_grid import random_grid
-from tests.io.make_log import LogRecipe, make_log
-from tests.io.test_bag_log import as_ros1_bag, as_ros2_folder
-from tests.io.test_foxglove import descriptor_set
-from tests.io.test_gaussian_ply import gaussian_set
-from tests.io.test_layouts import make_nerfstudio, make_redwood, make_tum
-from tests.io.test_rvl import encoded_rvl
+from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply
+from splatctrl_cli.splat_files.gltf import read_gltf
+from splatctrl_cli.splat_files.splat_file import read_splat
+from splatctrl_cli.splat_files.splat_formats import FORMATS
+from splatctrl_cli.splat_files.spz import read_spz
+from tests.containers.test_bag_log import as_ros1_bag, as_ros2_folder
+from tests.containers.test_foxglove import descriptor_set
+from tests.datasets.test_layouts import make_nerfstudio, make_redwood, make_tum
+from tests.grid_files.make_grid import random_grid
+from tests.logs.make_log import LogRecipe, make_log
+from tests.logs.test_rvl import encoded_rvl
+from tests.splat_files.test_gaussian_ply import gaussian_set
 
 Read = Callable[[bytes], object]
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) * 700

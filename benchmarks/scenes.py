@@ -8,7 +8,6 @@ import numpy as np
 
 from benchmarks.measure import SAMPLE
 from splatctrl_cli.config import Config
-from splatctrl_cli.io.source import open_source
 from splatctrl_cli.kernels.raster import TargetView
 from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, JointState, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.model import RobotModel
@@ -17,6 +16,7 @@ from splatctrl_cli.scene.render import camera_array
 from splatctrl_cli.scene.seeding import inside_workspace, world_points
 from splatctrl_cli.scene.time_steps import time_steps
 from splatctrl_cli.scene.window import make_view
+from splatctrl_cli.sources.source import open_source
 
 TRAINING = ("cam0", "cam1", "cam2")
 VGA = Intrinsics(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)

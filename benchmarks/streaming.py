@@ -16,10 +16,10 @@ from benchmarks.measure import ROOT, SAMPLE, Limit, Options, Result
 from benchmarks.scenes import enlarged, sample_robot
 from splatctrl_cli.cli import launch
 from splatctrl_cli.config import load_config
-from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Box, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.time_steps import time_steps
+from splatctrl_cli.sources.source import open_source
 
 CAMERAS = ("cam0", "cam1")
 SETTINGS = ("scene.iterations_per_step=5",)

@@ -4,21 +4,28 @@ import ast
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent / "splatctrl_cli"
-RANK = {
-    "cli": 4,
-    "jobs": 3,
-    **dict.fromkeys(["io", "scene", "field", "control", "simulate", "evaluate", "batch"], 2),
-    "robot": 1,
-    **dict.fromkeys(["records", "geometry", "config", "errors", "kernels", "mesh_distance"], 0),
-}
+ROOMS = [  # a room imports those of the rows above its own
+    ["records", "geometry", "config", "errors", "kernels", "mesh_distance"],
+    ["robot", "files"],
+    ["containers", "splat_files", "grid_files", "report"],
+    ["logs", "scene_files"],
+    ["captures", "scene", "field", "control", "simulate", "evaluate"],
+    ["datasets"],
+    ["sources"],
+    ["states", "checks"],
+    ["jobs"],
+    ["cli"],
+]
+RANK = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
 HOMES = {
     "torch": {"scene"},
     "pinocchio": {"robot"},
     "clarabel": {"control"},
     "daqp": {"control"},
-    "rosbags": {"io"},
-    "mcap": {"io"},
-    "pxr": {"io"},
+    "rosbags": {"containers", "logs"},
+    "mcap": {"containers", "logs"},
+    "pxr": {"splat_files"},
+    "matplotlib": {"report"},
 }
 
 

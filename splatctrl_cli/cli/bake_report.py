@@ -9,11 +9,11 @@ from splatctrl_cli.cli.common import table
 
 if TYPE_CHECKING:
     from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy
-    from splatctrl_cli.evaluate.reliability import Reliability
     from splatctrl_cli.evaluate.verdict import Verdict
     from splatctrl_cli.field.incremental import Changes
     from splatctrl_cli.field.report import GridStatistics
     from splatctrl_cli.records import DistanceGrid
+    from splatctrl_cli.report.reliability import Reliability
 
 SUMMARY_METRICS = (
     *("num_splats", "num_splats_left_out", "num_cells", "voxel", "length_scale", "median_radius", "median_spacing"),
@@ -196,7 +196,7 @@ def reference_lines(accuracy: "FieldAccuracy", what: str) -> list[str]:
 
 def write_pictures(folder: Path, report: FieldReport, point: Sequence[float]) -> None:
     """Slices through `point` [m], the gradient, and what else the grid has, into ``folder/report``."""
-    from splatctrl_cli.evaluate.field_pictures import gradient_picture, probability_picture, slices_picture
+    from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
 
     pictures = folder / "report"
     pictures.mkdir()
@@ -208,7 +208,7 @@ def write_pictures(folder: Path, report: FieldReport, point: Sequence[float]) ->
     if "probability" in grid.channels:
         probability_picture(pictures / "probability.png", grid, point)
     if report.reliability:
-        from splatctrl_cli.evaluate.reliability import reliability_picture
+        from splatctrl_cli.report.reliability import reliability_picture
 
         reliability_picture(pictures / "reliability.png", report.reliability, "Probability against the truth")
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.field.baker import Baker
     from splatctrl_cli.field.layout import GridLayout
     from splatctrl_cli.field.slabs import Kept, UnknownSpace
-    from splatctrl_cli.io.grid_slabs import GridSlabs
+    from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
@@ -46,7 +46,7 @@ def bake_to_disk(task: BakeTask, partial: Path, console: Console, *, resume: boo
     from tqdm import tqdm
 
     from splatctrl_cli.field.slabs import baked_planes, check_slab_memory, slabs
-    from splatctrl_cli.io.grid_slabs import SlabPlan, resume_slabs, start_slabs
+    from splatctrl_cli.grid_files.grid_slabs import SlabPlan, resume_slabs, start_slabs
 
     baker, folder = task.baker, partial / FOLDER
     layout = baker.layout
@@ -137,6 +137,6 @@ def _counts(folder: Path) -> dict[str, dict[str, int]]:
 
 
 def _write_counts(folder: Path, counts: Mapping[str, Mapping[str, int]]) -> None:
-    from splatctrl_cli.io.output import write_durably, write_json
+    from splatctrl_cli.files.output import write_durably, write_json
 
     write_durably(folder / COUNTS, lambda path: write_json(path, counts))

@@ -30,8 +30,8 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     Raises InputError for what is not there or not a scene, UsageError for a time in a bare file, NotEvaluableError
     for a time before the first snapshot.
     """
-    from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.splats import read_world_splats
+    from splatctrl_cli.files.output import sha256
+    from splatctrl_cli.splat_files.splats import read_world_splats
 
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
@@ -51,8 +51,8 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
 
 
 def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
-    from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.scene_folder import open_scene
+    from splatctrl_cli.files.output import sha256
+    from splatctrl_cli.scene_files.scene_folder import open_scene
 
     scene = open_scene(path)
     final = scene.occupancy()

@@ -43,9 +43,9 @@ def read_previous(path: Path, scene: Path) -> Previous:
     another version baked it.
     """
     from splatctrl_cli import __version__
-    from splatctrl_cli.io.grid import read_npz
-    from splatctrl_cli.io.output import sha256
-    from splatctrl_cli.io.parts import Parts
+    from splatctrl_cli.files.output import sha256
+    from splatctrl_cli.files.parts import Parts
+    from splatctrl_cli.grid_files.grid import read_npz
 
     if not path.is_dir():
         raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
@@ -116,7 +116,7 @@ def _check_memory(file: Path) -> None:
 def _its_source(path: Path, grid: "DistanceGrid", scene: Path) -> "BakeSource":
     """The splats of `scene` at the field's time. Raises UsageError where they are not those it was baked from."""
     from splatctrl_cli.cli.bake_source import read_bake_source
-    from splatctrl_cli.io.scene_folder import open_scene
+    from splatctrl_cli.scene_files.scene_folder import open_scene
 
     digests, stamp_ns = grid.header.get("digests"), grid.header.get("stamp_ns")
     wanted = next(iter(digests.values()), None) if isinstance(digests, dict) else None

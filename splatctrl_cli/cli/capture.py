@@ -24,8 +24,8 @@ def register(subparsers: Subparsers) -> None:
 
 def run_pack(args: argparse.Namespace) -> int:
     """Run the action and return its exit code."""
-    from splatctrl_cli.io.capture_pack import pack_capture
-    from splatctrl_cli.io.output import output_path
+    from splatctrl_cli.captures.capture_pack import pack_capture
+    from splatctrl_cli.files.output import output_path
 
     console = Console(args)
     if not args.capture.is_dir():
@@ -45,8 +45,8 @@ def run_pack(args: argparse.Namespace) -> int:
 
 def run_unpack(args: argparse.Namespace) -> int:
     """Run the action and return its exit code."""
-    from splatctrl_cli.io.capture_pack import unpack_capture
-    from splatctrl_cli.io.output import output_path
+    from splatctrl_cli.captures.capture_pack import unpack_capture
+    from splatctrl_cli.files.output import output_path
 
     if not args.packed.is_file():
         raise InputError(f"{args.packed}: no such file", remedy="expected what `splatctrl capture pack` writes")

@@ -15,10 +15,10 @@ from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from splatctrl_cli.checks.check_report import CheckReport
+    from splatctrl_cli.checks.check_times import Rate
+    from splatctrl_cli.checks.finding import Finding
     from splatctrl_cli.evaluate.verdict import Verdict
-    from splatctrl_cli.io.check_report import CheckReport
-    from splatctrl_cli.io.check_times import Rate
-    from splatctrl_cli.io.finding import Finding
     from splatctrl_cli.robot.model import RobotModel
 
 QUICK = 30  # images of a topic
@@ -69,9 +69,9 @@ def _num_images(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.check_log import check_log
-    from splatctrl_cli.io.check_source import check_source
-    from splatctrl_cli.io.source import open_logs
+    from splatctrl_cli.checks.check_log import check_log
+    from splatctrl_cli.checks.check_source import check_source
+    from splatctrl_cli.sources.source import open_logs
 
     if args.quick is not None and args.quick < 1:
         raise UsageError(f"--quick {args.quick}: expected 1 or more")
@@ -90,8 +90,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _verdict(report: "CheckReport", *, fail_on: str) -> "Verdict":
     """Of the findings: errors, and warnings where asked for, fail; the other warnings are notes."""
+    from splatctrl_cli.checks.finding import Severity
     from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
-    from splatctrl_cli.io.finding import Severity
 
     fatal = {Severity.ERROR, *([Severity.WARNING] if fail_on == "warning" else [])}
     read = Reason(
@@ -145,7 +145,7 @@ def _seven(text: str) -> tuple[float, ...]:
 
 def _agreement(report: "CheckReport") -> list["Finding"]:
     """Whether views agree on where the surfaces are that both see."""
-    from splatctrl_cli.io.finding import Finding, error, note
+    from splatctrl_cli.checks.finding import Finding, error, note
     from splatctrl_cli.scene.consistency import CAUSES, agreements
 
     findings: list[Finding] = []

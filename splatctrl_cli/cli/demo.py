@@ -15,9 +15,9 @@ from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_outpu
 from splatctrl_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.pictures import ComparisonRow
     from splatctrl_cli.evaluate.verdict import Reason
     from splatctrl_cli.records import RgbdFrame, SplatSet
+    from splatctrl_cli.report.pictures import ComparisonRow
 
 TRAINING, SCORING = "cam0,cam1,cam2", "cam3"
 CLOSED_LOOP_START = "1.6"  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
@@ -49,7 +49,7 @@ def register(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.evaluate.verdict import verdict_of
-    from splatctrl_cli.io.output import Stopwatch, output_path, sha256, write_run
+    from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
 
     console, stopwatch, start = Console(args), Stopwatch(), time.perf_counter()
     out = args.out or Path("demo_output")
@@ -143,12 +143,12 @@ def _pictures(data: Path, out: Path, threads: int) -> dict[str, str]:
     """Draw what the demo shows; file names under `out`, with a description each."""
     import numpy as np
 
-    from splatctrl_cli.evaluate.pictures import comparison_picture, field_slice_picture
-    from splatctrl_cli.io.grid import read_npz
-    from splatctrl_cli.io.scene_folder import open_scene
-    from splatctrl_cli.io.source import open_source
+    from splatctrl_cli.grid_files.grid import read_npz
     from splatctrl_cli.records import JointState, RgbdFrame
+    from splatctrl_cli.report.pictures import comparison_picture, field_slice_picture
     from splatctrl_cli.robot.model import RobotModel
+    from splatctrl_cli.scene_files.scene_folder import open_scene
+    from splatctrl_cli.sources.source import open_source
 
     newest: dict[str, RgbdFrame] = {}
     joints: JointState | None = None
@@ -183,7 +183,7 @@ def _pictures(data: Path, out: Path, threads: int) -> dict[str, str]:
 
 def _comparison(frame: "RgbdFrame", splats: "SplatSet", threads: int) -> "ComparisonRow":
     from splatctrl_cli.evaluate.images import psnr
-    from splatctrl_cli.evaluate.pictures import ComparisonRow
+    from splatctrl_cli.report.pictures import ComparisonRow
     from splatctrl_cli.scene.render import render
 
     view = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)

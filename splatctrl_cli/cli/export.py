@@ -11,8 +11,8 @@ from splatctrl_cli.cli.export_check import check, check_colors, compare, differe
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.io.splat_formats import SplatFormat
     from splatctrl_cli.records import GaussianSet, SplatSet
+    from splatctrl_cli.splat_files.splat_formats import SplatFormat
 
 LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
 SUFFIXES = ".ply, .splat, .spz, .glb, .usda, .usdc"
@@ -47,8 +47,8 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.output import output_path, sha256
-    from splatctrl_cli.io.splat_formats import read_splats
+    from splatctrl_cli.files.output import output_path, sha256
+    from splatctrl_cli.splat_files.splat_formats import read_splats
 
     source = _splat_file(args.scene)
     out = args.out or _beside(args.scene)
@@ -124,7 +124,7 @@ def _splat_file(scene: Path) -> Path:
 
 
 def _format(out: Path, layout: str | None) -> "SplatFormat":
-    from splatctrl_cli.io.splat_formats import FORMATS, REFERENCE_PLY, format_of
+    from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, format_of
 
     kind = format_of(out)
     if layout is not None and kind is not FORMATS[".ply"]:
@@ -144,8 +144,8 @@ def _check_layout(layout: str | None, chosen: "SplatSet | GaussianSet", source: 
 
 def _round(splats: "SplatSet | GaussianSet") -> "SplatSet | GaussianSet":
     """The nearest isotropic set; splats that are isotropic as they are."""
-    from splatctrl_cli.io.isotropic import nearest_splats
     from splatctrl_cli.records import GaussianSet
+    from splatctrl_cli.splat_files.isotropic import nearest_splats
 
     return nearest_splats(splats) if isinstance(splats, GaussianSet) else splats
 
@@ -169,10 +169,10 @@ def _write(
     partial: Path, kind: "SplatFormat", splats: "SplatSet | GaussianSet", comments: Mapping[str, str]
 ) -> "SplatSet | GaussianSet":
     """Write the splats and return what reads back; isotropic ones in a PLY keep their density."""
-    from splatctrl_cli.io.isotropic import as_gaussians, as_splats
-    from splatctrl_cli.io.splat_formats import FORMATS
-    from splatctrl_cli.io.splats import read_ply, write_ply
     from splatctrl_cli.records import GaussianSet
+    from splatctrl_cli.splat_files.isotropic import as_gaussians, as_splats
+    from splatctrl_cli.splat_files.splat_formats import FORMATS
+    from splatctrl_cli.splat_files.splats import read_ply, write_ply
 
     if isinstance(splats, GaussianSet):
         kind.write(partial, splats, comments)

@@ -10,10 +10,10 @@ from splatctrl_cli.errors import WriteError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from splatctrl_cli.io.splat_differences import Differences
-    from splatctrl_cli.io.splat_formats import SplatFormat
     from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, SplatSet
     from splatctrl_cli.scene.render import Rendering
+    from splatctrl_cli.splat_files.splat_differences import Differences
+    from splatctrl_cli.splat_files.splat_formats import SplatFormat
 
 MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measured: 107 and more, or the same
 MAX_PIXEL_DIFFERENCE = 3 / 255  # there; the last bit can take a splat across the renderer's cut-off of 1/255
@@ -76,8 +76,8 @@ def check_colors(source: "Path", splats: "SplatSet | GaussianSet") -> None:
     """Raise InputError naming the first splat whose colour no picture has: beside it float32 loses the others."""
     import numpy as np
 
-    from splatctrl_cli.io.splat_values import refuse
     from splatctrl_cli.records import SplatSet
+    from splatctrl_cli.splat_files.splat_values import refuse
 
     colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
     largest = np.abs(colors).max(axis=1, initial=0.0)
@@ -85,8 +85,8 @@ def check_colors(source: "Path", splats: "SplatSet | GaussianSet") -> None:
 
 
 def _gaussians(splats: "SplatSet | GaussianSet") -> "GaussianSet":
-    from splatctrl_cli.io.isotropic import as_gaussians
     from splatctrl_cli.records import SplatSet
+    from splatctrl_cli.splat_files.isotropic import as_gaussians
 
     return as_gaussians(splats) if isinstance(splats, SplatSet) else splats
 
@@ -94,7 +94,7 @@ def _gaussians(splats: "SplatSet | GaussianSet") -> "GaussianSet":
 def _differences(out: "Path", held: "GaussianSet", back: "GaussianSet", bound: "Differences") -> "Differences":
     import numpy as np
 
-    from splatctrl_cli.io.splat_differences import differences
+    from splatctrl_cli.splat_files.splat_differences import differences
 
     if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
         raise WriteError(f"{out}: is not its source: {len(back)} of {len(held)} splats, or other labels")

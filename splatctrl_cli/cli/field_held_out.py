@@ -11,9 +11,9 @@ from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.sources.source import open_source
 
 ROBOT_MARGIN = 0.03  # [m] about the robot's spheres in which a pixel does not count
 

@@ -12,13 +12,13 @@ from splatctrl_cli.cli.bake_source import BakeSource
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy
-from splatctrl_cli.evaluate.reliability import Reliability, reliability
 from splatctrl_cli.evaluate.visibility import seen_by
 from splatctrl_cli.field.grid import exact_channel
 from splatctrl_cli.field.probability import CollisionProbability
-from splatctrl_cli.io.source import open_source
 from splatctrl_cli.records import Bool, DistanceGrid, Float64, RgbdFrame
+from splatctrl_cli.report.reliability import Reliability, reliability
 from splatctrl_cli.simulate.truth import Truth, load_truth
+from splatctrl_cli.sources.source import open_source
 
 FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
 MAX_CELLS = 200_000  # a larger grid is compared at this many cells, drawn with the seed

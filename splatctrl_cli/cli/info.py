@@ -9,7 +9,7 @@ from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
 from splatctrl_cli.cli.source_options import add_source, source_options
 
 if TYPE_CHECKING:
-    from splatctrl_cli.io.summary import Summary
+    from splatctrl_cli.files.summary import Summary
 
 
 def register(subparsers: Subparsers) -> None:
@@ -21,7 +21,7 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.describe import describe
+    from splatctrl_cli.sources.describe import describe
 
     summary = describe(args.path, source_options(args))
     Console(args).result(summary.as_dict(), list(_lines(summary)))

@@ -15,8 +15,8 @@ from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.io.capture_writer import CaptureSummary
-    from splatctrl_cli.io.options import SourceOptions
+    from splatctrl_cli.captures.capture_writer import CaptureSummary
+    from splatctrl_cli.logs.options import SourceOptions
 
 
 def register(subparsers: Subparsers) -> None:
@@ -38,13 +38,13 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.capture import CaptureSource, write_capture
-    from splatctrl_cli.io.capture_journal import JOURNAL, read_identity
-    from splatctrl_cli.io.image_folder import HOLDOUT
-    from splatctrl_cli.io.output import Stopwatch, output_path, write_run
-    from splatctrl_cli.io.ros_log import RosLogSource
-    from splatctrl_cli.io.source import open_session
+    from splatctrl_cli.captures.capture import CaptureSource, write_capture
+    from splatctrl_cli.captures.capture_journal import JOURNAL, read_identity
+    from splatctrl_cli.datasets.image_folder import HOLDOUT
+    from splatctrl_cli.files.output import Stopwatch, output_path, write_run
     from splatctrl_cli.jobs.resume import check_same_run
+    from splatctrl_cli.logs.ros_log import RosLogSource
+    from splatctrl_cli.sources.source import open_session
 
     console, stopwatch = Console(args), Stopwatch()
     options = source_options(args)
@@ -110,8 +110,8 @@ def _identity(options: "SourceOptions", inputs: Mapping[str, str]) -> dict[str, 
 @contextmanager
 def _told_how_to_go_on(out: Path) -> Iterator[None]:
     """Says after Ctrl-C what was kept."""
-    from splatctrl_cli.io.capture_journal import JOURNAL
-    from splatctrl_cli.io.output import partial_path
+    from splatctrl_cli.captures.capture_journal import JOURNAL
+    from splatctrl_cli.files.output import partial_path
 
     try:
         yield

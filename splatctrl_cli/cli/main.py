@@ -125,7 +125,7 @@ def _stand_in_for_closed_streams() -> _Lost:
 
 
 def _fail_to_read_or_write(error: OSError, verbose: int) -> int:
-    from splatctrl_cli.io.output import is_write_failure
+    from splatctrl_cli.files.output import is_write_failure
 
     reason = error.strerror or error
     if is_write_failure(error):
@@ -139,7 +139,7 @@ def _check_output(args: argparse.Namespace) -> None:
     out = getattr(args, "out", None)
     if out is None:
         return
-    from splatctrl_cli.io.output import PARTIAL, check_can_be_written
+    from splatctrl_cli.files.output import PARTIAL, check_can_be_written
 
     check_can_be_written(out)
     target = Path(os.path.realpath(out))  # resolve() raises RuntimeError for a link to itself

@@ -166,7 +166,7 @@ def _config(args: argparse.Namespace) -> "Config":
 
 
 def _open(args: argparse.Namespace) -> "RecordSource":
-    from splatctrl_cli.io.source import open_source
+    from splatctrl_cli.sources.source import open_source
 
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")

@@ -25,10 +25,10 @@ ROUTES = "leave out --method, or give a folder of views (a TOML file or --dtu)"
 
 def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box: "Box | None") -> int:
     """Fit, write the scene folder and return the exit code."""
-    from splatctrl_cli.io.gaussian_ply import write_gaussian_ply
-    from splatctrl_cli.io.output import Stopwatch, output_path, write_run
-    from splatctrl_cli.io.scene_folder import FORMAT
+    from splatctrl_cli.files.output import Stopwatch, output_path, write_run
     from splatctrl_cli.scene.gaussian_fitter import GaussianFitter
+    from splatctrl_cli.scene_files.scene_folder import FORMAT
+    from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
 
     check_gate_names(args.require, GATED)
     _refuse_what_needs_time(args, source)

@@ -101,7 +101,7 @@ def _register_info(actions: Subparsers) -> None:
 def run_spheres(args: argparse.Namespace) -> int:
     """Fit, write, measure what was written, and return the exit code."""
     from splatctrl_cli.cli.robot_report import METRICS, coverage_json, coverage_lines, coverage_verdict
-    from splatctrl_cli.io.output import output_path
+    from splatctrl_cli.files.output import output_path
     from splatctrl_cli.robot.coverage import coverage_of_solids
     from splatctrl_cli.robot.solids import read_solids
     from splatctrl_cli.robot.sphere_files import read_spheres, spheres_yaml
@@ -243,8 +243,8 @@ def _comments(urdf: Path, report: "CoverageReport") -> list[str]:
 
 
 def _draw(path: Path, urdf: "UrdfFile", solids: "dict[str, tuple[Solid, ...]]", spheres: "SphereSet") -> None:
-    from splatctrl_cli.evaluate.robot_picture import robot_picture
     from splatctrl_cli.geometry import transform_points
+    from splatctrl_cli.report.robot_picture import robot_picture
     from splatctrl_cli.robot.model import RobotModel
 
     model = RobotModel.from_urdf(urdf.path, spheres)

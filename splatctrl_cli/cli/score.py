@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         read_baseline(args.baseline)  # better refused now than after the views
     check_gate_names(args.require, names if args.baseline is None else changed, {"--baseline": changed})
     console = Console(args)
-    from splatctrl_cli.io.output import output_path
+    from splatctrl_cli.files.output import output_path
 
     scenes = scenes_of_scans(args)
     output = output_path(args.out, force=args.force, is_folder=True) if args.out else nullcontext()
@@ -120,8 +120,8 @@ def score_scene(args: argparse.Namespace, console: Console, folder: Path | None)
     from splatctrl_cli.cli.score_views import Scorer, view_drawer
     from splatctrl_cli.evaluate.perceptual import Lpips
     from splatctrl_cli.field.selection import field_splats
-    from splatctrl_cli.io.output import Stopwatch
-    from splatctrl_cli.io.scene_folder import open_scene
+    from splatctrl_cli.files.output import Stopwatch
+    from splatctrl_cli.scene_files.scene_folder import open_scene
 
     stopwatch = Stopwatch()
     cloud = cloud_settings(args)

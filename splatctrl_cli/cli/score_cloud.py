@@ -11,9 +11,9 @@ from splatctrl_cli.cli.score_views import rendered
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.io.dtu_observed import ObservedSpace
-    from splatctrl_cli.io.scene_folder import SceneFolder
+    from splatctrl_cli.datasets.dtu_observed import ObservedSpace
     from splatctrl_cli.records import Float64, GaussianSet, RgbdFrame, SplatSet
+    from splatctrl_cli.scene_files.scene_folder import SceneFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class CloudSettings:
 
         Raises InputError naming the files looked for.
         """
-        from splatctrl_cli.io.dtu_observed import cloud_of_scan, read_observed
+        from splatctrl_cli.datasets.dtu_observed import cloud_of_scan, read_observed
 
         path = cloud_of_scan(self.path, scan or "") if self.path.is_dir() else self.path
         return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))
@@ -126,8 +126,8 @@ def cloud_figures(
 
 def _reference(settings: CloudSettings) -> "Float64":
     from splatctrl_cli.evaluate.cloud import points_on
-    from splatctrl_cli.io.points import is_mesh, read_positions
     from splatctrl_cli.mesh_distance import load_mesh
+    from splatctrl_cli.splat_files.points import is_mesh, read_positions
 
     if not is_mesh(settings.path):
         return settings.unit * read_positions(settings.path)

@@ -236,8 +236,8 @@ def _reconstruct(args: argparse.Namespace, scene: Path, scan: str, settings: lis
 
 
 def _scans(args: argparse.Namespace) -> list[str]:
-    from splatctrl_cli.io.dtu import scan_folders
-    from splatctrl_cli.io.idr import idr_scans
+    from splatctrl_cli.datasets.dtu import scan_folders
+    from splatctrl_cli.datasets.idr import idr_scans
 
     if args.dtu is None:
         return [args.reference.stem]
@@ -254,7 +254,7 @@ def _scans(args: argparse.Namespace) -> list[str]:
 @contextmanager
 def _folder(args: argparse.Namespace) -> Iterator[Path]:
     """Where the scenes go: the output, or a place for the time of the run."""
-    from splatctrl_cli.io.output import output_path
+    from splatctrl_cli.files.output import output_path
 
     if args.out is None:
         with tempfile.TemporaryDirectory() as folder:
@@ -349,7 +349,7 @@ def _whole(value: float | None) -> str:
 def _write(
     folder: Path, args: argparse.Namespace, result: dict[str, Any], config: dict[str, Any], verdict: Verdict
 ) -> None:
-    from splatctrl_cli.io.output import Stopwatch, write_json, write_run
+    from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 
     write_json(folder / "score.json", result)
     write_run(

@@ -14,9 +14,9 @@ def draw_methods(args: argparse.Namespace, console: Console, scenes: Mapping[str
     import numpy as np
 
     from splatctrl_cli.evaluate.images import psnr
-    from splatctrl_cli.evaluate.view_picture import renders_picture
     from splatctrl_cli.evaluate.views import views_to_score
-    from splatctrl_cli.io.scene_folder import open_scene
+    from splatctrl_cli.report.view_picture import renders_picture
+    from splatctrl_cli.scene_files.scene_folder import open_scene
 
     opened = {name: open_scene(scene) for name, scene in scenes.items()}
     training = next(iter(opened.values())).cameras

@@ -15,8 +15,8 @@ from splatctrl_cli.cli.score_views import Scores
 if TYPE_CHECKING:
     from splatctrl_cli.evaluate.perceptual import Lpips
     from splatctrl_cli.evaluate.verdict import Reason, Verdict
-    from splatctrl_cli.io.output import Stopwatch
-    from splatctrl_cli.io.scene_folder import SceneFolder
+    from splatctrl_cli.files.output import Stopwatch
+    from splatctrl_cli.scene_files.scene_folder import SceneFolder
 
 
 def result_of(
@@ -81,8 +81,8 @@ def _free_mass(path: Path, scene: "SceneFolder") -> float:
     """nan where the scene has no occupancy grid."""
     from splatctrl_cli.evaluate.free_space import free_mass
     from splatctrl_cli.field.obstacles import obstacle_spheres
-    from splatctrl_cli.io.scene_folder import run_value
     from splatctrl_cli.records import Label
+    from splatctrl_cli.scene_files.scene_folder import run_value
 
     if not (path / "occupancy.npz").is_file():
         return nan
@@ -161,8 +161,8 @@ def write_scores(
     """The files of ``score -o``."""
     import csv
 
-    from splatctrl_cli.evaluate.pictures import comparison_picture
-    from splatctrl_cli.io.output import sha256, write_json, write_run
+    from splatctrl_cli.files.output import sha256, write_json, write_run
+    from splatctrl_cli.report.pictures import comparison_picture
 
     write_json(folder / "score.json", result)
     with (folder / "views.csv").open("w", newline="", encoding="utf-8") as stream:

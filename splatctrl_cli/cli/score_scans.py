@@ -145,7 +145,7 @@ def lines_of_scans(result: dict[str, Any]) -> list[str]:
 def _write(folder: Path, result: dict[str, Any], verdict: "Verdict") -> None:
     import csv
 
-    from splatctrl_cli.io.output import Stopwatch, write_json, write_run
+    from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 
     write_json(folder / "score.json", result)
     with (folder / "scans.csv").open("w", newline="", encoding="utf-8") as stream:

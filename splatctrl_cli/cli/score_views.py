@@ -13,13 +13,13 @@ from splatctrl_cli.errors import NotEvaluableError, UsageError
 
 if TYPE_CHECKING:
     from splatctrl_cli.evaluate.doubts import Doubts
-    from splatctrl_cli.evaluate.pictures import ComparisonRow
     from splatctrl_cli.evaluate.score import Perceptual, ViewScore
     from splatctrl_cli.evaluate.views import View
-    from splatctrl_cli.io.output import Stopwatch
-    from splatctrl_cli.io.scene_folder import SceneFolder
+    from splatctrl_cli.files.output import Stopwatch
     from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
+    from splatctrl_cli.report.pictures import ComparisonRow
     from splatctrl_cli.scene.render import Rendering
+    from splatctrl_cli.scene_files.scene_folder import SceneFolder
 
 
 @dataclass(kw_only=True)
@@ -99,9 +99,9 @@ class Scorer:
             )
 
     def _score_one(self, scores: Scores, doubts: "Doubts", view: "View", splats: "SplatSet | GaussianSet") -> None:
-        from splatctrl_cli.evaluate.pictures import ComparisonRow
         from splatctrl_cli.evaluate.score import score_view
         from splatctrl_cli.evaluate.visibility import seen_pixels
+        from splatctrl_cli.report.pictures import ComparisonRow
 
         frame, protocol = view.frame, self.reference.protocol
         rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.args.threads)
@@ -188,7 +188,7 @@ class _SplatsAt:
 
 def view_drawer(folder: Path) -> "Callable[[ComparisonRow], None]":
     """Writes the pictures of each view into `folder`."""
-    from splatctrl_cli.evaluate.view_picture import view_picture
+    from splatctrl_cli.report.view_picture import view_picture
 
     folder.mkdir(parents=True, exist_ok=True)
 

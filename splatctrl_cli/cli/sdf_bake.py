@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from splatctrl_cli.field.baker import Baker
     from splatctrl_cli.field.incremental import Changes
     from splatctrl_cli.field.slabs import UnknownSpace
-    from splatctrl_cli.io.output import Stopwatch
+    from splatctrl_cli.files.output import Stopwatch
     from splatctrl_cli.records import DistanceGrid, Label, SplatSet
 
 
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     from splatctrl_cli.cli.bake_report import bake_verdict, metric_names, metrics
     from splatctrl_cli.cli.bake_run import CHECKPOINT, FOLDER, clear_leftovers
-    from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
+    from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
     from splatctrl_cli.jobs.resume import told_how_to_go_on
 
     console, stopwatch, config = Console(args), Stopwatch(), with_options(configured(args), args)
@@ -141,7 +141,7 @@ def _read(
     from splatctrl_cli.field.baker import Baker
     from splatctrl_cli.field.layout import GridLayout
     from splatctrl_cli.field.obstacles import obstacle_spheres
-    from splatctrl_cli.io.grid_formats import check_formats
+    from splatctrl_cli.grid_files.grid_formats import check_formats
 
     with stopwatch.stage("read"):
         source = read_bake_source(args.scene, args.at)
@@ -186,8 +186,8 @@ def _bake(
     """Bake, compare, and write all but ``run.json``; returns the report and what is printed."""
     from splatctrl_cli.cli.bake_report import FieldReport, summary_lines, warnings_of, write_pictures
     from splatctrl_cli.field.report import grid_statistics
-    from splatctrl_cli.io.grid_formats import write_grid
-    from splatctrl_cli.io.output import write_json
+    from splatctrl_cli.files.output import write_json
+    from splatctrl_cli.grid_files.grid_formats import write_grid
 
     with stopwatch.stage("bake"):
         grid, changes = _baked(job, args, partial, console)

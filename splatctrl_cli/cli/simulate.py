@@ -57,7 +57,7 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.io.output import Stopwatch, output_path, write_json, write_run
+    from splatctrl_cli.files.output import Stopwatch, output_path, write_json, write_run
     from splatctrl_cli.simulate.recording import RecordingOptions
     from splatctrl_cli.simulate.shared_workspace import DURATION_S
     from splatctrl_cli.simulate.truth import truth_document
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _record(folder: Path, options: "RecordingOptions", console: Console) -> "tuple[Truth, dict[str, int]]":
     """Write robot files and log; the truth and the number of frames by camera."""
-    from splatctrl_cli.io.mcap_writer import mcap_log
+    from splatctrl_cli.logs.mcap_writer import mcap_log
     from splatctrl_cli.records import JointState
     from splatctrl_cli.robot.model import RobotModel
     from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
@@ -147,8 +147,8 @@ def _truth(folder: Path, recording: "Recording", contrast: dict[str, float]) -> 
 
 
 def _write_scan(folder: Path) -> None:
-    from splatctrl_cli.io.dtu import DtuView, write_dtu
-    from splatctrl_cli.io.idr import write_idr
+    from splatctrl_cli.datasets.dtu import DtuView, write_dtu
+    from splatctrl_cli.datasets.idr import write_idr
     from splatctrl_cli.simulate.turntable import object_mask, views
 
     scan = [

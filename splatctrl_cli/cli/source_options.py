@@ -9,7 +9,7 @@ from splatctrl_cli.cli.numbers import real, several
 from splatctrl_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from splatctrl_cli.io.options import CameraTopics, PoseTopic, SourceOptions
+    from splatctrl_cli.logs.options import CameraTopics, PoseTopic, SourceOptions
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +74,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 
 def source_options(args: argparse.Namespace) -> "SourceOptions":
     """What `add_source` parsed. Raises UsageError for a value of the wrong form."""
-    from splatctrl_cli.io.options import SourceOptions
+    from splatctrl_cli.logs.options import SourceOptions
 
     return SourceOptions(
         world_frame=args.world_frame,
@@ -111,7 +111,7 @@ def _names(text: str | None) -> tuple[str, ...] | None:
 
 
 def _topics(text: str) -> "CameraTopics":
-    from splatctrl_cli.io.options import CameraTopics
+    from splatctrl_cli.logs.options import CameraTopics
 
     name, equals, rest = text.partition("=")
     topics = rest.split(",")
@@ -144,7 +144,7 @@ def _is_topic(text: str) -> bool:
 
 
 def _pose_topic(text: str) -> tuple[str, "PoseTopic"]:
-    from splatctrl_cli.io.options import PoseTopic
+    from splatctrl_cli.logs.options import PoseTopic
 
     name, _, rest = text.partition("=")
     topic, at, frame = rest.partition("@")

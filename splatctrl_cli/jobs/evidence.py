@@ -8,11 +8,11 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.evaluate.recording import changed_files, differences
-from splatctrl_cli.io.scene_folder import SceneFolder
-from splatctrl_cli.io.state_columns import StateColumns
+from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.agreement import agreement_with_grid
+from splatctrl_cli.scene_files.scene_folder import SceneFolder
 from splatctrl_cli.simulate.truth import Truth
 
 S = TypeVar("S", SceneConfig, OccupancyConfig)

@@ -22,10 +22,9 @@ from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid import GridField, exact_channel
 from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_spheres
 from splatctrl_cli.field.spheres import Spheres
-from splatctrl_cli.io.grid import read_npz
-from splatctrl_cli.io.output import sha256
-from splatctrl_cli.io.parts import Parts
-from splatctrl_cli.io.scene_folder import open_scene
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.parts import Parts
+from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.records import (
     SWEPT,
     Balls,
@@ -39,6 +38,7 @@ from splatctrl_cli.records import (
     SplatSet,
     VoxelState,
 )
+from splatctrl_cli.scene_files.scene_folder import open_scene
 
 Index = NDArray[np.int64]
 

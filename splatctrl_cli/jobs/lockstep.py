@@ -7,17 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.io.capture import CaptureSource
-from splatctrl_cli.io.output import Stopwatch, write_run
-from splatctrl_cli.io.ros_log import RosLogSource
-from splatctrl_cli.io.shot import ShotSource
-from splatctrl_cli.io.splats import read_ply
-from splatctrl_cli.io.state_source import open_states
-from splatctrl_cli.io.voxel_file import read_known_states, read_unrepresented
+from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.jobs.known_scene import (
     KnownFields,
     KnownScene,
@@ -31,9 +26,14 @@ from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruct import check_pose_jumps
 from splatctrl_cli.jobs.replay_evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP, ReplayRequest
+from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.shot import ShotSource
 from splatctrl_cli.records import Float64, UInt8
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene_files.voxel_file import read_known_states, read_unrepresented
+from splatctrl_cli.splat_files.splats import read_ply
+from splatctrl_cli.states.state_source import open_states
 
 if TYPE_CHECKING:
     from splatctrl_cli.jobs.reconstruction import Reconstruction

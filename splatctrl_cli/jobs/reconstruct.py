@@ -9,18 +9,18 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
-from splatctrl_cli.io.output import Stopwatch, output_path, partial_path, write_run
-from splatctrl_cli.io.points import read_points
-from splatctrl_cli.io.scene_writer import CHECKPOINT
-from splatctrl_cli.io.shot import ShotSource
+from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.reconstruction import Reconstruction, training_cameras
 from splatctrl_cli.jobs.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
+from splatctrl_cli.logs.shot import ShotSource
 from splatctrl_cli.records import Box, RecordSource
 from splatctrl_cli.robot.declared import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.consistency import largest_jump
+from splatctrl_cli.scene_files.scene_writer import CHECKPOINT
+from splatctrl_cli.splat_files.points import read_points
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,6 @@ from tqdm import tqdm
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.recording import first_frame
-from splatctrl_cli.io.scene_folder import FORMAT
-from splatctrl_cli.io.scene_writer import Checkpoint, SceneWriter
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Box, JointState, PointCloud, RecordSource
 from splatctrl_cli.robot.declared import Declarations
@@ -26,6 +24,8 @@ from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
+from splatctrl_cli.scene_files.scene_folder import FORMAT
+from splatctrl_cli.scene_files.scene_writer import Checkpoint, SceneWriter
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
 SAME_MOMENT_NS = 20_000_000  # frames of one time step are at most so far apart

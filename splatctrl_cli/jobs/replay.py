@@ -6,8 +6,7 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
-from splatctrl_cli.io.output import Stopwatch, output_path, sha256, write_json
-from splatctrl_cli.io.scene_folder import open_scene
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.jobs.evidence import Mismatch, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.lockstep import check_lockstep, opened_scene
 from splatctrl_cli.jobs.progress import SILENT, Progress
@@ -27,6 +26,7 @@ from splatctrl_cli.jobs.replay_twists import check_twists
 from splatctrl_cli.jobs.replay_verdict import ASKED, replay_verdict
 from splatctrl_cli.jobs.replay_worst import draw_worst_frames
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.simulate.truth import load_truth
 
 

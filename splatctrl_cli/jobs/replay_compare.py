@@ -17,10 +17,10 @@ from splatctrl_cli.control.planned import PlannedPath, planned_detours, planned_
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.methods_picture import methods_picture
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
 from splatctrl_cli.records import Float64
+from splatctrl_cli.report.methods_picture import methods_picture
 
 if TYPE_CHECKING:
     from splatctrl_cli.jobs.known_scene import KnownFields

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatctrl_cli.control.explain import INTERVENTIONS, Event
-from splatctrl_cli.evaluate.replay_pictures import (
+from splatctrl_cli.records import Float64, FloatRows
+from splatctrl_cli.report.replay_pictures import (
     clearance_picture,
     commands_picture,
     divergence_picture,
     open_loop_picture,
 )
-from splatctrl_cli.records import Float64, FloatRows
 
 if TYPE_CHECKING:
     from splatctrl_cli.jobs.replay_modes import Replay

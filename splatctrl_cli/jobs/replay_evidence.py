@@ -20,17 +20,17 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.field.distance import SphereField
+from splatctrl_cli.files.rows import ranges
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.rows import ranges
-from splatctrl_cli.io.scene_folder import open_scene
-from splatctrl_cli.io.state_source import open_states
 from splatctrl_cli.jobs.reconstruction import SAME_MOMENT_NS, training_cameras
 from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replay_store import StoredAudit
+from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
+from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.states.state_source import open_states
 
 EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
 CELL = 0.02  # [m] to which the places of spheres are rounded

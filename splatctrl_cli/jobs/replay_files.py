@@ -11,8 +11,7 @@ import numpy as np
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.explain import INTERVENTIONS, Event, first_intervention
 from splatctrl_cli.evaluate.verdict import Verdict
-from splatctrl_cli.io.output import Stopwatch, write_json, write_run
-from splatctrl_cli.io.replay_output import write_steps
+from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 from splatctrl_cli.jobs import replay_compare
 from splatctrl_cli.jobs.replay_columns import chunks_of
 from splatctrl_cli.jobs.replay_draw import draw_replay
@@ -20,6 +19,7 @@ from splatctrl_cli.jobs.replay_metrics import Metrics
 from splatctrl_cli.jobs.replay_modes import Replay
 from splatctrl_cli.jobs.replay_robot import coverage_words
 from splatctrl_cli.records import Float64
+from splatctrl_cli.report.replay_output import write_steps
 
 UNITS = {
     **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),

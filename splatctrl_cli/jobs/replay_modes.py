@@ -20,8 +20,7 @@ from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.clearance import ClearanceAgreement, clearance_agreement, mark_seen
-from splatctrl_cli.io.rows import RowFile, Rows, ranges
-from splatctrl_cli.io.state_columns import StateColumns
+from splatctrl_cli.files.rows import RowFile, Rows, ranges
 from splatctrl_cli.jobs.known_scene import KnownScene
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone, separations
@@ -33,6 +32,7 @@ from splatctrl_cli.jobs.replay_request import FIRST_MAP, ReplayInputs, ReplayReq
 from splatctrl_cli.jobs.replay_states import check_inside
 from splatctrl_cli.jobs.replay_store import Figures, StoredAudit, StoredLoop, StoredOpenLoop, StoredSteps
 from splatctrl_cli.jobs.replay_twists import twist_figures, twist_track
+from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import Float64, FloatRows, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import distance_to

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.course import LoggedMotion
-from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.state_columns import StateColumns
 from splatctrl_cli.jobs.evidence import Mismatch
 from splatctrl_cli.jobs.known_scene import KnownScene
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel

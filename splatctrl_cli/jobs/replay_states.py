@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.checks.state_check import PoseAgreement, check_angles, check_states, pose_agreement
+from splatctrl_cli.checks.state_motion import ImageMotion
+from splatctrl_cli.checks.state_offset import ClockOffset, RobotPoints, estimate_clock_offset, states_asked
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.io.state_check import PoseAgreement, check_angles, check_states, pose_agreement
-from splatctrl_cli.io.state_columns import StateCollector, StateColumns
-from splatctrl_cli.io.state_motion import ImageMotion
-from splatctrl_cli.io.state_offset import ClockOffset, RobotPoints, estimate_clock_offset, states_asked
-from splatctrl_cli.io.state_source import StateSource, open_states
 from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
 from splatctrl_cli.records import Box, Float64, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.states.state_source import StateSource, open_states
 
 MAX_NOTES = 10  # printed
 LOG_FIGURES = (

@@ -13,7 +13,7 @@ from splatctrl_cli.control.audit import AuditTrace, Clearance
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
 from splatctrl_cli.control.step import ControlStep, RowKind, VelocityMargin
-from splatctrl_cli.io.rows import IN_MEMORY, RowFile, Rows, scratch_folder
+from splatctrl_cli.files.rows import IN_MEMORY, RowFile, Rows, scratch_folder
 from splatctrl_cli.records import Float64, FloatRows
 
 BLOCK = 1024  # states that are replayed at once

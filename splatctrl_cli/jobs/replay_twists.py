@@ -10,11 +10,11 @@ from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.io.twists import read_twists
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replay_request import ReplayRequest
 from splatctrl_cli.records import FloatRows
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.states.twists import read_twists
 
 WORLD = "world"
 FIGURES = (

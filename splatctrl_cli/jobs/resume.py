@@ -10,9 +10,9 @@ from typing import Any
 from splatctrl_cli import __version__
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.io.output import sha256
-from splatctrl_cli.io.scene_writer import Checkpoint, read_checkpoint
+from splatctrl_cli.files.output import sha256
 from splatctrl_cli.kernels import native
+from splatctrl_cli.scene_files.scene_writer import Checkpoint, read_checkpoint
 
 DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit
 

@@ -7,12 +7,12 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from splatctrl_cli.io import state_source
 from splatctrl_cli.jobs import lockstep, replay_files, replay_robot, replay_states
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot import coverage
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
+from splatctrl_cli.states import state_source
 from tests.cli.replay_desk import Desk, FakeSource, logged
 
 MEASURED: dict[tuple[bytes, ...], coverage.CoverageReport] = {}

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.output import part_digests
-from splatctrl_cli.io.scene_writer import SceneWriter
+from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from tests.known_voxels import known
 
 SECOND = 1_000_000_000

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.io.check_report import BLOCKED
+from splatctrl_cli.checks.check_report import BLOCKED
 from tests.cli.test_ingest import run
-from tests.io.break_log import Message, broken_log
-from tests.io.make_log import LogRecipe, make_log
+from tests.files.break_log import Message, broken_log
+from tests.logs.make_log import LogRecipe, make_log
 
 GOOD = LogRecipe(num_frames=20)
 
@@ -118,7 +118,7 @@ def test_a_capture_is_checked_as_its_log(tmp_path: Path, capsys: pytest.CaptureF
 def test_every_code_is_in_the_page() -> None:
     root = Path(__file__).parents[2]
     page = (root / "docs/check.md").read_text()
-    sources = [*(root / "splatctrl_cli/io").glob("check_*.py"), root / "splatctrl_cli/cli/check.py"]
+    sources = [*(root / "splatctrl_cli/checks").glob("check_*.py"), root / "splatctrl_cli/cli/check.py"]
     text = "\n".join(path.read_text() for path in sources)
     codes = set(re.findall(r'(?:error|warning|note|severity|make)\(\s*"([a-z-]+)"', text))
     assert len(codes) > 30

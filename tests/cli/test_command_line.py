@@ -15,13 +15,13 @@ from pathlib import Path
 
 import pytest
 
+from splatctrl_cli.captures.capture import write_capture
 from splatctrl_cli.cli import demo
 from splatctrl_cli.cli.main import COMMANDS, build_parser, main
 from splatctrl_cli.evaluate.verdict import noted
-from splatctrl_cli.io.capture import write_capture
-from splatctrl_cli.io.source import open_source
+from splatctrl_cli.sources.source import open_source
 from tests.cli import here
-from tests.io.make_log import LogRecipe, make_log
+from tests.logs.make_log import LogRecipe, make_log
 
 WRITERS = [command for command in COMMANDS if command not in {"info", "check"}]
 HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "mcap", "rosbags", "clarabel")

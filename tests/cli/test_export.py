@@ -12,13 +12,13 @@ import pytest
 from splatctrl_cli.cli import export_check
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io import splats as splats_module
-from splatctrl_cli.io.gaussian_ply import write_gaussian_ply
-from splatctrl_cli.io.isotropic import as_gaussians
-from splatctrl_cli.io.splat_formats import FORMATS
-from splatctrl_cli.io.splats import read_ply, write_ply
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
+from splatctrl_cli.splat_files import splats as splats_module
+from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
+from splatctrl_cli.splat_files.isotropic import as_gaussians
+from splatctrl_cli.splat_files.splat_formats import FORMATS
+from splatctrl_cli.splat_files.splats import read_ply, write_ply
 from tests.cli import here
 
 

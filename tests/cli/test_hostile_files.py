@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.io.arrays import npy_of
+from splatctrl_cli.files.arrays import npy_of
 from splatctrl_cli.robot.solids import mesh_path
 from splatctrl_cli.robot.urdf import MeshShape
-from tests.io.make_npz import write_zeros
+from tests.files.make_npz import write_zeros
 
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10\nfy = 10\ncx = 4.0\ncy = 3.0\n"
 LAUGHS = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
@@ -127,7 +127,7 @@ CODES = {"grid announced": {0, 4}, "splats announced": {0, 4}, "states of 16 GiB
 RUN = """
 import resource, sys
 from splatctrl_cli.cli.main import main
-import splatctrl_cli.cli.ingest, cv2, numpy, splatctrl_cli.io.source, splatctrl_cli.io.describe
+import splatctrl_cli.cli.ingest, cv2, numpy, splatctrl_cli.sources.source, splatctrl_cli.sources.describe
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + 2**30
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.scene_folder import open_scene
 from splatctrl_cli.records import Label
-from tests.io.make_log import LogRecipe, make_log
+from splatctrl_cli.scene_files.scene_folder import open_scene
+from tests.logs.make_log import LogRecipe, make_log
 
 MASK = ("--human-topic", "cam0=/cam0/people/mask")
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.splat_formats import FORMATS
-from tests.io.make_log import LogRecipe, make_log
-from tests.io.test_gaussian_ply import gaussian_set
-from tests.io.test_layouts import make_tum
+from splatctrl_cli.splat_files.splat_formats import FORMATS
+from tests.datasets.test_layouts import make_tum
+from tests.logs.make_log import LogRecipe, make_log
+from tests.splat_files.test_gaussian_ply import gaussian_set
 
 RUN = """
 import contextlib, io, sys
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.splat_formats import FORMATS
+from splatctrl_cli.splat_files.splat_formats import FORMATS
 for line in sys.stdin:
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):

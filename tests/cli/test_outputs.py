@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.io.capture_writer import write_capture
-from splatctrl_cli.io.source import open_source
+from splatctrl_cli.captures.capture_writer import write_capture
+from splatctrl_cli.sources.source import open_source
 from tests.cli import here
 from tests.cli.test_command_line import assert_refused
-from tests.io.make_log import LogRecipe, make_log
+from tests.logs.make_log import LogRecipe, make_log
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"
 DTU = ["--dtu", str(SAMPLES / "dtu"), "--holdout", "2,5"]

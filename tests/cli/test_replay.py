@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
-from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.grid_files.grid import write_npz
 from splatctrl_cli.records import Box, LossReport
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import (

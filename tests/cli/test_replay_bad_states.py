@@ -10,10 +10,10 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
-from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.grid_files.grid import write_npz
 from splatctrl_cli.records import Box
 from tests.cli.replay_desk import BALL, START, Desk, grid_seen, splats_of, write_scene
-from tests.io.make_states import START_NS, STEP_NS, states_of, write_mcap
+from tests.logs.make_states import START_NS, STEP_NS, states_of, write_mcap
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))

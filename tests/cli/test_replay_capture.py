@@ -12,14 +12,14 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.source import open_source
-from splatctrl_cli.io.state_source import open_states
+from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.states.state_source import open_states
 from tests.cli.replay_desk import BALL, START, splats_of, write_scene
-from tests.io.make_log import START_NS, LogRecipe, make_log
-from tests.io.make_states import NEW_CONTROLLER, Message, header, joint_state, store_with
+from tests.logs.make_log import START_NS, LogRecipe, make_log
+from tests.logs.make_states import NEW_CONTROLLER, Message, header, joint_state, store_with
 
 pytestmark = pytest.mark.usefixtures("coverage_once", "without_plots")
 NUM = 60  # states, every 10 ms

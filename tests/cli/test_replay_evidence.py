@@ -13,12 +13,12 @@ from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.io.options import SourceOptions
 from splatctrl_cli.jobs import replay_evidence
 from splatctrl_cli.jobs.lockstep import from_log
 from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.replay_evidence import apart_from_robot, held_out, open_evidence, trained
 from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import time_steps

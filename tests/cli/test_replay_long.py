@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.control.explain import EventFold, EventKind, Signal, events_of
-from splatctrl_cli.io import rows, state_columns
+from splatctrl_cli.files import rows
 from splatctrl_cli.jobs import replay_columns, replay_record, replay_store
+from splatctrl_cli.logs import state_columns
 from splatctrl_cli.records import JointState
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, splats_of, write_scene
 

@@ -12,7 +12,7 @@ from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_scene
-from tests.io.make_states import START_NS, STEP_NS, states_of, write_mcap
+from tests.logs.make_states import START_NS, STEP_NS, states_of, write_mcap
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))

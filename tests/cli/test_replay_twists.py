@@ -9,8 +9,8 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_scene
-from tests.io.make_states import START_NS, states_of, write_mcap
-from tests.io.test_twists import stamped
+from tests.logs.make_states import START_NS, states_of, write_mcap
+from tests.states.test_twists import stamped
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

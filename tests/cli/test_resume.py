@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io import scene_writer
-from splatctrl_cli.io.scene_folder import open_scene
 from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene_files import scene_writer
+from splatctrl_cli.scene_files.scene_folder import open_scene
 
 DTU = Path(__file__).parent.parent.parent / "sample_data" / "dtu"
 FAST = [

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.io import scene_folder, source
-from splatctrl_cli.io.dtu import DtuView, write_dtu
-from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.records import Float64, Intrinsics, Label, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
+from splatctrl_cli.scene_files import scene_folder
+from splatctrl_cli.sources import source
+from splatctrl_cli.splat_files.splats import write_ply
 
 INTRINSICS = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 SECOND = 1_000_000_000

@@ -9,9 +9,9 @@ import pytest
 
 from splatctrl_cli.cli import score_fit
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.dtu import read_dtu
-from splatctrl_cli.io.idr import write_idr
-from tests.io.make_idr import half_size
+from splatctrl_cli.datasets.dtu import read_dtu
+from splatctrl_cli.datasets.idr import write_idr
+from tests.datasets.make_idr import half_size
 
 QUICK = ("--fit", "--fit-iterations", "6", "--fit-splats", "400", "--threads", "1")
 

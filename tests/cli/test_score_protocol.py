@@ -11,14 +11,14 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.score_reference import _missing_views, is_folder_of_views
+from splatctrl_cli.datasets.dtu import DtuView, read_dtu, write_dtu
+from splatctrl_cli.datasets.dtu_source import DtuSource
+from splatctrl_cli.datasets.idr import write_idr
+from splatctrl_cli.datasets.protocols import score_protocol
 from splatctrl_cli.evaluate.cloud import spaced
-from splatctrl_cli.io.dtu import DtuView, read_dtu, write_dtu
-from splatctrl_cli.io.dtu_source import DtuSource
-from splatctrl_cli.io.idr import write_idr
-from splatctrl_cli.io.protocols import score_protocol
 from splatctrl_cli.records import Float64
-from tests.io.make_idr import half_size
-from tests.io.make_observed import write_observed
+from tests.datasets.make_idr import half_size
+from tests.files.make_observed import write_observed
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
 HOLDOUT = "holdout:every4"

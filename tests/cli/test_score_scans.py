@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.dtu import read_dtu
-from splatctrl_cli.io.idr import write_idr
-from tests.io.make_idr import half_size
+from splatctrl_cli.datasets.dtu import read_dtu
+from splatctrl_cli.datasets.idr import write_idr
+from tests.datasets.make_idr import half_size
 
 HOLDOUT = ("--protocol", "holdout:0")
 QUICK = ("-q", "--max-splats", "300", "--set", "scene.first_iterations=4", "--set", "scene.refine_iterations=0")

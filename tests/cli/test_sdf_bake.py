@@ -16,12 +16,12 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.grid import exact_channel
-from splatctrl_cli.io import grid_formats
-from splatctrl_cli.io.grid import read_npz
-from splatctrl_cli.io.scene_writer import SceneWriter
-from splatctrl_cli.io.splats import write_ply
+from splatctrl_cli.grid_files import grid_formats
+from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.records import OccupancyGrid
+from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
+from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli import here
 from tests.field.scenes import cloud, splat_set
 from tests.known_voxels import known

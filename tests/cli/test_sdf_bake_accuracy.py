@@ -10,8 +10,8 @@ import trimesh
 
 from splatctrl_cli.cli.field_held_out import split_cameras
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.simulate.truth import load_truth
+from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import splat_set
 
 BOX = np.array([[0.4, -0.15, -0.05], [0.7, 0.15, 0.2]])

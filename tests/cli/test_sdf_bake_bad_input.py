@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.grid import read_npz
-from splatctrl_cli.io.splats import write_ply
+from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.records import Label, SplatSet
+from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 
 BOX = "--box=-0.2,-0.2,-0.2,0.2,0.2,0.2"

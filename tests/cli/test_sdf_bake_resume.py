@@ -18,8 +18,8 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field import layout, slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.layout import GridLayout
-from splatctrl_cli.io.grid_slabs import GridSlabs
-from splatctrl_cli.io.splats import write_ply
+from splatctrl_cli.grid_files.grid_slabs import GridSlabs
+from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 
 OPTIONS = ["--voxel", "0.03", "--set", "field.max_loss=1", "--channels", "gradient,bound,observed,label,se", "-q"]
@@ -96,7 +96,7 @@ def test_a_bake_stopped_while_it_writes_files_goes_on(
     splats: Path, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splatctrl_cli.io.grid_formats.write_vti", interrupted_write)
+        patch.setattr("splatctrl_cli.grid_files.grid_formats.write_vti", interrupted_write)
         assert bake(splats, tmp_path / "field") == 130
     assert (tmp_path / "field.partial" / "left over").is_file()
     monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake
@@ -118,7 +118,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field import layout, slabs
 from splatctrl_cli.field.layout import GridLayout
-from splatctrl_cli.io.grid_slabs import GridSlabs
+from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 slabs.SLAB_BYTES, real, calls = 1, GridSlabs.write, []
 def write(self, slab):
     real(self, slab)

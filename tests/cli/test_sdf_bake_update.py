@@ -11,9 +11,9 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.field import slabs
-from splatctrl_cli.io.scene_writer import SceneWriter
-from splatctrl_cli.io.splats import write_ply
 from splatctrl_cli.records import OccupancyGrid, SplatSet
+from splatctrl_cli.scene_files.scene_writer import SceneWriter
+from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 from tests.known_voxels import known
 

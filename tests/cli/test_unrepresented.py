@@ -10,10 +10,10 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.explain import UNREPRESENTED
-from splatctrl_cli.io.grid import read_npz
-from splatctrl_cli.io.scene_folder import open_scene
+from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.jobs.known_scene import from_splats, splat_fields
 from splatctrl_cli.records import Balls, Float64, KnownVoxels, Label
+from splatctrl_cli.scene_files.scene_folder import open_scene
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
 from tests.reference.unrepresented import unrepresented
 

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.field_pictures import gradient_picture, probability_picture, slices_picture
 from splatctrl_cli.records import DistanceGrid, VoxelState
+from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
 
 SHAPE = (40, 30, 20)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.evaluate.methods_picture import methods_picture
+from splatctrl_cli.report.methods_picture import methods_picture
 
 
 def test_every_curve_is_drawn_whatever_its_length_and_gaps(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.evaluate.pictures import (
+from splatctrl_cli.records import DistanceGrid, UInt8
+from splatctrl_cli.report.pictures import (
     ComparisonRow,
     comparison_picture,
     field_slice_picture,
 )
-from splatctrl_cli.records import DistanceGrid, UInt8
 
 
 def row(depth_error: float) -> ComparisonRow:

@@ -8,7 +8,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.replay_pictures import clearance_picture, commands_picture, open_loop_picture
+from splatctrl_cli.report.replay_pictures import clearance_picture, commands_picture, open_loop_picture
 
 NUM = 6000  # states: more than a picture has columns
 SECONDS = np.linspace(0, 5, NUM)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate import time_axis
-from splatctrl_cli.evaluate.time_axis import SHORTEST, column, envelope, spans
+from splatctrl_cli.report import time_axis
+from splatctrl_cli.report.time_axis import SHORTEST, column, envelope, spans
 
 
 def test_a_short_series_is_drawn_as_it_is() -> None:

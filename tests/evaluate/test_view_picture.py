@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.pictures import ComparisonRow
-from splatctrl_cli.evaluate.view_picture import renders_picture, view_picture
 from splatctrl_cli.records import UInt8
+from splatctrl_cli.report.pictures import ComparisonRow
+from splatctrl_cli.report.view_picture import renders_picture, view_picture
 
 H, W = 30, 40
 

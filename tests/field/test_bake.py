@@ -11,7 +11,7 @@ from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
 from splatctrl_cli.field.layout import GridLayout, bounding_box
-from splatctrl_cli.io.grid import write_npz
+from splatctrl_cli.grid_files.grid import write_npz
 from splatctrl_cli.records import SWEPT, Box, DistanceGrid, Float64, Label, OccupancyGrid
 from tests.field.scenes import cloud, splat_set
 from tests.reference import field as reference

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatctrl_cli.io.output import part_digests, write_json
-from splatctrl_cli.io.scene_writer import SceneWriter
+from splatctrl_cli.files.output import part_digests, write_json
 from splatctrl_cli.records import Balls, Float64, JointState, KnownVoxels, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.textures import Texture
 from splatctrl_cli.simulate.truth import Truth, truth_document

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.io.output import part_digests, write_json
-from splatctrl_cli.io.splats import read_ply, write_ply
+from splatctrl_cli.files.output import part_digests, write_json
 from splatctrl_cli.records import SplatSet, VoxelState
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.splat_files.splats import read_ply, write_ply
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
-from tests.io.make_states import states_of, write_mcap
 from tests.jobs.stage import FAR, Stage, decisive, states_on
 from tests.known_voxels import known
+from tests.logs.make_states import states_of, write_mcap
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 

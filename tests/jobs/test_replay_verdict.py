@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.checks.state_offset import ClockOffset
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
-from splatctrl_cli.io.grid import read_npz, write_npz
-from splatctrl_cli.io.state_offset import ClockOffset
+from splatctrl_cli.grid_files.grid import read_npz, write_npz
 from splatctrl_cli.jobs import replay as job
 from splatctrl_cli.records import Box, VoxelState
 from splatctrl_cli.robot.model import RobotModel

@@ -11,12 +11,11 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.io.options import SourceOptions
-from splatctrl_cli.io.source import open_source
 from splatctrl_cli.jobs import replay_files, replay_robot
 from splatctrl_cli.jobs.reconstruct import ReconstructRequest, reconstruct
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Intrinsics, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, coverage_deficit
 from splatctrl_cli.robot.model import RobotModel
@@ -25,6 +24,7 @@ from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive, Track
 from splatctrl_cli.simulate.render import Camera
+from splatctrl_cli.sources.source import open_source
 from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, least_clearance
 from tools.hunt.families import FAMILIES, ORDER, Draft
 from tools.hunt.faults import spheres_yaml

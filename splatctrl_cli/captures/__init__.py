@@ -1,0 +1,1 @@
+"""Our own recordings on disk: written, read, packed, resumed."""

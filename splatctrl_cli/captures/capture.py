@@ -1,0 +1,251 @@
+"""``X.capture/``: a recording as a plain folder of images, poses and joints (docs/capture.md)."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.captures.capture_header import check_header
+from splatctrl_cli.captures.capture_index import FileSums, FrameRows
+from splatctrl_cli.captures.capture_joints import read_joints
+from splatctrl_cli.captures.capture_writer import COLUMNS, FORMAT, VERSION, write_capture
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import DAMAGE, npy_of
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.logs.joint_topics import (
+    joints_again,
+    read_topics,
+    with_joints,
+    without_joints,
+)
+from splatctrl_cli.logs.masks import human_mask
+from splatctrl_cli.logs.messages import decode_file, metres
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.shot import Shot, merged
+from splatctrl_cli.records import (
+    Bool,
+    Float32,
+    Float64,
+    Intrinsics,
+    JointState,
+    LossReport,
+    Record,
+    RgbdFrame,
+    UInt8,
+)
+
+__all__ = ["CaptureSource", "is_capture", "read_capture_header", "write_capture"]
+
+INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
+_NOT_FOR_CAPTURES = (
+    *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
+    *("camera_pose_topics", "depth_scale", "root", "holdout", "stamps"),
+)
+_AGAIN = "run `splatctrl ingest` again"
+
+
+class CaptureSource:
+    """Records of a capture folder; a file whose checksum differs is counted as damage and left out.
+
+    joints: a robot's, to be brought together from the topics that the capture kept, as from those of the log itself;
+    without them, or in a capture that kept none, the states are those of joints.npz.
+    """
+
+    def __init__(self, path: Path, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
+        options.refuse(_NOT_FOR_CAPTURES, "a capture", path)
+        self._path = path
+        self.name = path.name
+        header = read_capture_header(path)
+        self.world_frame = str(header["world_frame"])
+        self.has_clock = bool(header["has_clock"])
+        self.joint_names = tuple(header["joint_names"])
+        self._cameras: dict[str, dict[str, Any]] = header["cameras"]
+        self.cameras = tuple(self._cameras) if options.cameras is None else options.cameras
+        for name in self.cameras:
+            if name not in self._cameras:
+                raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(self._cameras)}")
+        self._sums = FileSums(path)
+        self._rows = FrameRows(path / "frames.csv", self.cameras)
+        self._damaged: list[str] = []
+        self._loss = LossReport(**header["loss"])
+        described = header.get("joint_topics")
+        self.joint_topics = None if described is None else read_topics(path, described, self._checked)
+        self._joints: Sequence[JointState] = []
+        if joints is None or self.joint_topics is None:
+            options.refuse(("joint_topic",), "the states of one topic in a capture", path)
+            self._joints = read_joints(path) if self.joint_names else []
+        else:
+            kept = self.joint_topics
+            self.joint_names, self._joints, loss = joints_again(kept, options, joints)
+            others = without_joints(self._loss, kept.loss, kept.first_note)
+            self._loss = with_joints(others, loss, kept.first_note)
+
+    @property
+    def loss(self) -> LossReport:
+        """What `ingest` could not take, and what has been damaged since."""
+        loss = self._loss
+        return replace(loss, damaged=loss.damaged + len(self._damaged), notes=[*loss.notes, *self._damaged])
+
+    def records(self) -> Iterator[Record]:
+        """Joint states and frames by stamp."""
+        for item in self.shots():
+            yield item.frame if isinstance(item, Shot) else item
+
+    def shots(self) -> Iterator[Shot | JointState]:
+        """Joint states and shots by stamp."""
+        self._damaged = []
+        return merged(self._joints, self._shots())
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every row of frames.csv."""
+        return ((int(row["stamp_ns"]), row["camera"], _pose(row)) for row in self._rows)
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of SHA256SUMS, which covers every file."""
+        return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS")}
+
+    def __len__(self) -> int:
+        """Frames that `shot_at` knows."""
+        return len(self._rows)
+
+    def shot_at(self, number: int) -> Shot | None:
+        """A frame by its number among those of `cameras`, without reading others; None where it is damaged."""
+        return self._shot(self._rows[number])
+
+    def row(self, number: int) -> Mapping[str, str]:
+        """What frames.csv says of a frame, by its number."""
+        return self._rows[number]
+
+    def states(self) -> Sequence[JointState]:
+        """The joint states, by stamp."""
+        return self._joints
+
+    def _shots(self) -> Iterator[Shot]:
+        for row in self._rows:
+            shot = self._shot(row)
+            if shot is not None:
+                yield shot
+
+    def _shot(self, row: Mapping[str, str]) -> Shot | None:
+        """The frame of a row; None, and counted, where an image is not as it was written."""
+        color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
+        human_bytes = self._read(row["human"]) if row.get("human") else None
+        camera = self._cameras[row["camera"]]
+        valid = self._valid(row["valid"], camera) if row.get("valid") else None
+        if color_bytes is None or depth_bytes is None or (row.get("valid") and valid is None):
+            return None
+        color, depth = decode_file(color_bytes, color=True), _decode_depth(row["depth"], depth_bytes, camera)
+        if color is None or depth is None:
+            self._damaged.append(f"{row['color']}, {row['depth']}: cannot be decoded")
+            return None
+        if not color.shape[:2] == depth.shape == (camera["height"], camera["width"]):
+            size = f"{camera['width']}x{camera['height']}"
+            self._damaged.append(f"{row['color']}, {row['depth']}: expected images of {size} as capture.json says")
+            return None
+        intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
+        return Shot.of(
+            RgbdFrame(
+                stamp_ns=int(row["stamp_ns"]),
+                camera=row["camera"],
+                color=color,
+                depth=depth,
+                intrinsics=intrinsics,
+                T_world_camera=_pose(row),
+                human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
+                valid=valid,
+            ),
+            color_file=color_bytes,
+            depth_unit=camera["depth_scale"] if row["depth"].endswith(".png") else None,
+            origin=row["source"],
+        )
+
+    def _valid(self, name: str, camera: Mapping[str, Any]) -> Bool | None:
+        data = self._read(name)
+        pixels = None if data is None else decode_file(data, color=False)
+        if data is not None and (pixels is None or pixels.shape != (camera["height"], camera["width"])):
+            self._damaged.append(f"{name}: not a mask of the images' size")
+            return None
+        return None if pixels is None else np.asarray(pixels > 0)
+
+    def _human(self, name: str, data: bytes, intrinsics: Intrinsics) -> UInt8 | None:
+        pixels = decode_file(data, color=False)
+        if pixels is None:
+            self._damaged.append(f"{name}: cannot be decoded")
+            return None
+        return human_mask(pixels, intrinsics, str(self._path / name))
+
+    def _read(self, name: str) -> bytes | None:
+        path = self._path / name
+        if not path.is_file():
+            self._damaged.append(f"{name}: missing")
+            return None
+        data = path.read_bytes()
+        if self._sums.get(name) != hashlib.sha256(data).hexdigest():
+            self._damaged.append(f"{name}: its checksum differs from SHA256SUMS")
+            return None
+        return data
+
+    def _checked(self, name: str) -> Path:
+        """The path of a file that is as it was written. Raises InputError for another."""
+        file = self._path / name
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise InputError(f"{file}: lies outside the capture", remedy=_AGAIN)
+        if not file.is_file() or self._sums.get(name) != sha256(file):
+            raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=_AGAIN)
+        return file
+
+
+def _pose(row: Mapping[str, str]) -> Float64:
+    values = [float(row[key]) for key in COLUMNS[4:11]]
+    return transform_from(values[:3], values[3:])
+
+
+def is_capture(path: Path) -> bool:
+    """Whether a folder holds a capture."""
+    return (path / "capture.json").is_file()
+
+
+def read_capture_header(path: Path) -> dict[str, Any]:
+    """capture.json. Raises InputError where it is not one of ours, or of a newer kind."""
+    file = path / "capture.json"
+    try:
+        header = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(f"{file}: not a splatctrl capture", remedy="expected what `splatctrl ingest` writes")
+    if header.get("version") != VERSION:
+        raise InputError(
+            f"{file}: expected version {VERSION}, got {header.get('version')}", remedy="use a newer splatctrl"
+        )
+    check_header(file, header)
+    _check_index(path)
+    return header
+
+
+def _check_index(path: Path) -> None:
+    """Raises InputError where an index file is not as it was written: nothing in it can be trusted then."""
+    sums = FileSums(path)
+    for name in INDEX_FILES:
+        if not (path / name).is_file():
+            raise InputError(f"{path / name}: missing", remedy="run `splatctrl ingest` again")
+        if sums.get(name) != sha256(path / name):
+            raise InputError(
+                f"{path / name}: its checksum differs from SHA256SUMS", remedy="run `splatctrl ingest` again"
+            )
+
+
+def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | None:
+    if name.endswith(".npy"):
+        try:
+            return np.asarray(npy_of(data), dtype=np.float32)
+        except DAMAGE:
+            return None
+    counts, scale = decode_file(data, color=False), camera.get("depth_scale")
+    return None if counts is None or scale is None else metres(counts, scale)

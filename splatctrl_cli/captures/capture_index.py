@@ -1,0 +1,122 @@
+"""frames.csv and SHA256SUMS of a capture, a row at a time: some fifty bytes of memory a file."""
+
+import csv
+import hashlib
+from array import array
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import BinaryIO
+
+import numpy as np
+
+from splatctrl_cli.captures.capture_writer import COLUMNS, MASKS
+from splatctrl_cli.errors import InputError
+
+SUMS = "SHA256SUMS"
+_FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
+_MOST_ROW = 1 << 16  # bytes of a row
+_AGAIN = "run `splatctrl ingest` again"
+
+
+class FrameRows(Sequence[Mapping[str, str]]):
+    """Rows of frames.csv of some cameras, in its order; each is read when it is asked for."""
+
+    def __init__(self, file: Path, cameras: Collection[str]) -> None:
+        """Raises InputError for a row that is none, or that names a file outside the capture."""
+        self._file = file
+        self._offsets = array("q")
+        try:
+            with file.open("rb") as stream:
+                rows = _rows(stream, 0)
+                _, names = next(rows, (0, []))
+                self._names = tuple(names)
+                if self._names[: len(COLUMNS)] != COLUMNS or self._names[len(COLUMNS) :] not in _FURTHER:
+                    raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy=_AGAIN)
+                for offset, values in rows:
+                    row = self._row(values)
+                    _check(row)
+                    if row["camera"] in cameras:
+                        self._offsets.append(offset)
+        except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
+            raise InputError(f"{file}: cannot be read: {error}", remedy=_AGAIN) from None
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def __getitem__(self, number: int) -> Mapping[str, str]:  # type: ignore[override]
+        """A row by its number. Raises InputError where the file is no longer what it was."""
+        try:
+            with self._file.open("rb") as stream:
+                _, values = next(_rows(stream, self._offsets[number]), (0, []))
+            row = self._row(values)
+            _check(row)
+        except (UnicodeDecodeError, csv.Error, ValueError, TypeError):
+            raise InputError(f"{self._file}: changed while it was read", remedy="try again") from None
+        return row
+
+    def _row(self, values: Sequence[str]) -> Mapping[str, str]:
+        return dict(zip(self._names, values, strict=True))
+
+
+def _check(row: Mapping[str, str]) -> None:
+    """Raise ValueError for what is no frame."""
+    int(row["stamp_ns"])
+    for key in COLUMNS[4:11]:
+        float(row[key])
+    for name in (row["color"], row["depth"], *(row.get(mask) or "" for mask in MASKS)):
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts:
+            raise ValueError(f"{name} lies outside the capture")
+
+
+def _rows(stream: BinaryIO, offset: int) -> Iterator[tuple[int, list[str]]]:
+    """Each row from the byte `offset` on, with the byte at which it begins."""
+    end = offset
+    stream.seek(offset)
+
+    def lines() -> Iterator[str]:
+        nonlocal end
+        while line := stream.readline(_MOST_ROW):
+            end += len(line)
+            yield line.decode("utf-8")
+
+    reader, start = csv.reader(lines(), strict=True), offset
+    for row in reader:
+        if row:
+            yield start, row
+        start = end
+
+
+class FileSums:
+    """SHA256SUMS: the checksum that it says of a file, by name."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError where there is none."""
+        file = folder / SUMS
+        if not file.is_file():
+            raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {_AGAIN}")
+        keys, sums = array("Q"), bytearray()
+        with file.open("rb") as stream:
+            while line := stream.readline(_MOST_ROW):
+                try:
+                    digest = bytes.fromhex(line[:64].decode("ascii"))
+                except ValueError:  # UnicodeDecodeError among them
+                    continue
+                if len(digest) == 32:
+                    keys.append(_key(line[66:].rstrip(b"\r\n")))
+                    sums += digest
+        order = np.argsort(np.frombuffer(keys, dtype=np.uint64), kind="stable")
+        self._keys = np.frombuffer(keys, dtype=np.uint64)[order]
+        self._sums = np.frombuffer(sums, dtype=np.uint8).reshape(-1, 32)[order]
+
+    def get(self, name: str) -> str | None:
+        """The sha256, hexadecimal, that the last line of a name says; None where there is none."""
+        at = int(np.searchsorted(self._keys, np.uint64(_key(name.encode())), side="right")) - 1
+        if at < 0 or int(self._keys[at]) != _key(name.encode()):
+            return None
+        return bytes(self._sums[at]).hex()
+
+
+def _key(name: bytes) -> int:
+    """64 bits of a name; two that share them would make a good file look damaged."""
+    return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")

@@ -1,0 +1,192 @@
+"""A capture as one MCAP of standard messages that viewers open, and back, byte for byte.
+
+Messages are of ROS 2 (CDR): /CAM/color/image/compressed with the file's own bytes, /CAM/depth/image (16UC1 mm where
+the capture counts millimetres, else 32FC1 m), /CAM/*/camera_info, /tf, /joint_states. The depth file's own bytes are
+in /CAM/depth/image/compressedDepth, as image_transport's plugin of that name has them: twelve bytes, then the PNG.
+All other files are attachments, by their path.
+"""
+
+import csv
+import io
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.captures.capture_writer import VERSION
+from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.mcap_file import McapFile
+from splatctrl_cli.containers.mcap_records import ATTACHMENT, BadRecordError, Metadata, parse_record
+from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.unpacked_folder import NewFolder, attachment_at
+from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.logs.mcap_writer import MILLIMETRES, McapLog, mcap_log
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.records import JointState, RgbdFrame
+
+MARK = "splatctrl-capture"  # name of the metadata record
+SUMS = "SHA256SUMS"
+DEPTH_HEAD = bytes(12)  # of compressed_depth_image_transport: its parameters, which 16UC1 does not use
+_TYPES = {".json": "application/json", ".csv": "text/csv", ".npz": "application/zip"}
+METADATA = 0x0C
+_AGAIN = "copy the file again"
+_IMAGES = ("color", "depth", "human")  # columns of frames.csv
+
+
+def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | None = None) -> int:
+    """Write `capture` as the MCAP `out`; returns the number of frames. Raises InputError where a file is damaged."""
+    source = CaptureSource(capture, SourceOptions())
+    with mcap_log(out) as log:
+        log.describe(MARK, {"version": str(VERSION), "name": capture.name})
+        states = iter(source.states())
+        state = next(states, None)
+        for number in range(len(source)):
+            row, shot = source.row(number), source.shot_at(number)
+            if shot is None:
+                raise InputError(f"{capture}: {source.loss.notes[-1]}", remedy="run `splatctrl ingest` again")
+            while state is not None and state.stamp_ns <= shot.frame.stamp_ns:
+                state = _add_state(log, state, source, states)
+            _add_frame(log, shot.frame, shot.depth_unit, {n: capture / row[n] for n in _IMAGES if row.get(n)}, source)
+            if progress is not None:
+                progress(number + 1)
+        while state is not None:
+            state = _add_state(log, state, source, states)
+        images = {row[name] for row in map(source.row, range(len(source))) for name in _IMAGES if row.get(name)}
+        for name in sorted(p.relative_to(capture).as_posix() for p in capture.rglob("*") if p.is_file()):
+            if name not in images:
+                _check_inside(capture, name)
+                media_type = _TYPES.get(PurePosixPath(name).suffix, "application/octet-stream")
+                log.attach(name, media_type, (capture / name).read_bytes())
+    return len(source)
+
+
+def _check_inside(capture: Path, name: str) -> None:
+    """Raise InputError for a link that leads out of the capture: the file behind it would be given away."""
+    if not Path(os.path.realpath(capture / name)).is_relative_to(os.path.realpath(capture)):
+        raise InputError(f"{capture / name}: leads out of the capture", remedy="remove the link")
+
+
+def unpack_capture(packed: Path, folder: Path) -> int:
+    """Write the capture that `packed` holds into the empty `folder`; returns the number of frames.
+
+    Raises InputError where it holds none, where it is damaged, where a name in it is not that of one file below a
+    folder, and where a file is not what SHA256SUMS of the capture says.
+    """
+    damage, names, attachments = Damage(), set[str](), []
+    for part in McapFile(packed).parts(damage):
+        if part.opcode == METADATA:
+            names.add(_metadata_name(part.content))
+        elif part.opcode == ATTACHMENT:
+            attachments.append(part.offset)
+    _check_whole(packed, damage)
+    if MARK not in names:
+        raise InputError(f"{packed}: not a packed capture", remedy="for other logs use `splatctrl ingest`")
+    target = NewFolder(folder)
+    with packed.open("rb") as stream:
+        for offset in attachments:
+            target.write(*attachment_at(stream, offset))
+    num_frames = _unpack_images(folder, packed, target)
+    _check_sums(packed, folder, target.digests)
+    return num_frames
+
+
+def _add_state(
+    log: McapLog, state: JointState, source: CaptureSource, states: Iterator[JointState]
+) -> JointState | None:
+    """Write a state; returns the next."""
+    log.add_joint_state(state, source.joint_names)
+    return next(states, None)
+
+
+def _add_frame(
+    log: McapLog, frame: RgbdFrame, unit: float | None, files: Mapping[str, Path], source: CaptureSource
+) -> None:
+    """All messages of a frame; files by column."""
+    stamp, camera = frame.stamp_ns, frame.camera
+    if stamp < 0:
+        raise InputError(f"{source.name}: stamp {stamp} ns: MCAP has no times before 0", remedy="shift the stamps")
+    frame_id = f"{camera}_optical_frame"
+    log.add_transforms(stamp, [(source.world_frame, frame_id, frame.T_world_camera)], is_static=False)
+    for kind in ("color", "depth"):
+        log.add_camera_info(f"/{camera}/{kind}/camera_info", stamp, frame_id, frame.intrinsics)
+    color = files["color"].read_bytes()
+    form = "png" if color.startswith(b"\x89PNG") else "jpeg"
+    log.add_image_file(f"/{camera}/color/image/compressed", stamp, frame_id, form, color)
+    if unit == 1.0 / MILLIMETRES:
+        pixels: Any = np.rint(frame.depth.astype(np.float64) * MILLIMETRES).astype("<u2")
+        log.add_image(f"/{camera}/depth/image", stamp, frame_id, "16UC1", pixels)
+    else:
+        log.add_image(f"/{camera}/depth/image", stamp, frame_id, "32FC1", frame.depth.astype("<f4"))
+    depth, is_png = files["depth"].read_bytes(), files["depth"].suffix == ".png"
+    topic = f"/{camera}/depth/image/compressedDepth" if is_png else f"/{camera}/depth/file"
+    data = DEPTH_HEAD + depth if is_png else depth
+    log.add_image_file(topic, stamp, frame_id, "16UC1; compressedDepth png" if is_png else "npy", data)
+    if "human" in files:
+        log.add_image_file(f"/{camera}/people/mask/compressed", stamp, frame_id, "png", files["human"].read_bytes())
+
+
+def _unpack_images(folder: Path, packed: Path, target: NewFolder) -> int:
+    """Write the images under the names that frames.csv gives them, in its order."""
+    rows = _rows(packed, folder / "frames.csv")
+    names: dict[str, Iterator[str]] = {}
+    for camera in {row["camera"] for row in rows}:
+        of_camera = [row for row in rows if row["camera"] == camera]
+        depth = [row["depth"] for row in of_camera]
+        names[f"/{camera}/color/image/compressed"] = iter([row["color"] for row in of_camera])
+        names[f"/{camera}/depth/image/compressedDepth"] = iter([name for name in depth if name.endswith(".png")])
+        names[f"/{camera}/depth/file"] = iter([name for name in depth if not name.endswith(".png")])
+        masks = [row["human"] for row in of_camera if row.get("human")]
+        names[f"/{camera}/people/mask/compressed"] = iter(masks)
+    damage, decoder = Damage(), MessageDecoder()
+    for message in open_raw_log(packed).messages(damage, set(names)):
+        topic = message.topic.name
+        try:
+            data = bytes(decoder.decode(message).data)
+        except (UndecodableMessageError, AttributeError, TypeError, ValueError) as error:
+            raise InputError(f"{packed}: cannot be unpacked: {error}", remedy=_AGAIN) from None
+        name = next(names[topic], None)
+        if name is None:
+            raise InputError(f"{packed}: {topic} has more images than frames.csv has rows", remedy=_AGAIN)
+        target.write(name, [data[len(DEPTH_HEAD) :] if topic.endswith("/compressedDepth") else data])
+    _check_whole(packed, damage)
+    return len(rows)
+
+
+def _metadata_name(content: bytes) -> str:
+    try:
+        record = parse_record(METADATA, content)
+    except BadRecordError:
+        return ""
+    return record.name if isinstance(record, Metadata) else ""
+
+
+def _rows(packed: Path, file: Path) -> list[dict[str, str]]:
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+    except (FileNotFoundError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{packed}: its frames.csv cannot be read: {error}", remedy=_AGAIN) from None
+    if any(row.get(name) is None for row in rows for name in ("camera", "color", "depth")):
+        raise InputError(f"{packed}: its frames.csv lacks a camera or an image", remedy=_AGAIN)
+    return rows
+
+
+def _check_whole(packed: Path, damage: Damage) -> None:
+    if damage.count:
+        raise InputError(f"{packed}: cannot be unpacked: {damage.notes[0]}", remedy=_AGAIN)
+
+
+def _check_sums(packed: Path, folder: Path, written: Mapping[str, str]) -> None:
+    """Raise InputError where a file that SHA256SUMS names is missing or another."""
+    file = folder / SUMS
+    if not file.is_file():
+        raise InputError(f"{packed}: {SUMS} is missing", remedy=_AGAIN)
+    for line in io.StringIO(file.read_text(encoding="utf-8", errors="replace")):
+        digest, name = line[:64], line[66:].rstrip("\n")
+        if written.get(name) != digest:
+            what = "is missing" if name not in written else "differs from what was packed"
+            raise InputError(f"{packed}: {name} {what}", remedy=_AGAIN)

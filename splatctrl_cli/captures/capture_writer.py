@@ -1,0 +1,252 @@
+"""Writes a capture folder (docs/capture.md) frame by frame, in bounded memory; what was interrupted goes on."""
+
+import csv
+import hashlib
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.lib import format as npy
+
+from splatctrl_cli.captures.capture_journal import Entry, Journal, check_same_frame
+from splatctrl_cli.errors import InputError, WriteError
+from splatctrl_cli.files.checksums import Checksums
+from splatctrl_cli.files.output import sha256, write_json
+from splatctrl_cli.files.rows import Table, blocks_of
+from splatctrl_cli.geometry import quat_from_rotation
+from splatctrl_cli.logs.joint_topics import FOLDER, JointTopics, write_topics
+from splatctrl_cli.logs.messages import metres
+from splatctrl_cli.logs.shot import Shot, ShotSource
+from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
+from splatctrl_cli.records import Float32, JointState, LossReport
+
+FORMAT, VERSION = "splatctrl-capture", 1
+COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
+MASKS = ("human", "valid")  # further columns, where the recording has such masks
+PROVENANCE = "provenance.csv"
+PLACE = ("file", "offset", "log_time_ns")
+PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
+FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
+FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
+PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSummary:
+    """What was written; num_resumed: frames of an earlier run."""
+
+    num_frames: dict[str, int]
+    num_joint_states: int
+    loss: LossReport
+    num_resumed: int = 0
+
+
+def write_capture(
+    folder: Path,
+    source: ShotSource,
+    *,
+    topics: JointTopics | None = None,
+    progress: Callable[[int], None] | None = None,
+    identity: Mapping[str, Any] | None = None,
+) -> CaptureSummary:
+    """Write all of `source` into `folder`; the same input gives the same bytes.
+
+    The folder is empty, or what an interrupted run left: its frames are not written again. JPEG and PNG colour is
+    kept byte for byte where its pixels are the frame's; depth becomes 16-bit PNG in the unit it was recorded in, or
+    .npy [m] where no unit holds it. topics: the joint states as they were recorded, beside those of `source`, which
+    are of one topic. Raises InputError when the source yields no frame, UsageError where the frames that are there
+    are not the source's.
+    """
+    states = StateCollector(len(source.joint_names))
+    cameras: dict[str, dict[str, Any]] = {}
+    num_states = num_resumed = 0
+    with Journal(folder, identity or {}) as journal:
+        for item in source.shots():
+            if isinstance(item, JointState):
+                states.add(item)
+                num_states += 1
+                continue
+            row, kept = _row(item, cameras), journal.kept()
+            if kept is None:
+                journal.add(_write_shot(folder, item, row, cameras[item.camera]))
+            else:
+                check_same_frame(folder, kept.row, row)
+                num_resumed += 1
+            if progress is not None:
+                progress(journal.num_entries)
+        if not journal.num_entries:
+            raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": source.name,
+            "world_frame": source.world_frame,
+            "units": {"length": "m", "time": "ns", "angle": "rad"},
+            "pose": "T_world_camera, optical frame (x right, y down, z forward), quaternion x y z w",
+            "pixels": "pixel (0, 0) is centred at u = v = 0",
+            "has_clock": source.has_clock,
+            "cameras": cameras,
+            "joint_names": list(source.joint_names),
+            "sources": source.digests(),
+            "loss": asdict(source.loss),
+        }
+        _write_joints(folder / "joints.npz", states.columns())
+        _write_index(folder, header, journal, topics)
+        journal.remove()
+    return CaptureSummary(
+        num_frames={name: camera["num_frames"] for name, camera in cameras.items()},
+        num_joint_states=num_states,
+        loss=source.loss,
+        num_resumed=num_resumed,
+    )
+
+
+def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None) -> None:
+    """frames.csv, provenance.csv, joint topics, capture.json and SHA256SUMS, which names everything but itself."""
+    names = ["joints.npz", "frames.csv"]
+    columns = (*COLUMNS, *(name for name in MASKS if name in journal.masks))
+    with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(entry.row for entry in journal.entries())
+    if journal.has_provenance:
+        names.append(PROVENANCE)
+        with (folder / PROVENANCE).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, PROVENANCE_COLUMNS, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(entry.provenance for entry in journal.entries())
+    if topics is not None and topics.topics:
+        shutil.rmtree(folder / FOLDER, ignore_errors=True)  # what an interrupted run left
+        header = header | {"joint_topics": write_topics(folder, topics, names.append)}
+    write_json(folder / "capture.json", header)
+    sums = Checksums()
+    for entry in journal.entries():
+        for digest, name in entry.sums:
+            if name.startswith("valid/"):  # not in the order of frames, which share that of their lens
+                sums.add_other(digest, name)
+            else:
+                sums.add(digest, name)
+    for name in [*names, "capture.json"]:
+        sums.add_other(sha256(folder / name), name)
+    sums.write(folder / "SHA256SUMS")
+
+
+def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """The frame's row of frames.csv, but for the suffixes of its files; its camera is counted."""
+    if shot.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(shot.camera):
+        raise InputError(f"{shot.origin}: camera {shot.camera!r}: cannot name a folder", remedy="name it otherwise")
+    unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
+    lens = vars(shot.intrinsics)
+    camera = cameras.setdefault(shot.camera, {**lens, "depth_scale": unit, "num_frames": 0})
+    if any(camera[name] != value for name, value in lens.items()):
+        raise InputError(
+            f"{shot.origin}: camera {shot.camera} changes its lens, and a capture holds one of each camera",
+            remedy="leave --holdout to `reconstruct` and `score`",
+        )
+    camera["num_frames"] += 1
+    T = shot.T_world_camera
+    pose = [repr(float(value)) for value in (*T[:3, 3], *quat_from_rotation(T[:3, :3]))]
+    return {
+        "camera": shot.camera,
+        "stamp_ns": str(shot.stamp_ns),
+        **dict(zip(COLUMNS[4:11], pose, strict=True)),
+        "source": shot.origin,
+    }
+
+
+def _write_shot(folder: Path, shot: Shot, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
+    """Write the images of a frame whose row is without their names."""
+    sums: list[tuple[str, str]] = []
+    stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
+    color = shot.color_file
+    if color is None:
+        color = encoded(cv2.cvtColor(shot.color, cv2.COLOR_RGB2BGR))
+    is_png = color.startswith(b"\x89PNG")
+    color_name = f"color/{shot.camera}/{stem}.{'png' if is_png else 'jpg'}"
+    kind, depth = _depth_file(shot, unit)
+    depth_name = f"depth/{shot.camera}/{stem}.{kind}"
+    files = {color_name: color, depth_name: depth}
+    named = {"color": color_name, "depth": depth_name}
+    if shot.human is not None:
+        named["human"] = f"human/{shot.camera}/{stem}.png"
+        files[named["human"]] = encoded(shot.human * np.uint8(255))
+    if shot.valid is not None:
+        mask = encoded(shot.valid * np.uint8(255))
+        named["valid"] = f"valid/{shot.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
+        files[named["valid"]] = mask
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+        sums.append((hashlib.sha256(data).hexdigest(), name))
+    return Entry(row=row | named, sums=sums, provenance=_provenance(shot, color_name, depth_name))
+
+
+def _provenance(shot: Shot, color: str, depth: str) -> dict[str, str]:
+    """Where the images of a frame were recorded; a byte that is not known stays empty."""
+    if not shot.places:
+        return {}
+    found = {"color": color, "depth": depth}
+    for kind, place in zip(("color", "depth"), shot.places, strict=False):
+        offset = "" if place.offset < 0 else str(place.offset)
+        found |= {f"{kind}_file": place.file, f"{kind}_offset": offset, f"{kind}_log_time_ns": str(place.log_time_ns)}
+    return found
+
+
+def _depth_file(shot: Shot, unit: float) -> tuple[str, bytes]:
+    """Suffix and bytes of the depth image: the recorded PNG where it counts in the camera's unit."""
+    if shot.depth_file is not None and shot.depth_unit == unit:
+        return "png", shot.depth_file
+    counts = _counts(shot.depth, unit, is_exact=shot.depth_unit is not None)
+    return ("npy", _npy(shot.depth)) if counts is None else ("png", encoded(counts))
+
+
+def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:
+    """Depth as uint16 counts of `unit`; None where they would not give the depth back."""
+    if depth.max(initial=0.0) / unit > 65535.5:
+        return None
+    counts = np.round(depth / np.float32(unit)).astype(np.uint16)
+    error = np.abs(metres(counts, unit) - depth).max(initial=0.0)
+    return counts if error <= (0.0 if is_exact else FLOAT_DEPTH_ERROR) else None
+
+
+def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
+    """The PNG file of an image."""
+    is_written, data = cv2.imencode(".png", pixels, PNG)
+    if not is_written:
+        raise WriteError(f"an image of shape {pixels.shape} could not be encoded as PNG")
+    return bytes(data)
+
+
+def _npy(depth: Float32) -> bytes:
+    stream = BytesIO()
+    np.save(stream, np.ascontiguousarray(depth, dtype="<f4"), allow_pickle=False)
+    return stream.getvalue()
+
+
+def _write_joints(path: Path, states: StateColumns) -> None:
+    """joints.npz as numpy.savez would write it, a block at a time."""
+    columns: dict[str, Table | None] = {
+        "position": states.position,
+        "velocity": states.velocity,
+        "commanded_velocity": states.commanded_velocity,
+        "T_base_ee": states.T_base_ee,
+        "T_world_ee": states.T_world_ee,
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        with archive.open("stamp_ns.npy", "w", force_zip64=True) as stream:
+            npy.write_array(stream, states.stamp_ns, allow_pickle=False)
+        for name, rows in columns.items():
+            if rows is None:
+                continue
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                header = {"descr": "<f8", "fortran_order": False, "shape": tuple(rows.shape)}
+                npy.write_array_header_1_0(stream, header)
+                for block in blocks_of(rows):
+                    stream.write(np.ascontiguousarray(block, dtype="<f8").tobytes())

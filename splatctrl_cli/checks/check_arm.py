@@ -1,0 +1,203 @@
+"""Whether depth images show the arm where forward kinematics puts it, and if not, what would put it right."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from splatctrl_cli.checks.check_images import strided_lens
+from splatctrl_cli.checks.finding import Finding, note, warning
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+
+NEAR = 0.10  # [m] beyond its surface: something else is seen where the arm should be; nearer by more: it is hidden
+COVER = 0.02  # [m] by which covering spheres may stand before the surface
+MAX_OFFSET = 0.03  # [m]
+MAX_SEEN_THROUGH = 0.25  # of the arm's pixels
+MAX_MISFIT = 0.025  # [m] mean of the pixels' offsets, each cut at NEAR
+MIN_PIXELS = 100
+CLOSE_NS = 100_000_000  # between a frame and the joint states around it
+ROWS = 60  # of an image
+NUM_SWAPPED = 8  # frames that exchanged joints are tried on
+SWAPPED = 0.4  # of the misfit that may remain
+REACH, STEP, FINE = 0.32, 0.04, 0.02  # [s] of clock offsets that are tried, and between them, first and then
+CHEAPER, SAVED = 0.9, 0.0005  # [-], [m] of the misfit at offset 0 that a better one must reach
+MAX_SPREAD, OTHER_SCALE = 0.04, 0.04  # [-] of depth over predicted depth: its spread, and its departure from 1
+Posture = Callable[[int], Float64 | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmAgreement:
+    """Depth minus the rendered depth of the robot's surface, over the pixels that it covers, of one camera's frames.
+
+    median [m] of those within `NEAR`, positive where the robot is measured behind its surface; misfit [m]: mean
+    distance from it (from 0 where it is negative, from `COVER` where it is more), each cut at `NEAR`; seen_through:
+    share of the pixels whose depth lies more than `NEAR` behind; num_pixels with depth; num_frames with joint states;
+    scale: depth over predicted depth where it is one factor for most pixels.
+    """
+
+    median: float
+    misfit: float
+    seen_through: float
+    num_pixels: int
+    num_frames: int
+    scale: float | None = None
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the arm is where the joints say."""
+        is_there = self.seen_through <= MAX_SEEN_THROUGH and abs(self.median) <= MAX_OFFSET
+        return is_there and self.misfit <= MAX_MISFIT
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmTiming:
+    """A camera's clock against that of the joint states, at which its depth images show the arm best: offset [s], and
+    the misfit [m] with it.
+    """
+
+    camera: str
+    offset_s: float
+    misfit: float
+
+
+def posture_at(states: StateColumns) -> Posture:
+    """Joint positions at a time [ns], linearly between states; None where they are too far away."""
+
+    def posture(stamp_ns: int) -> Float64 | None:
+        after = int(np.searchsorted(states.stamp_ns, stamp_ns))
+        near = [
+            i
+            for i in (after - 1, after)
+            if 0 <= i < len(states) and abs(int(states.stamp_ns[i]) - stamp_ns) <= CLOSE_NS
+        ]
+        if not near:
+            return None
+        if len(near) == 1:
+            return states[near[0]].position
+        before, later = states[near[0]], states[near[1]]
+        share = (stamp_ns - before.stamp_ns) / max(later.stamp_ns - before.stamp_ns, 1)
+        return np.asarray((1 - share) * before.position + share * later.position)
+
+    return posture
+
+
+def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
+    """Frames of at most `ROWS` rows."""
+    strides = [max(1, -(-frame.depth.shape[0] // ROWS)) for frame in frames]
+    return [
+        replace(f, depth=f.depth[::s, ::s], color=f.color[::s, ::s], intrinsics=strided_lens(f.intrinsics, s))
+        for f, s in zip(frames, strides, strict=True)
+    ]
+
+
+def arm_agreement(
+    model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture, *, offset_s: float = 0.0
+) -> ArmAgreement | None:
+    """Of one camera's frames; None where too little of the arm is seen. offset_s: its clock against the joints'."""
+    parts: list[Float64] = []
+    for frame in frames:
+        q = posture(frame.stamp_ns - round(offset_s * 1e9))
+        if q is None:
+            continue
+        T_world_link = model.surface.poses({link: model.frame_pose(q, link) for link in model.surface.links})
+        predicted = model.surface.render(T_world_link, frame.intrinsics, frame.T_world_camera, frame.depth).depth
+        both = (predicted > 0) & (frame.depth > 0)
+        parts.append(np.stack([frame.depth[both], predicted[both]]).astype(np.float64))
+    rows = np.concatenate(parts, axis=1) if parts else np.zeros((2, 0))
+    if rows.shape[1] < MIN_PIXELS:
+        return None
+    offsets = rows[0] - rows[1]
+    visible = offsets[offsets > -NEAR]  # what is nearer by more hides the arm
+    near = visible[visible < NEAR]
+    behind = float(np.clip(np.median(near), 0.0, COVER)) if len(near) else 0.0
+    ratio = rows[0] / rows[1]
+    scale = float(np.median(ratio))
+    is_scaled = abs(scale - 1) > OTHER_SCALE and np.median(np.abs(ratio / scale - 1)) < MAX_SPREAD / 2
+    if len(visible) < MIN_PIXELS and not is_scaled:
+        return None
+    return ArmAgreement(
+        median=float(np.median(near)) if len(near) else float("inf"),
+        misfit=float(np.minimum(np.abs(visible - behind), NEAR).mean()) if len(visible) else NEAR,
+        seen_through=float((visible > NEAR).mean()) if len(visible) else 0.0,
+        num_pixels=rows.shape[1],
+        num_frames=len(parts),
+        scale=scale if is_scaled else None,
+    )
+
+
+def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> ArmTiming | None:
+    """Of one camera; None where no offset shows the arm much better than another, or the best is at the edge."""
+
+    def misfit(offset: float) -> float:
+        agreement = arm_agreement(model, frames, posture, offset_s=offset)
+        return NEAR if agreement is None else agreement.misfit
+
+    tried = np.round(np.arange(-REACH, REACH + STEP / 2, STEP), 3)
+    costs = np.array([misfit(float(offset)) for offset in tried])
+    best = int(np.argmin(costs))
+    if best in {0, len(tried) - 1} or costs[best] > MAX_MISFIT:
+        return None
+    ends = min(costs[max(best - 4, 0)], costs[min(best + 4, len(tried) - 1)])
+    if costs[best] > CHEAPER * ends or ends - costs[best] < SAVED:
+        return None
+    near = np.round(np.arange(tried[best] - STEP, tried[best] + STEP + FINE / 2, FINE), 3)
+    fine = np.array([misfit(float(offset)) for offset in near])
+    low = int(np.argmin(fine[1:-1])) + 1
+    before, least, after = fine[low - 1 : low + 2]
+    bend = before - 2 * least + after
+    shift = float(np.clip(0.5 * FINE * (before - after) / bend, -FINE, FINE)) if bend > 0 else 0.0
+    return ArmTiming(camera=frames[0].camera, offset_s=float(near[low]) + shift, misfit=float(least))
+
+
+def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
+    """Two joints that, exchanged, put the arm where the depth images show it; None where there are no such."""
+    few = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), NUM_SWAPPED)).astype(int))]
+    plain = arm_agreement(model, few, posture)
+    best: tuple[float, tuple[int, int]] | None = None
+    for i, j in combinations(range(model.num_joints), 2):
+        agreement = arm_agreement(model, few, _exchanged(posture, i, j))
+        if agreement is not None and agreement.is_good and (best is None or agreement.misfit < best[0]):
+            best = agreement.misfit, (i, j)
+    if best is None or plain is None or best[0] > SWAPPED * plain.misfit:
+        return None
+    return best[1]
+
+
+def _exchanged(posture: Posture, i: int, j: int) -> Posture:
+    def exchanged(stamp_ns: int) -> Float64 | None:
+        q = posture(stamp_ns)
+        if q is None:
+            return None
+        q = q.copy()
+        q[[i, j]] = q[[j, i]]
+        return q
+
+    return exchanged
+
+
+def arm_finding(where: str, agreement: ArmAgreement) -> Finding:
+    """One sentence on a camera that shows the arm where the joints say, but for its scale."""
+    share = f"{100 * agreement.seen_through:.0f} % of {agreement.num_pixels} pixels"
+    seen = f"in {agreement.num_frames} depth images {share} show what is behind it"
+    if agreement.is_good and agreement.scale is None:
+        text = f"depth shows the arm {1e3 * agreement.median:+.0f} mm behind its surface (median); {seen}"
+        return note("arm", where, text, value=round(1e3 * agreement.median, 1), unit="mm")
+    assert agreement.scale is not None
+    text = f"depth shows the arm at {agreement.scale:.3g} times the distance that the joints say"
+    remedy = f"multiply --depth-scale by {1 / agreement.scale:.3g}, or check --base and the camera's pose"
+    return warning("arm", where, text, remedy, value=round(agreement.scale, 3))
+
+
+def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
+    """Of cameras that show the arm elsewhere; cause: what would put it right, if known."""
+    where = f"camera{'s' if len(bad) > 1 else ''} {', '.join(bad)}"
+    off = ", ".join(f"{1e3 * agreement.misfit:.0f}" for agreement in bad.values())
+    through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
+    text = f"the arm is not where the joints say: {off} mm off in the mean (each pixel counted as"
+    text = f"{text} {1e3 * NEAR:.0f} mm at most); {through} % of its pixels show what is behind it"
+    remedy = cause or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong"
+    worst = max(agreement.misfit for agreement in bad.values())
+    return warning("arm", where, text, remedy, value=round(1e3 * worst, 1), unit="mm")

@@ -1,0 +1,181 @@
+"""Whether intrinsics fit the images, distortion is known, and tf places every frame."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from splatctrl_cli.checks.finding import Finding, error, note, warning
+from splatctrl_cli.logs.decoder import CAMERA_INFO
+from splatctrl_cli.logs.options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS
+from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
+from splatctrl_cli.logs.tf_tree import MAX_GAP_NS
+from splatctrl_cli.records import Float64, Intrinsics
+
+SAME_FACTOR = 0.1  # by which both factors of another size may differ
+CENTRE = 0.15  # of the image's size that a principal point may be off its middle
+RATIO = 0.05  # by which fx / fy may differ from 1
+FIELD_OF_VIEW = (20.0, 140.0)  # [deg], horizontal
+MAX_POSES = 20_000  # of a camera that are looked up
+JUMP = 0.2  # [m] in a frame, as `reconstruct` refuses them
+JUMP_RATIO = 10.0  # times the median step
+NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+
+
+def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Finding]:
+    """Focal lengths and principal point against the image's size; source: what says them."""
+    found: list[Finding] = []
+    says = f"{source}: " if source else ""
+    remedy = "calibrate again, or give the CameraInfo of this very stream (a crop or another size has its own)"
+    off = [(c + 0.5) / size - 0.5 for c, size in ((lens.cx, lens.width), (lens.cy, lens.height))]
+    if max(map(abs, off)) > CENTRE:
+        worst = max(off, key=abs)
+        text = f"{says}cx, cy = {lens.cx:.1f}, {lens.cy:.1f} px of {lens.width}x{lens.height}"
+        text, make = f"{text}: {100 * abs(worst):.0f} % off the middle of the image", warning
+        times = [2 * (share + 0.5) for share in off]
+        if abs(times[0] / times[1] - 1) < SAME_FACTOR:
+            factor = float(np.mean(times))
+            size = f"{factor * lens.width:.0f}x{factor * lens.height:.0f}"
+            text, remedy = f"{text}, as if calibrated at about {size}", f"scale K by {1 / factor:.3g}, or {remedy}"
+            make = error
+        found.append(make("principal-point", where, text, remedy, value=round(100 * worst, 1), unit="%"))
+    ratio = lens.fx / lens.fy
+    if abs(ratio - 1) > RATIO:
+        text = (
+            f"{says}fx / fy = {ratio:.3f} ({lens.fx:.1f}, {lens.fy:.1f} px): pixels are square in every RGB-D camera"
+        )
+        found.append(warning("focal-ratio", where, text, remedy, value=ratio))
+    angle = math.degrees(2 * math.atan(0.5 * lens.width / lens.fx))
+    low, high = FIELD_OF_VIEW
+    if not low <= angle <= high:
+        text = (
+            f"{says}field of view {angle:.0f} deg (fx {lens.fx:.1f} of {lens.width} px): expected {low:g} to {high:g}"
+        )
+        found.append(warning("field-of-view", where, text, remedy, value=angle, unit="deg"))
+    return found
+
+
+def calibration_findings(found: Survey, cameras: Sequence[CameraTopics], changed: dict[str, int]) -> list[Finding]:
+    """CameraInfo topics of the log; `changed`: stamps at which one first differs from its first message."""
+    findings: list[Finding] = []
+    used = {name for camera in cameras for name in (camera.info, camera.depth_info)}
+    for entry in found.of_type(CAMERA_INFO):
+        name, calibration = entry.topic.name, entry.calibration
+        if calibration is None:
+            text = "K is zero: the camera was never calibrated"
+            remedy = "calibrate it, or record the driver's factory values"
+            make = note if cameras and all(camera.info for camera in cameras) else warning
+            findings.append(make("uncalibrated", name, text, remedy))
+            continue
+        if name in changed:
+            text = "the CameraInfo changes within the log; the first is used for all frames"
+            remedy = "split the log there, or record with one setting"
+            findings.append(warning("camera-info-changes", name, text, remedy, stamp_ns=changed[name]))
+        if name in used:
+            findings += _distortion(name, calibration)
+    for camera in cameras:
+        findings += _sizes(found, camera)
+        findings += _rivals(found, camera)
+    return findings
+
+
+def _distortion(name: str, calibration: Calibration) -> list[Finding]:
+    d, model = calibration.distortion, SAME_MODELS.get(calibration.distortion_model, calibration.distortion_model)
+    if not np.any(np.abs(d) > 1e-9):
+        return []
+    if model not in DISTORTION_MODELS:
+        remedy = f"rectify the images first; known: {', '.join(DISTORTION_MODELS)}"
+        return [error("distortion", name, f"distortion model {model!r} is unknown", remedy)]
+    if len(d) not in NUM_DISTORTION[model]:
+        expected = " or ".join(map(str, NUM_DISTORTION[model]))
+        text = f"{model} with {len(d)} coefficients, expected {expected}"
+        return [warning("distortion", name, text, "calibrate again", value=len(d))]
+    figures = ", ".join(f"{v:.4g}" for v in d[:5])
+    return [note("distortion", name, f"{model} ({figures}): ingest undistorts, images do not pass through unchanged")]
+
+
+def _sizes(found: Survey, camera: CameraTopics) -> list[Finding]:
+    findings = []
+    for topic, info in ((camera.color, camera.info), (camera.depth, camera.depth_info or camera.info)):
+        image = found.topics[topic].first_image
+        calibration = found.topics[info].calibration if info else None
+        if image is None or calibration is None or calibration.width == 0:
+            continue
+        if (image.width, image.height) != (calibration.width, calibration.height):
+            text = f"{topic} is {image.width}x{image.height}, its CameraInfo {calibration.width}x{calibration.height}"
+            remedy = "record the CameraInfo of this stream, or name it with --camera"
+            findings.append(error("camera-info-size", info, text, remedy))
+    return findings
+
+
+def _rivals(found: Survey, camera: CameraTopics) -> list[Finding]:
+    """Other CameraInfo topics of the colour image's frame and size that say something else."""
+    chosen = found.topics[camera.info].calibration if camera.info else None
+    if chosen is None:
+        return []
+    rivals = [t for t in found.of_type(CAMERA_INFO) if _is_rival(t, camera, chosen)]
+    return [
+        warning(
+            "camera-info-two",
+            f"camera {camera.name}",
+            f"{rival.topic.name} has the frame and size of {camera.info}, but another K: the latter is used",
+            "name the right one with --camera NAME=COLOR,DEPTH,INFO",
+        )
+        for rival in rivals
+    ]
+
+
+def _is_rival(entry: TopicSurvey, camera: CameraTopics, chosen: Calibration) -> bool:
+    other = entry.calibration
+    if other is None or entry.topic.name in (camera.info, camera.depth_info):
+        return False
+    is_same_view = (other.width, other.height, other.frame_id) == (chosen.width, chosen.height, chosen.frame_id)
+    return is_same_view and not np.allclose(other.K, chosen.K, rtol=1e-3)
+
+
+def tf_findings(found: Survey, cameras: Sequence[CameraTopics], options: SourceOptions) -> list[Finding]:
+    """Separate trees, frames with two parents."""
+    roots = found.tf.roots
+    findings = [warning("tf-parents", "tf", text, "let one node publish each frame") for text in found.tf.notes]
+    if len(roots) > 1:
+        frames = {camera.name: _frame(found, camera.color) for camera in cameras}
+        trees = {found.tf.root_of(frame) for frame in frames.values() if frame in found.tf.frames}
+        text = f"{len(roots)} separate trees, with roots {', '.join(roots[:6])}"
+        if len(trees) > 1 and not options.camera_poses:
+            remedy = "record the transform that joins them (hand-eye calibration), or choose with --cameras"
+            findings.append(error("tf-roots", "tf", f"{text}; the cameras hang in more than one", remedy))
+        else:
+            findings.append(note("tf-roots", "tf", text, "give --world-frame if the wrong one is taken"))
+    return findings
+
+
+def _frame(found: Survey, topic: str) -> str:
+    image = found.topics[topic].first_image
+    return "" if image is None else image.frame_id
+
+
+def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 | None]) -> list[Finding]:
+    """Frames that nothing places, and jumps; stamps in order."""
+    findings: list[Finding] = []
+    lost = [stamp for stamp, T in zip(stamps_ns, poses, strict=True) if T is None]
+    if lost:
+        share = f"{len(lost)} of {len(poses)} images have no pose"
+        severity = error if len(lost) == len(poses) else warning
+        remedy = "tf starts late, ends early, or has a gap of more than 1 s; if it stands still give --camera-pose"
+        findings.append(severity("pose-missing", where, share, remedy, value=len(lost), stamp_ns=lost[0]))
+    known = [(s, T[:3, 3]) for s, T in zip(stamps_ns, poses, strict=True) if T is not None]
+    steps = [
+        (float(np.linalg.norm(b - a)), first)
+        for (first, a), (last, b) in pairwise(known)
+        if last - first <= MAX_GAP_NS
+    ]
+    if steps:
+        longest, at = max(steps)
+        median = float(np.median([step for step, _ in steps]))
+        if longest > max(JUMP, JUMP_RATIO * median):
+            text = f"the camera jumps by {longest:.3g} m from one frame to the next (median {median:.2g} m)"
+            remedy = "two publishers of one frame, or a localisation that was corrected; reconstruct refuses it"
+            findings.append(error("pose-jump", where, text, remedy, value=longest, unit="m", stamp_ns=at))
+    return findings

@@ -1,0 +1,240 @@
+"""What images hold: whether they decode, their encodings and sizes, how much depth and how far."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.checks.finding import Finding, Thinned, error, note, warning
+from splatctrl_cli.logs.messages import MILLIMETRE
+from splatctrl_cli.logs.shot import PLAUSIBLE_DEPTH
+from splatctrl_cli.records import Float32, Intrinsics, UInt8
+
+ROWS = 240  # that a kept depth image has at most
+NUM_KEPT = 12  # depth images of a camera
+COLUMNS = 64  # of a thumbnail, as motion is judged by (state_motion)
+NUM_THUMBNAILS = 300
+NUM_DECODED = 300
+LITTLE_DEPTH, SOME_DEPTH = 0.10, 0.5  # of the pixels
+SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
+TABLE_DEPTH = (0.15, 8.0)  # [m] between which a median is no surprise
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """Every `stride`-th pixel of an image: depth (h, w) [m] or colour (h, w, 3); width, height [px] of all of it."""
+
+    stamp_ns: int
+    stride: int
+    width: int
+    height: int
+    depth: Float32 | None = None
+    color: UInt8 | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thumbnail:
+    """An image of `COLUMNS` columns: depth (h, w) [m] or colour (h, w, 3)."""
+
+    stamp_ns: int
+    depth: Float32 | None = None
+    color: UInt8 | None = None
+
+
+class ImageWatch:
+    """Watches the images of one topic or camera in bounded memory.
+
+    All of the first `NUM_DECODED` images are to be decoded, then every second, fourth, ... (`is_wanted`).
+    """
+
+    def __init__(self, where: str, scale: float | None = None) -> None:
+        self.where, self.scale = where, scale
+        self.count = self.num_decoded = self.num_bad = self.num_without_depth = self.num_invalid = 0
+        self.first_bad_ns: int | None = None
+        self.first_bad = ""
+        self.encodings: Counter[str] = Counter()
+        self.sizes: Counter[tuple[int, int]] = Counter()
+        self.medians: Thinned[float] = Thinned(1000)
+        self.shares: Thinned[float] = Thinned(1000)
+        self.kept: Thinned[Kept] = Thinned(NUM_KEPT)
+        self.thumbnails: list[Thumbnail] = []
+        self._wanted: Thinned[None] = Thinned(NUM_DECODED)
+
+    def is_wanted(self) -> bool:
+        """Whether the image that comes now is to be decoded; to be asked once for each."""
+        is_next = self._wanted.is_next()
+        if is_next:
+            self._wanted.add(None)
+        return is_next
+
+    def add_bad(self, stamp_ns: int, reason: str) -> None:
+        """An image that does not decode."""
+        self.count += 1
+        self.num_bad += 1
+        if self.first_bad_ns is None:
+            self.first_bad_ns, self.first_bad = stamp_ns, reason
+
+    def add_color(self, stamp_ns: int, color: UInt8, encoding: str) -> None:
+        """A colour image (H, W, 3)."""
+        height, width = color.shape[:2]
+        self.add_undecoded(encoding, width, height)
+        self.num_decoded += 1
+        if len(self.thumbnails) < NUM_THUMBNAILS:
+            small = cv2.resize(color, thumbnail_size(width, height), interpolation=cv2.INTER_AREA)
+            self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, color=np.asarray(small, dtype=np.uint8)))
+        if self.kept.is_next():
+            stride = stride_of(height)
+            small = cv2.resize(color, (-(-width // stride), -(-height // stride)), interpolation=cv2.INTER_AREA)
+            small = np.asarray(small, dtype=np.uint8)
+            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, color=small))
+
+    def add_depth(self, stamp_ns: int, depth: Float32, encoding: str, num_invalid: int = 0) -> None:
+        """A depth image (H, W) [m], 0 = none."""
+        height, width = depth.shape
+        self.add_undecoded(encoding, width, height)
+        self.num_decoded += 1
+        self.num_invalid += num_invalid
+        stride = stride_of(height)
+        small = depth[::stride, ::stride]
+        valid = small[small > 0]
+        if self.shares.is_next():
+            self.shares.add(valid.size / small.size)
+        self.num_without_depth += valid.size == 0
+        if self.medians.is_next():
+            self.medians.add(float(np.median(valid)) if valid.size else 0.0)
+        if self.kept.is_next():
+            self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, depth=small.copy()))
+        if len(self.thumbnails) < NUM_THUMBNAILS:
+            size = thumbnail_size(width, height)
+            thumbnail = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
+            self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, depth=thumbnail))
+
+    def rescale(self, scale: float) -> None:
+        """Take [m per count] for what the depths were read with; for a log that says its unit."""
+        read_with = self.scale if self.scale is not None else 1.0 if self.is_float else MILLIMETRE
+        factor = np.float32(scale / read_with)
+        self.scale = scale
+        if factor != 1.0:
+            self.medians.change(lambda median: float(median * factor))
+            self.kept.change(lambda kept: kept if kept.depth is None else replace(kept, depth=kept.depth * factor))
+            changed = [t if t.depth is None else replace(t, depth=t.depth * factor) for t in self.thumbnails]
+            self.thumbnails = changed
+
+    @property
+    def is_float(self) -> bool:
+        """Whether most images are 32FC1."""
+        return self.encodings.most_common(1)[:1] != [] and self.encodings.most_common(1)[0][0] == "32FC1"
+
+    def add_undecoded(self, encoding: str, width: int, height: int) -> None:
+        """An image of an encoding that is not read, or of which only the head is."""
+        self.count += 1
+        self.encodings[encoding] += 1
+        self.sizes[width, height] += 1
+
+
+def stride_of(height: int) -> int:
+    """The rows from one kept row to the next."""
+    return max(1, -(-height // ROWS))
+
+
+def thumbnail_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height [px]."""
+    columns = min(COLUMNS, width)
+    return columns, max(1, round(height * columns / width))
+
+
+def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
+    """The camera of a thumbnail."""
+    width, height = thumbnail_size(lens.width, lens.height)
+    across, down = width / lens.width, height / lens.height
+    cx, cy = (lens.cx + 0.5) * across - 0.5, (lens.cy + 0.5) * down - 0.5
+    return Intrinsics(fx=lens.fx * across, fy=lens.fy * down, cx=cx, cy=cy, width=width, height=height)
+
+
+def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:
+    """The camera of every `stride`-th pixel: pixel (0, 0) stays where it was."""
+    fx, fy, cx, cy = (value / stride for value in (lens.fx, lens.fy, lens.cx, lens.cy))
+    width, height = -(-lens.width // stride), -(-lens.height // stride)
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
+def image_findings(images: ImageWatch) -> list[Finding]:
+    """What is wrong with the images, depth apart."""
+    where, found = images.where, []
+    if images.num_bad:
+        text = f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}"
+        severity = error if images.num_bad == images.count else warning
+        remedy = "they are left out; copy the file again, or look at the recorder"
+        figure = {"value": images.num_bad, "stamp_ns": images.first_bad_ns}
+        found.append(severity("undecodable", where, text, remedy, **figure))
+    if len(images.sizes) > 1:
+        sizes = ", ".join(f"{w}x{h} ({n})" for (w, h), n in images.sizes.most_common(4))
+        remedy = "record one size; frames of another than the camera's are left out"
+        found.append(warning("image-size", where, f"the size of the images changes: {sizes}", remedy))
+    if len(images.encodings) > 1:
+        kinds = ", ".join(f"{name} ({n})" for name, n in images.encodings.most_common(4))
+        text = f"the encoding of the images changes: {kinds}"
+        found.append(warning("encoding", where, text, "record one encoding"))
+    return found
+
+
+def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
+    """That not every image was decoded, where that is so."""
+    few = [images for images in topics if images.num_decoded + images.num_bad < images.count and images.num_decoded]
+    if not few:
+        return []
+    decoded, count = sum(images.num_decoded for images in few), sum(images.count for images in few)
+    text = f"{decoded} of {count} images were decoded, the first {NUM_DECODED} of a topic and fewer and fewer later"
+    text = f"{text}; of the others only head, closing mark and checksum were read"
+    return [note("sampled", "images", text, value=decoded / count)]
+
+
+def depth_findings(images: ImageWatch) -> list[Finding]:
+    """Whether depth is there, and at a plausible distance."""
+    where, found = images.where, []
+    if images.num_without_depth:
+        every = images.num_without_depth == images.num_decoded
+        num = "all" if every else str(images.num_without_depth)
+        text = f"{num} of {images.num_decoded} depth images hold no depth at all"
+        severity = error if every else warning
+        remedy = "is the projector on, and the scene within its range?"
+        found.append(severity("depth-empty", where, text, remedy, value=images.num_without_depth))
+        if every:
+            return found
+    share = float(np.median(list(images.shares)))
+    if share < SOME_DEPTH:
+        severity = warning if share < LITTLE_DEPTH else note
+        text = f"{100 * share:.0f} % of the pixels have depth (median of the images)"
+        remedy = "the rest stays unseen: dark or shiny things, too near, or warped depth with holes"
+        found.append(severity("depth-share", where, text, remedy, value=share))
+    if images.num_invalid:
+        text = f"{images.num_invalid} depth pixels of {images.num_decoded} images are NaN, infinite or negative"
+        text += ": they count as none"
+        found.append(note("depth-invalid", where, text, value=images.num_invalid))
+    return [*found, *_scale(images)]
+
+
+def _scale(images: ImageWatch) -> list[Finding]:
+    medians = [median for median in images.medians if median > 0]
+    if not medians:
+        return []
+    median = float(np.median(medians))
+    used = images.scale if images.scale is not None else 1.0 if images.is_float else MILLIMETRE
+    low, high = PLAUSIBLE_DEPTH
+    if low <= median <= high:
+        near, far = TABLE_DEPTH
+        if near <= median <= far:
+            return []
+        text = f"median depth {median:.3g} m, read as {used:g} m per count: unusual for a robot's table"
+        remedy = "if it is wrong, give --depth-scale"
+        return [note("depth-scale", images.where, text, remedy, value=median, unit="m")]
+    counts = median / used
+    fits = [s for s in SCALES if TABLE_DEPTH[0] <= counts * s <= TABLE_DEPTH[1]]
+    guess = "millimetres stored as floats" if images.is_float and counts > high else ""
+    guess = "metres stored as integers" if not images.is_float and counts < 20 else guess
+    text = f"median depth {median:.4g} m, read as {used:g} m per count: expected {low:g} to {high:g} m"
+    text += f"; {guess}?" if guess else ""
+    remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
+    return [error("depth-scale", images.where, text, remedy, value=median, unit="m")]

@@ -1,0 +1,230 @@
+"""Everything that is wrong with a log, from one pass over it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from splatctrl_cli.checks.check_alignment import alignment_findings
+from splatctrl_cli.checks.check_cameras import calibration_findings, tf_findings
+from splatctrl_cli.checks.check_images import depth_findings, image_findings, sample_findings, thumbnail_lens
+from splatctrl_cli.checks.check_report import CheckReport, damage_findings, needs, usable_frames
+from splatctrl_cli.checks.check_rig import CheckedCamera, camera_findings, checked_camera, nearest, ready
+from splatctrl_cli.checks.check_robot import motion_findings
+from splatctrl_cli.checks.check_states import log_states
+from splatctrl_cli.checks.check_times import (
+    TimesWatch,
+    clock_findings,
+    ending_findings,
+    file_findings,
+    joined_gaps,
+    part_findings,
+    peer_findings,
+    time_findings,
+)
+from splatctrl_cli.checks.check_views import check_views
+from splatctrl_cli.checks.check_watch import LogWatch
+from splatctrl_cli.checks.finding import Finding, Severity, error, note, warning
+from splatctrl_cli.checks.state_motion import ImageMotion
+from splatctrl_cli.containers.raw_log import RawLog
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
+from splatctrl_cli.logs.masks import check_mask_topics
+from splatctrl_cli.logs.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
+from splatctrl_cli.logs.options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.rig import Camera, camera_topics, missing
+from splatctrl_cli.logs.state_messages import STATE_TYPES
+from splatctrl_cli.logs.survey import Survey, survey
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+
+IMAGES = (IMAGE, COMPRESSED_IMAGE)
+SAID = (" are never closer than ", " images as ", "distortion model ")  # lacks that other findings name
+
+
+def check_log(
+    log: RawLog, options: SourceOptions, *, model: RobotModel | None = None, num_images: int | None = None
+) -> CheckReport:
+    """Read `log` once, in bounded memory; with `num_images` up to as many of a topic.
+
+    Raises InputError for options that do not fit the log.
+    """
+    options.refuse(("root", "holdout"), "a log", log.path)
+    watch = LogWatch(log, options, num_images)
+    found = survey(watch, by_log_time=options.stamps == "log")
+    findings = damage_findings(log.path.name, found.damage.notes)
+    findings += file_findings(watch.spans)
+    cameras = _chosen(log, found, options)
+    rig = [(topics, ready(log, found, topics, options)) for topics in cameras]
+    for topics, camera in rig:
+        if camera is not None and camera.depth_scale is not None and topics.depth in watch.images:
+            watch.images[topics.depth].rescale(camera.depth_scale)
+    findings += _time_findings(watch, found, cameras)
+    findings += _image_findings(watch, cameras)
+    findings += calibration_findings(found, cameras, watch.changed_infos)
+    findings += tf_findings(found, cameras, options)
+    for topics, camera in rig:
+        findings += camera_findings(found, topics, camera, options)
+    if any(finding.code == "pose-missing" for finding in findings):
+        findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
+    lacks = _lacks(log, found, options)
+    findings += [error("missing", log.path.name, *_parted(lack)) for lack in lacks]
+    checked = [checked_camera(t, c, watch.images, found.tf, options) for t, c in rig if c is not None]
+    states, states_lack, of_states = log_states(found, options, model)
+    findings += of_states
+    frames = [frame for camera in checked for frame in camera.frames]
+    findings += alignment_findings(frames)
+    frames = usable_frames(frames, findings)
+    views = check_views(frames, {c.camera.name: _unit(watch, c) for c in checked if c.frames})
+    findings += views.findings
+    if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
+        findings += motion_findings(views.corrected, _motion(watch, checked), states, model)
+    if not watch.is_whole:
+        findings.append(note("quick", log.path.name, f"only the first {num_images} images of a topic were read"))
+    first, last = _span(found)
+    return CheckReport(
+        path=str(log.path),
+        kind=log.container,
+        duration_s=(last - first) * 1e-9,
+        num_messages=found.num_messages,
+        start_ns=watch.first_ns,
+        findings=findings,
+        rates=[t.rate(is_read=_is_read(found, name)) for name, t in sorted(watch.times.items())],
+        needs=needs(
+            num_cameras=len(cameras),
+            num_frames=max((images.count for images in watch.images.values()), default=0),
+            states_lack=states_lack,
+        ),
+        frames=views.scaled,
+    )
+
+
+def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
+    """The cameras that the options leave. Raises InputError for one that the log has not."""
+    cameras = camera_topics(log, found, options)
+    names = tuple(camera.name for camera in cameras)
+    if not names:
+        return ()
+    for name in (*(options.cameras or ()), *options.camera_poses, *options.intrinsics):
+        if name not in names:
+            raise InputError(f"{log.path}: no camera {name!r}", remedy=f"use one of: {', '.join(names)}")
+    check_mask_topics(log.path, found, options.human_topics, names)
+    return tuple(c for c in cameras if options.cameras is None or c.name in options.cameras)
+
+
+def _lacks(log: RawLog, found: Survey, options: SourceOptions) -> list[str]:
+    """What keeps `ingest` from the log and no other finding says."""
+    if not found.num_messages:
+        damage = "nothing usable before the damage" if found.damage.count else "the log holds no messages"
+        return [f"{damage}; record it again, or give another file"]
+    return [lack for lack in missing(log, found, options) if not any(words in lack for words in SAID)]
+
+
+def _parted(lack: str) -> tuple[str, str]:
+    """What is lacking, and what to do."""
+    what, _, remedy = lack.rpartition("; ")
+    return (what, remedy) if what else (remedy, "")
+
+
+def _unit(watch: LogWatch, checked: CheckedCamera) -> float | None:
+    """Metres per count of its depth; None for metres."""
+    images = watch.images[checked.topics.depth]
+    return images.scale if images.scale is not None else None if images.is_float else 1e-3
+
+
+def _is_read(found: Survey, name: str) -> bool:
+    return found.topics[name].topic.type_name in (*IMAGES, CAMERA_INFO, *STATE_TYPES, *TRANSFORMS)
+
+
+def _span(found: Survey) -> tuple[int, int]:
+    entries = [t for t in found.topics.values() if t.count]
+    return min((t.first_log_ns for t in entries), default=0), max((t.last_log_ns for t in entries), default=0)
+
+
+def _time_findings(watch: LogWatch, found: Survey, cameras: Sequence[CameraTopics]) -> list[Finding]:
+    names = [n for n, e in sorted(found.topics.items()) if e.topic.type_name in (*IMAGES, *STATE_TYPES)]
+    judged = [name for name in names if name in watch.times and not _is_beside(watch, name, cameras)]
+    times = [watch.times[name] for name in judged]
+    each = [f for t in times for f in time_findings(t, "images" if t.topic in watch.images else "states")]
+    each += [f for edge in watch.transforms.values() for f in _edge_findings(edge)]
+    last_ns = max((t.last_ns for t in times if t.topic in watch.images), default=0)
+    peers = [[watch.times[getattr(camera, kind)] for camera in cameras] for kind in ("color", "depth")]
+    clocks = clock_findings(times)
+    said = {finding.where for finding in clocks if finding.code == "clock-offset"}
+    clocks += [f for topics in peers for f in peer_findings(topics) if f.where not in said]
+    return [
+        *joined_gaps(each),
+        *(part_findings(times) if not any(f.code in {"clock", "clock-offset"} for f in clocks) else ()),
+        *clocks,
+        *ending_findings(list(watch.transforms.values()), last_ns),
+    ]
+
+
+def _edge_findings(edge: TimesWatch) -> list[Finding]:
+    """Of one moving transform: the same as of a topic, a gap under its own name."""
+    return [
+        replace(finding, code="tf-gap") if finding.code == "gap" else finding
+        for finding in time_findings(edge, "transforms")
+    ]
+
+
+def _is_beside(watch: LogWatch, name: str, cameras: Sequence[CameraTopics]) -> bool:
+    """Whether a topic holds images that none of the cameras is made of."""
+    return bool(cameras) and name in watch.images and not any(name in (c.color, c.depth) for c in cameras)
+
+
+def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics]) -> list[Finding]:
+    """Those of topics that no camera is made of are notes: nothing reads them."""
+    findings = []
+    for name, images in sorted(watch.images.items()):
+        its = image_findings(images)
+        kinds = set(images.encodings)
+        unread = sorted(kinds - set(DEPTH_ENCODINGS) - set(COLOR_CONVERSIONS))
+        if unread:
+            text = f"encoding {unread[0]!r} is not read"
+            known = ", ".join((*COLOR_CONVERSIONS, *DEPTH_ENCODINGS))
+            remedy = f"record another topic of this camera, or convert it; read: {known}"
+            its.append(warning("encoding", name, text, remedy))
+        if _is_beside(watch, name, cameras):
+            its = [replace(f, severity=Severity.NOTE, what=f"{f.what}; no camera uses the topic") for f in its]
+        elif kinds & set(DEPTH_ENCODINGS) and images.num_decoded:
+            its += depth_findings(images)
+        findings += its
+    return [*findings, *sample_findings(list(watch.images.values()))]
+
+
+def _motion(watch: LogWatch, cameras: Sequence[CheckedCamera]) -> ImageMotion:
+    """How the first images of each camera change."""
+    motion = ImageMotion()
+    for checked in cameras:
+        if checked.frames and checked.topics.color in watch.images:
+            for frame in _thumbnails(watch, checked.camera, checked):
+                motion.add(frame)
+    return motion
+
+
+def _thumbnails(watch: LogWatch, camera: Camera, checked: CheckedCamera) -> list[RgbdFrame]:
+    """Colour beside depth only where both are of one view."""
+    is_registered = camera.depth_to_color is None
+    colors = watch.images[checked.topics.color].thumbnails if is_registered else []
+    gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
+    at, frames = sorted(gray), []
+    poses = {frame.stamp_ns: frame.T_world_camera for frame in checked.frames}
+    stamps = sorted(poses)
+    for thumbnail in watch.images[checked.topics.depth].thumbnails:
+        near, depth = nearest(at, thumbnail.stamp_ns), thumbnail.depth
+        assert depth is not None
+        color = gray.get(near) if near is not None else None
+        if color is None or color.shape[:2] != depth.shape:
+            color = np.zeros((*depth.shape, 3), np.uint8)
+        frames.append(
+            RgbdFrame(
+                stamp_ns=thumbnail.stamp_ns,
+                camera=camera.name,
+                color=color,
+                depth=depth,
+                intrinsics=thumbnail_lens(camera.intrinsics),
+                T_world_camera=poses[nearest(stamps, thumbnail.stamp_ns) or stamps[0]],
+            )
+        )
+    return frames

@@ -1,0 +1,210 @@
+"""Everything that is wrong with a capture or an image folder, from one pass over its frames."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.captures.capture import is_capture
+from splatctrl_cli.checks.check_alignment import alignment_findings
+from splatctrl_cli.checks.check_cameras import lens_findings, pose_findings
+from splatctrl_cli.checks.check_images import ImageWatch, depth_findings, sample_findings, strided_lens
+from splatctrl_cli.checks.check_report import CheckReport, damage_findings, needs, usable_frames
+from splatctrl_cli.checks.check_robot import motion_findings
+from splatctrl_cli.checks.check_states import robot_findings
+from splatctrl_cli.checks.check_times import TimesWatch, time_findings
+from splatctrl_cli.checks.check_views import check_views
+from splatctrl_cli.checks.finding import Finding, error, note, warning
+from splatctrl_cli.checks.state_motion import ImageMotion
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.shot import Shot, ShotSource
+from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
+from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.sources.source import open_source
+
+_LOST = {
+    "unpaired_color": "colour images without a depth image of their time",
+    "unpaired_depth": "depth images without a colour image of their time",
+    "without_pose": "images without a pose",
+    "without_intrinsics": "images without intrinsics",
+}
+
+
+class _CameraWatch:
+    """What is kept of one camera's frames."""
+
+    def __init__(self, lens: Intrinsics, where: str, unit: float | None) -> None:
+        self.lens, self.unit = lens, unit
+        self.images, self.colors = ImageWatch(where, unit), ImageWatch(where)
+        self.times = TimesWatch(where, has_stamps=False)
+        self.stamps: list[int] = []
+        self.poses: list[Float64] = []
+
+    def add(self, shot: Shot, motion: ImageMotion) -> None:
+        """Take a frame; its images are decoded where they are wanted."""
+        self.times.add(shot.stamp_ns, shot.stamp_ns)
+        self.stamps.append(shot.stamp_ns)
+        self.poses.append(shot.T_world_camera)
+        encoding = "32FC1" if shot.depth_unit is None else "16UC1"
+        if self.images.is_wanted():
+            self.images.add_depth(shot.stamp_ns, shot.depth, encoding)
+            self.colors.add_color(shot.stamp_ns, shot.color, "rgb8")
+            motion.add(shot.frame)
+        else:
+            self.images.add_undecoded(encoding, self.lens.width, self.lens.height)
+
+    def frames(self, camera: str) -> list[RgbdFrame]:
+        """The kept images with their poses; by number, for views of a folder may have no clock."""
+        poses = dict(zip(self.stamps, self.poses, strict=True))
+        pairs = [(d, c) for d, c in zip(self.images.kept, self.colors.kept, strict=True)]
+        return [
+            RgbdFrame(
+                stamp_ns=depth.stamp_ns,
+                camera=camera,
+                color=color.color if color.color is not None else np.zeros((*depth.depth.shape, 3), np.uint8),
+                depth=depth.depth,
+                intrinsics=strided_lens(self.lens, depth.stride),
+                T_world_camera=poses[depth.stamp_ns],
+            )
+            for depth, color in pairs
+            if depth.depth is not None
+        ]
+
+
+def check_source(
+    path: Path, options: SourceOptions, *, model: RobotModel | None = None, num_images: int | None = None
+) -> CheckReport:
+    """Read the frames of `path` once; with `num_images` up to as many of a camera."""
+    kind = "capture" if is_capture(path) else "image folder"
+    try:
+        source = open_source(path, options)
+    except InputError as wrong:
+        return _refused(path, kind if path.is_file() or is_capture(path) else "folder", wrong)
+    cameras: dict[str, _CameraWatch] = {}
+    states = StateCollector(len(source.joint_names))
+    motion = ImageMotion()
+    findings: list[Finding] = []
+    is_whole = True
+    try:
+        for item in source.shots():
+            if isinstance(item, JointState):
+                states.add(item)
+                continue
+            is_whole = _take(item, cameras, motion, num_images)
+            if not is_whole:
+                break
+    except InputError as wrong:
+        findings.append(error("refused", path.name, wrong.message, wrong.remedy))
+    findings += _losses(source, path.name)
+    for name, camera in sorted(cameras.items()):
+        findings += _camera_findings(f"camera {name}", camera, has_clock=source.has_clock)
+    findings += sample_findings([camera.images for _, camera in sorted(cameras.items())])
+    frames = [frame for name, camera in sorted(cameras.items()) for frame in camera.frames(name)]
+    findings += alignment_findings(frames)
+    frames = usable_frames(frames, findings)
+    views = check_views(frames, {name: camera.unit for name, camera in sorted(cameras.items())})
+    findings += views.findings
+    columns = states.columns()
+    states_lack = "" if len(columns) else "no joint states; give them apart (docs/replay.md, Logs)"
+    if len(columns) and source.has_clock:
+        states_lack, of_robot = _robot(source, views.corrected, columns, motion, model)
+        findings += of_robot
+    if not cameras and not any(finding.code == "refused" for finding in findings):
+        findings.append(error("missing", path.name, "no frame could be read", "copy or record it again"))
+    if not is_whole:
+        findings.append(note("quick", path.name, f"only the first {num_images} frames of a camera were read"))
+    return _report(path, kind, source, cameras, len(columns), views.scaled, findings, states_lack)
+
+
+def _take(shot: Shot, cameras: dict[str, _CameraWatch], motion: ImageMotion, num_images: int | None) -> bool:
+    """Watch a frame; False where it was the last that is wanted."""
+    where = f"camera {shot.camera}"
+    camera = cameras.setdefault(shot.camera, _CameraWatch(shot.intrinsics, where, shot.depth_unit))
+    camera.add(shot, motion)
+    return len(camera.stamps) != num_images
+
+
+def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
+    return CheckReport(
+        path=str(path),
+        kind=kind,
+        duration_s=0.0,
+        num_messages=0,
+        start_ns=None,
+        findings=[error("refused", path.name, wrong.message.removeprefix(f"{path}: "), wrong.remedy)],
+        needs=needs(num_cameras=0, num_frames=0, states_lack=""),
+    )
+
+
+def _losses(source: ShotSource, where: str) -> list[Finding]:
+    loss = source.loss
+    findings = damage_findings(where, loss.notes[:50])
+    if not loss.damaged:
+        findings = [note("loss", where, text) for text in loss.notes[:50]]
+    for name, words in _LOST.items():
+        count = getattr(loss, name)
+        if count:
+            code = "pose-missing" if name == "without_pose" else "pairing"
+            findings.append(warning(code, where, f"{count} {words}", "they are left out", value=count))
+    if loss.invalid_depth:
+        text = f"{loss.invalid_depth} depth pixels are NaN, infinite or negative: they count as none"
+        findings.append(note("depth-invalid", where, text, value=loss.invalid_depth))
+    return findings
+
+
+def _camera_findings(where: str, camera: _CameraWatch, *, has_clock: bool) -> list[Finding]:
+    findings = [*lens_findings(where, camera.lens), *depth_findings(camera.images)]
+    if has_clock:
+        findings += time_findings(camera.times, "frames")
+        findings += pose_findings(where, camera.stamps, camera.poses)
+    return findings
+
+
+def _robot(
+    source: ShotSource,
+    frames: Sequence[RgbdFrame],
+    states: StateColumns,
+    motion: ImageMotion,
+    model: RobotModel | None,
+) -> tuple[str, list[Finding]]:
+    """What `replay` lacks, and what is wrong with the joint states."""
+    if model is None:
+        return "", motion_findings(frames, motion, states, None)
+    absent = [name for name in model.joint_names if name not in source.joint_names]
+    if absent:
+        text = f"the robot's joints {', '.join(absent)} are in no joint state"
+        remedy = "give this robot's URDF, or hold them still with --lock"
+        return f"{text}; {remedy}", [error("joints", "joint states", text, remedy)]
+    states = states.of_joints(np.asarray(model.joint_order(source.joint_names), dtype=np.int64))
+    found = robot_findings(model, states, "joint states")
+    return "", [*found, *motion_findings(frames, motion, states, model)]
+
+
+def _report(
+    path: Path,
+    kind: str,
+    source: ShotSource,
+    cameras: dict[str, _CameraWatch],
+    num_states: int,
+    frames: Sequence[RgbdFrame],
+    findings: list[Finding],
+    states_lack: str,
+) -> CheckReport:
+    stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
+    return CheckReport(
+        path=str(path),
+        kind=kind,
+        duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
+        num_messages=len(stamps) + num_states,
+        start_ns=min(stamps, default=None) if source.has_clock else None,
+        findings=findings,
+        rates=[camera.times.rate(is_read=True) for _, camera in sorted(cameras.items())] if source.has_clock else [],
+        needs=needs(
+            num_cameras=len(cameras),
+            num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
+            states_lack=states_lack,
+        ),
+        frames=frames,
+    )

@@ -1,0 +1,309 @@
+"""When the messages of a topic came: rate, gaps, stamps that repeat or go back, header stamps against log times."""
+
+import heapq
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from splatctrl_cli.checks.finding import Finding, Thinned, error, note, warning
+from splatctrl_cli.records import Float64
+
+MAX_KEPT = 4096  # intervals and delays of a topic, however long the log
+MAX_GAPS = 1000  # the longest intervals
+GAP_RATIO = 3.0  # of the median interval
+MIN_GAP = 0.1  # [s]; a shorter gap costs nothing
+REGULAR = 2.0  # times the median that nine of ten intervals must stay under for a topic to have a rate
+AHEAD = 0.020  # [s] that a stamp may be after its log time
+DELAYED = 1.0  # [s] from stamp to log that no driver takes
+APART = 0.2  # [s] between the delays of two topics
+PEERS = 0.060  # [s] between the delays of one kind of images of several cameras
+DRIFT = 0.020  # [s] over the log
+TOGETHER = 0.8  # of the shorter of two pauses that both share
+ENDS = 1.0  # [s] before the last image; or after the first of all topics, before the last
+MUCH = 0.1  # of the log
+FILES_APART = 60.0  # [s]
+_NS = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """A row of the table of rates; is_read: by later commands; hz: median; longest_s: interval between two stamps;
+    delay_s: median of log time minus stamp.
+    """
+
+    topic: str
+    is_read: bool
+    messages: int
+    hz: float | None
+    longest_s: float | None
+    delay_s: float | None
+
+
+class TimesWatch:
+    """Watches one topic in bounded memory; stamps are those of headers where messages have one, else log times."""
+
+    def __init__(self, topic: str, *, has_stamps: bool) -> None:
+        self.topic, self.has_stamps = topic, has_stamps
+        self.count = self.num_duplicates = self.num_back = self.num_zero = 0
+        self.first_ns = self.last_ns = 0
+        self.first_duplicate_ns = self.first_back_ns = 0
+        self.furthest_back = 0.0
+        self._intervals: Thinned[float] = Thinned(MAX_KEPT)
+        self._delays: Thinned[tuple[float, float]] = Thinned(MAX_KEPT)
+        self._longest: list[tuple[int, int]] = []
+        self._latest_ns = 0
+
+    def add(self, stamp_ns: int, log_ns: int) -> None:
+        """The next message of the file."""
+        self.count += 1
+        self.num_zero += self.has_stamps and stamp_ns == 0
+        if self.count == 1:
+            self.first_ns = self.last_ns = self._latest_ns = stamp_ns
+        else:
+            self._step(stamp_ns)
+        if self.has_stamps and self._delays.is_next():
+            self._delays.add((log_ns * _NS, (log_ns - stamp_ns) * _NS))
+        self.first_ns, self.last_ns = min(self.first_ns, stamp_ns), max(self.last_ns, stamp_ns)
+        self._latest_ns = stamp_ns
+
+    def _step(self, stamp_ns: int) -> None:
+        interval = stamp_ns - self._latest_ns
+        if interval == 0:
+            self.num_duplicates += 1
+            self.first_duplicate_ns = self.first_duplicate_ns or stamp_ns
+        elif interval < 0:
+            self.num_back += 1
+            self.first_back_ns = self.first_back_ns or stamp_ns
+            self.furthest_back = max(self.furthest_back, -interval * _NS)
+        else:
+            if self._intervals.is_next():
+                self._intervals.add(interval * _NS)
+            entry = (interval, self._latest_ns)
+            if len(self._longest) < MAX_GAPS:
+                heapq.heappush(self._longest, entry)
+            else:
+                heapq.heappushpop(self._longest, entry)
+
+    @property
+    def median_interval(self) -> float | None:
+        """[s]; None for less than two messages of different times."""
+        return float(np.median(list(self._intervals))) if len(self._intervals) else None
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether the messages have a rate at all."""
+        median = self.median_interval
+        return median is not None and float(np.quantile(list(self._intervals), 0.9)) <= REGULAR * median
+
+    @property
+    def delays(self) -> Float64:
+        """Rows (K, 2) [s] of log time and log time minus stamp."""
+        return np.array(list(self._delays), dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def delay(self) -> float | None:
+        """Median of log time minus stamp [s]."""
+        return float(np.median(self.delays[:, 1])) if len(self._delays) and not self.num_zero else None
+
+    def gaps(self) -> list[tuple[float, int]]:
+        """Intervals [s] far above the median, and the stamp before each, by time; none where there is no rate."""
+        median = self.median_interval
+        if median is None or not self.is_regular:
+            return []
+        limit = max(MIN_GAP, GAP_RATIO * median)
+        return sorted(((i * _NS, at) for i, at in self._longest if i * _NS > limit), key=lambda gap: gap[1])
+
+    def rate(self, *, is_read: bool) -> Rate:
+        """Its row of the table."""
+        median = self.median_interval
+        return Rate(
+            topic=self.topic,
+            is_read=is_read,
+            messages=self.count,
+            hz=None if not median else 1.0 / median,
+            longest_s=max(self._longest)[0] * _NS if self._longest else None,
+            delay_s=self.delay,
+        )
+
+
+def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
+    """What is wrong with the times of one topic."""
+    found: list[Finding] = []
+    where = times.topic
+    if times.num_zero:
+        text = f"{times.num_zero} of {times.count} header stamps are 0"
+        remedy = "give --stamps log to take the times of logging, and let the driver stamp the next recording"
+        make = error if times.num_zero == times.count and what != "states" else warning
+        if what == "states":
+            text = f"{text}; the times of logging are taken where all are"
+        return [make("stamp-zero", where, text, remedy, value=times.num_zero)]
+    gaps = times.gaps()
+    if gaps and times.median_interval is not None:
+        longest, at = max(gaps)
+        lost = sum(round(interval / times.median_interval) - 1 for interval, _ in gaps)
+        gaps_of = f"a gap of {longest:.3g} s" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest {longest:.3g} s"
+        text = f"{gaps_of}; about {lost} {what} are missing"
+        remedy = "record fewer topics or to a faster disk; what moved meanwhile is unknown"
+        found.append(warning("gap", where, text, remedy, value=longest, unit="s", stamp_ns=at))
+    if times.num_duplicates:
+        text = f"{times.num_duplicates} of {times.count} stamps repeat the one before"
+        remedy = "look for a driver that publishes twice, or a topic recorded twice"
+        first = times.first_duplicate_ns
+        found.append(warning("stamp-repeats", where, text, remedy, value=times.num_duplicates, stamp_ns=first))
+    if times.num_back:
+        text = f"stamps go back {times.num_back} times, by up to {times.furthest_back:.3g} s"
+        remedy = "two publishers on one topic, a clock that was set, or a loop of a played log: record again"
+        first = times.first_back_ns
+        figure = {"value": times.furthest_back, "unit": "s", "stamp_ns": first}
+        found.append(warning("stamp-back", where, text, remedy, **figure))
+    return found
+
+
+def joined_gaps(findings: list[Finding]) -> list[Finding]:
+    """With one finding for all topics and transforms that pause together."""
+    kept = [f for f in findings if f.code not in {"gap", "tf-gap"}]
+    groups: list[list[Finding]] = []
+    for finding in (f for f in findings if f.code in {"gap", "tf-gap"}):
+        group = next((g for g in groups if _overlap(g[0], finding)), None)
+        if group is None:
+            groups.append([finding])
+        else:
+            group.append(finding)
+    return [*(group[0] if len(group) == 1 else _joined(group) for group in groups), *kept]
+
+
+def _overlap(a: Finding, b: Finding) -> bool:
+    """Whether the longest pauses of two topics are the same."""
+    (a0, a1), (b0, b1) = (((f.stamp_ns or 0) * _NS, (f.stamp_ns or 0) * _NS + (f.value or 0.0)) for f in (a, b))
+    return min(a1, b1) - max(a0, b0) > TOGETHER * min(a1 - a0, b1 - b0)
+
+
+def _joined(group: list[Finding]) -> Finding:
+    worst = max(group, key=lambda f: f.value or 0.0)
+    names = [f.where for f in group]
+    where = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return replace(worst, where=where, what=f"{len(names)} pause together; of {worst.where}: {worst.what}")
+
+
+def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
+    """Files of one recording that were logged far apart; spans: first and last log time [ns] by file."""
+    ordered = sorted((span, name) for name, span in spans.items() if name)
+    found = []
+    for (before, name), (after, other) in pairwise(ordered):
+        pause = (after[0] - before[1]) * _NS
+        if pause > FILES_APART:
+            text = f"between {name} and {other} nothing was logged for {pause:.4g} s"
+            remedy = "are they one recording? if not, give each alone"
+            found.append(warning("files-apart", "files", text, remedy, value=pause, unit="s", stamp_ns=before[1]))
+    return found
+
+
+def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
+    """Moving transforms that end long before the last image."""
+    ended = [
+        e for e in edges if e.count > 2 and (last_ns - e.last_ns) * _NS > max(ENDS, 3 * (e.median_interval or 0))
+    ]
+    if not ended:
+        return []
+    first = min(ended, key=lambda edge: edge.last_ns)
+    early = (last_ns - first.last_ns) * _NS
+    more = f" and {len(ended) - 1} more" if len(ended) > 1 else ""
+    text = f"ends {early:.3g} s before the last image: what hangs below has no pose from then on"
+    remedy = "record /tf to the end; if it stands still, publish it on /tf_static or give --camera-pose"
+    return [warning("tf-ends", f"{first.topic}{more}", text, remedy, value=early, unit="s", stamp_ns=first.last_ns)]
+
+
+def part_findings(topics: list[TimesWatch]) -> list[Finding]:
+    """Topics that begin long after the others, or end long before them."""
+    several = [t for t in topics if t.count > 2 and t.median_interval is not None]
+    found = []
+    first, last = (min((t.first_ns for t in several), default=0), max((t.last_ns for t in several), default=0))
+    for times in several:
+        least = max(ENDS, 3 * (times.median_interval or 0.0))
+        begins, ends = (times.first_ns - first) * _NS, (last - times.last_ns) * _NS
+        for seconds, words, at in ((begins, "begins", times.first_ns), (ends, "ends", times.last_ns)):
+            if seconds > least:
+                side = "after the first" if words == "begins" else "before the last"
+                text = f"{words} {seconds:.3g} s {side} of the other topics"
+                make = warning if seconds > MUCH * (last - first) * _NS else note
+                remedy = "start and stop all drivers with the recorder, or cut the log there"
+                found.append(make("part", times.topic, text, remedy, value=seconds, unit="s", stamp_ns=at))
+    return found
+
+
+def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
+    """Topics of one kind of different cameras: one whose stamps are otherwise against the log than all others'."""
+    stamped = [t for t in topics if t.delay is not None and t.count > 1]
+    if len(stamped) < 3:
+        return []
+    found = []
+    for times in stamped:
+        own = times.delays[:, 1]
+        others = np.array([t.delay for t in stamped if t is not times], dtype=np.float64)
+        apart = float(np.median(own) - np.median(others))
+        spread = float(np.median(np.abs(own - np.median(own))))
+        if abs(apart) > max(PEERS, 5 * spread, 3 * float(np.ptp(others))) and abs(apart) <= APART:
+            text = f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
+            text = f"{text} cameras' images, as logged"
+            remedy = "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves"
+            figure = {"value": round(1e3 * apart, 1), "unit": "ms", "stamp_ns": times.first_ns}
+            found.append(warning("clock-offset", times.topic, text, remedy, **figure))
+    return found
+
+
+def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
+    """What header stamps say beside log times: another clock, an offset, a drift."""
+    stamped = [t for t in topics if t.delay is not None and t.count > 1]
+    if not stamped:
+        return []
+    delays = [t.delay for t in stamped if t.delay is not None]
+    common = float(np.median(delays))
+    if abs(common) > DELAYED and max(abs(delay - common) for delay in delays) <= APART:
+        text = f"header stamps are of another clock than the log's, {common:+.4g} s apart, the same for all topics"
+        found = [note("clock", "all topics", f"{text} (a played log, or simulated time)", value=common, unit="s")]
+    else:
+        found = [*filter(None, (_offset(t, common) for t in stamped))]
+    return [*found, *filter(None, (_drift(t) for t in stamped))]
+
+
+def _offset(times: TimesWatch, common: float) -> Finding | None:
+    delay = times.delay
+    assert delay is not None
+    figure = {"value": delay, "unit": "s", "stamp_ns": times.first_ns}
+    if -delay > AHEAD:
+        text = f"header stamps are {-delay:.3g} s later than the log's times: the sender's clock is ahead"
+    elif delay > DELAYED:
+        text = f"header stamps are {delay:.4g} s before the log's times"
+    elif abs(delay - common) > APART:
+        text = f"header stamps are {delay:.3g} s before the log's times, those of most topics {common:.3g} s"
+    else:
+        return None
+    remedy = "synchronise the clocks (chrony, PTP) and record again; images and poses do not belong together"
+    return warning("clock-offset", times.topic, text, remedy, **figure)
+
+
+def _drift(times: TimesWatch) -> Finding | None:
+    rows = times.delays
+    if len(rows) < 20:
+        return None
+    at, delay = rows[:, 0] - rows[0, 0], rows[:, 1]
+    if at[-1] <= 0:
+        return None
+    slope = _slope(at, delay)
+    spread = float(np.median(np.abs(delay - np.median(delay) - slope * (at - np.median(at)))))
+    change = slope * float(at[-1])
+    if abs(change) < max(DRIFT, 6.0 * spread):
+        return None
+    text = f"header stamps drift against the log's times by {1e3 * change:+.0f} ms ({1e6 * slope:+.0f} ppm)"
+    remedy = "synchronise the clocks (chrony, PTP) and record again"
+    return warning("clock-drift", times.topic, text, remedy, value=change, unit="s", stamp_ns=times.first_ns)
+
+
+def _slope(at: Float64, delay: Float64) -> float:
+    """Median slope between the first and the second half (a few late messages do not turn it)."""
+    half = len(at) // 2
+    rise = delay[-half:] - delay[:half]
+    run = at[-half:] - at[:half]
+    return float(np.median(rise[run > 0] / run[run > 0])) if (run > 0).any() else 0.0

@@ -1,0 +1,397 @@
+"""Whether views of one scene fit together: by which depth scale, and by which move of one camera, they would."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.checks.check_images import TABLE_DEPTH
+from splatctrl_cli.checks.finding import Finding, error, warning
+from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
+from splatctrl_cli.logs.shot import PLAUSIBLE_DEPTH
+from splatctrl_cli.records import Bool, Float64, RgbdFrame
+
+ROWS = 80  # of an image that are looked at
+NUM_VIEWS = 12
+NUM_PAIRS = 40
+NUM_POINTS = 1000  # of a view that are laid into others
+MIN_LANDED = 1000  # of all pairs
+BASELINE = 0.02  # [m] between two views that are compared
+SCALES = (0.001, 0.01, 0.1, 0.2, 0.25, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0)
+SCALES = (*SCALES, *(1 / s for s in reversed(SCALES[:-1])))
+FINE = np.linspace(0.92, 1.08, 17)
+FIT = 0.01  # of the depth, from a surface, within which a point fits it
+FEW_LANDED = 0.6  # of the most: with fewer, the share that fits is taken of as many
+SAME_FIT = 0.9  # of the best share of points, for another to be as good
+OTHER_SCALE = 0.08  # of its logarithm, that a scale must differ from 1 to be named
+TRUSTED = 0.2  # of the most points that land: with so many that fit, depths are taken as they are
+UNUSUAL = 0.75  # of the largest usual depth: beyond it views that do not meet are doubtful
+BESIDE = (1 / 1.5, 1.5)  # of the best scale: where one of them fits as well, the scale cannot be told
+MORE_FIT, TIMES_FIT = 0.07, 1.12  # by which more points must fit
+LEAST_FIT = 0.4  # of the points that must fit then
+WIDTHS = (0.05, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)  # [m] of a residual that counts, by round
+WIDE = (0.15, 0.15, 0.12, 0.1, 0.08, 0.06)  # before them, where a camera is far off
+FLAT = 2e-3  # eigenvalue (of the mean normal equation) below which a direction is not seen
+CUT = 0.015  # [m] of a residual, in the cost
+CHEAPER = 0.04  # share of the cost that a move must save
+MOVED, TURNED = 0.012, 0.8  # [m], [deg] from which a move is named
+GOOD_SHARE = 0.45  # of the points that must lie within 1 % of the depth after a move
+
+
+@dataclass(frozen=True, kw_only=True)
+class _View:
+    """A reduced view: normals (h, w, 3) of its points (0 where unknown), some of the points (K, 3), camera frame."""
+
+    frame: RgbdFrame
+    surface: Float64
+    normals: Float64
+    points: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Move:
+    """What brings a camera's views to those of the others: T_camera_corrected, its length [m] and angle [deg], and
+    the mean cut residual [m] before and after.
+    """
+
+    camera: str
+    T_camera_corrected: Float64
+    distance: float
+    angle: float
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewsCheck:
+    """What is wrong with depth scales and poses; the frames with the scale that fits, and with the poses, too."""
+
+    findings: list[Finding]
+    scaled: list[RgbdFrame]
+    corrected: list[RgbdFrame]
+
+
+def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None]) -> ViewsCheck:
+    """Compare views from different places, of one moment or a still scene.
+
+    used: metres per count of each camera's depth, None where it is stored as floats.
+    """
+    views = [_view(frame) for frame in _chosen(frames)]
+    pairs = _pairs(views)
+    if not pairs:
+        return ViewsCheck(findings=[], scaled=list(frames), corrected=list(frames))
+    scales, moves = wrong_scales(views, pairs), wrong_poses(views, pairs)
+    scaled = _scaled(frames, scales)
+    if scales:
+        fitted = [_view(frame) for frame in _chosen(scaled)]
+        if _cost(fitted, pairs)[1] > _cost(_all_moved(views, moves), pairs)[1]:
+            moves = wrong_poses(fitted, pairs)
+        else:  # moves explain more
+            scales, scaled = {}, list(frames)
+    findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs)
+    findings += [_pose_finding(move, sorted(used)) for move in moves]
+    by_camera = {move.camera: move.T_camera_corrected for move in moves}
+    corrected = [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in scaled]
+    return ViewsCheck(findings=findings, scaled=scaled, corrected=corrected)
+
+
+def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
+    """By camera, the factor by which its depths fit the other views; empty where they fit as they are.
+
+    First one factor for all cameras is tried, then one for each alone.
+    """
+    cameras = sorted({view.frame.camera for view in views})
+    together = _best_scale(views, pairs, cameras)
+    if together is not None:
+        return dict.fromkeys(cameras, together)
+    found = {}
+    plain = {camera: _cost(views, _with(views, pairs, camera))[1] for camera in cameras}
+    for camera in cameras if len(cameras) > 1 else []:
+        if plain[camera] > max(GOOD_SHARE, 0.7 * max(plain.values())):
+            continue
+        scale = _best_scale(views, _with(views, pairs, camera), [camera])
+        if scale is not None:
+            found[camera] = scale
+    return found if 2 * len(found) <= len(cameras) else {}  # else the factors only chase each other
+
+
+def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Move]:
+    """The cameras whose views fit the others much better after a small move, the one that saves most first."""
+    cameras = sorted({view.frame.camera for view in views})
+    moves: list[Move] = []
+    for _ in range(max(1, len(cameras) // 2)):
+        left = [camera for camera in cameras if camera not in {move.camera for move in moves}]
+        found = [(camera, T) for camera in left if (T := _fitted(views, pairs, camera)) is not None]
+        if not found:
+            break
+        before = _cost(views, pairs)
+        costs = [_cost(_moved(views, camera, T), pairs) for camera, T in found]
+        best = int(np.argmin([cost for cost, _ in costs]))
+        camera, T = found[best]
+        its = _with(views, pairs, camera)
+        own_before, own_after = _cost(views, its)[0], _cost(_moved(views, camera, T), its)
+        move = _move(camera, T, own_before, own_after[0])
+        is_large = move.distance > MOVED or move.angle > TURNED
+        if not is_large or move.after > (1 - CHEAPER) * move.before or own_after[1] < GOOD_SHARE:
+            break
+        if costs[best][0] >= before[0]:
+            break
+        moves.append(move)
+        views = _moved(views, camera, T)
+    return moves
+
+
+def _overlap_findings(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Finding]:
+    """Of depths that are unusual, and with which views that would meet at a tenth or at ten times do not."""
+    low, high = TABLE_DEPTH[0], UNUSUAL * TABLE_DEPTH[1]
+    depths = np.concatenate([view.points[:, 2] for view in views])
+    if not len(depths) or low <= (median := float(np.median(depths))) <= high:
+        return []
+    scale = 0.1 if median > high else 10.0
+    (_, plain), (fits, most) = (_fitting(views, pairs, [v.frame.camera for v in views], s) for s in (1.0, scale))
+    if most < MIN_LANDED or plain > TRUSTED * most or fits < LEAST_FIT * most:
+        return []
+    text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
+    return [warning("views-scale", "cameras", text, "if so, multiply --depth-scale by it", value=scale)]
+
+
+def _scaled(frames: Sequence[RgbdFrame], scales: Mapping[str, float]) -> list[RgbdFrame]:
+    return [replace(f, depth=f.depth * np.float32(scales.get(f.camera, 1.0))) for f in frames]
+
+
+def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None]) -> list[Finding]:
+    shared = set(scales.values())
+    is_all = len(scales) == len(used) and len(shared) == 1
+    units = {used[camera] or 1.0 for camera in scales}
+    if is_all and len(units) == 1:
+        factor, unit = shared.pop(), units.pop()
+        text = f"views of one scene fit together only where all depths are multiplied by {factor:.3g}"
+        remedy = f"give --depth-scale {unit * factor:.3g} (it is {unit:g} m per count), or correct the poses' unit"
+        return [error("views-scale", "cameras", text, remedy, value=factor)]
+    found = []
+    for camera, factor in sorted(scales.items()):
+        text = f"its views fit those of the other cameras only where its depths are multiplied by {factor:.3g}"
+        remedy = "set the depth unit of its driver as that of the others, or leave it out with --cameras"
+        found.append(error("views-scale", f"camera {camera}", text, remedy, value=factor))
+    return found
+
+
+def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
+    by = f"{1e3 * move.distance:.0f} mm and {move.angle:.1f} deg"
+    where, what = f"camera {move.camera}", f"its views fit those of the other cameras where it is moved by {by}"
+    remedy = "calibrate this camera's pose again (hand-eye), or leave it out with --cameras"
+    if len(cameras) == 1:
+        what = f"its views fit together where the camera is moved on its mount by {by}"
+        remedy = "calibrate the camera on its mount again (hand-eye)"
+    elif len(cameras) == 2:
+        where, what = f"cameras {' and '.join(cameras)}", f"their views fit where {move.camera} is moved by {by}"
+        remedy = "calibrate both cameras' poses again (hand-eye): two do not tell which of them is wrong"
+    falls = f"points then lie {1e3 * move.after:.1f} mm off surfaces instead of {1e3 * move.before:.1f}"
+    text = f"{what}: {falls} (mean, each counted as {1e3 * CUT:.0f} mm at most)"
+    return warning("views-pose", where, text, remedy, value=round(1e3 * move.distance, 1), unit="mm")
+
+
+def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
+    """As many of each camera, spread over its frames."""
+    cameras = sorted({frame.camera for frame in frames})
+    each = max(2, min(8, NUM_VIEWS // max(len(cameras), 1)))
+    chosen: list[RgbdFrame] = []
+    for camera in cameras:
+        its = [frame for frame in frames if frame.camera == camera]
+        chosen += [its[i] for i in np.unique(np.linspace(0, len(its) - 1, min(each, len(its))).astype(int))]
+    return chosen
+
+
+def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
+    """Ordered pairs of views from different places."""
+    places = [view.frame.T_world_camera[:3, 3] for view in views]
+    pairs = [
+        (i, j)
+        for i in range(len(views))
+        for j in range(len(views))
+        if i != j and float(np.linalg.norm(places[i] - places[j])) > BASELINE
+    ]
+    return [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), NUM_PAIRS)).astype(int))]
+
+
+def _with(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> list[tuple[int, int]]:
+    """The pairs of which one view or both are of a camera."""
+    return [(i, j) for i, j in pairs if camera in (views[i].frame.camera, views[j].frame.camera)]
+
+
+def _view(frame: RgbdFrame) -> _View:
+    stride = max(1, frame.depth.shape[0] // ROWS)
+    depth = cv2.medianBlur(np.ascontiguousarray(frame.depth), 3)[::stride, ::stride]
+    k = frame.intrinsics
+    lens = replace(k, fx=k.fx / stride, fy=k.fy / stride, cx=k.cx / stride, cy=k.cy / stride)
+    lens = replace(lens, width=depth.shape[1], height=depth.shape[0])
+    surface = back_project(lens, depth)
+    normals = _normals(surface)
+    points = surface[np.any(normals != 0, axis=-1)]
+    if len(points) > NUM_POINTS:
+        points = points[np.linspace(0, len(points) - 1, NUM_POINTS).astype(int)]
+    reduced = replace(frame, depth=np.asarray(depth, np.float32), color=np.zeros((*depth.shape, 3), np.uint8))
+    return _View(frame=replace(reduced, intrinsics=lens), surface=surface, normals=normals, points=points)
+
+
+def _normals(surface: Float64) -> Float64:
+    """(h, w, 3), 0 along edges and where depth is missing."""
+    normals = np.zeros_like(surface)
+    across, down = surface[1:-1, 2:] - surface[1:-1, :-2], surface[2:, 1:-1] - surface[:-2, 1:-1]
+    z = surface[..., 2]
+    around = np.stack([z[1:-1, 1:-1], z[1:-1, 2:], z[1:-1, :-2], z[2:, 1:-1], z[:-2, 1:-1]])
+    cross = np.cross(across, down)
+    length = np.linalg.norm(cross, axis=-1)
+    is_smooth = np.ptp(around, axis=0) < 0.1 * around[0]
+    is_known = (around > 0).all(axis=0) & is_smooth & (length > 0)
+    normals[1:-1, 1:-1][is_known] = cross[is_known] / length[is_known][:, None]
+    return normals
+
+
+def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Bool, Float64, Float64]:
+    """Points (K, 3) of view a in b's camera frame, which of them land on a depth of b (K,), and b's surface and
+    normals (K, 3) there.
+    """
+    T = invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera
+    points = transform_points(T, a.points * scale_a)
+    lens = b.frame.intrinsics
+    is_ahead = points[:, 2] > PLAUSIBLE_DEPTH[0]
+    pixels = np.round(project(lens, np.where(is_ahead[:, None], points, 1.0)))
+    lands = is_ahead & np.all((pixels >= 0) & (pixels < [lens.width, lens.height]), axis=1)
+    u, v = np.where(lands[:, None], pixels, 0).astype(np.int64).T
+    surface = b.surface[v, u] * scale_b
+    return points, lands & (surface[:, 2] > 0), surface, b.normals[v, u]
+
+
+def _distances(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
+    """Distance [m] of the points of view a from the planes of view b's surface that they land on, and their depth."""
+    points, lands, surface, normals = _landed(a, b, scale_a, scale_b)
+    lands &= np.any(normals != 0, axis=1)
+    return np.abs(np.einsum("ki,ki->k", points - surface, normals))[lands], points[lands, 2]
+
+
+def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str]) -> float | None:
+    """The factor on these cameras' depths with which far more points fit than without; None where there is none."""
+    medians = [float(np.median(v.points[:, 2])) for v in views if v.frame.camera in cameras and len(v.points)]
+    if not medians:
+        return None
+    low, high = PLAUSIBLE_DEPTH
+    tried = [s for s in SCALES if s == 1.0 or low <= s * float(np.median(medians)) <= high]
+    counts = np.array([_fitting(views, pairs, cameras, s) for s in tried], dtype=np.float64)
+    most = counts[:, 1].max()
+    if most < MIN_LANDED:
+        return None
+    plain = tried.index(1.0)
+    shares = counts[:, 0] / np.maximum(counts[:, 1], FEW_LANDED * most)
+    fit = counts[:, 0] / np.maximum(counts[:, 1], 1.0)
+    best = int(np.argmax(shares))
+    if counts[plain, 1] > TRUSTED * most and fit[plain] > SAME_FIT * fit[best]:
+        return None
+    if shares[best] < max(shares[plain] + MORE_FIT, TIMES_FIT * shares[plain], LEAST_FIT):
+        return None
+    beside = [_fitting(views, pairs, cameras, tried[best] * factor) for factor in BESIDE]
+    if min(num_fit / max(num, 1) for num_fit, num in beside if num > MIN_LANDED // 10) > SAME_FIT * fit[best]:
+        return None  # a flat wall fits at any scale
+    near = [tried[best] * factor for factor in FINE]
+    scale = float(near[int(np.argmax([_fitting(views, pairs, cameras, s, FIT / 4)[0] for s in near]))])
+    return scale if abs(np.log(scale)) > OTHER_SCALE else None
+
+
+def _fitting(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str], scale: float, fit: float = FIT
+) -> tuple[int, int]:
+    """Points that land within `fit` of the depth where these cameras' depths are scaled, and all that land."""
+    num_fit = num = 0
+    for i, j in pairs:
+        a, b = views[i], views[j]
+        scales = [scale if view.frame.camera in cameras else 1.0 for view in (a, b)]
+        off, depth = _distances(a, b, *scales)
+        num_fit += int((off < fit * depth).sum())
+        num += len(off)
+    return num_fit, num
+
+
+def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
+    """The better of two starts, near and wide."""
+    is_far = _cost(views, _with(views, pairs, camera))[1] < GOOD_SHARE
+    starts = [WIDTHS, (*WIDE, *WIDTHS)] if is_far else [WIDTHS]
+    found = [T for widths in starts if (T := _descended(views, pairs, camera, widths)) is not None]
+    return min(found, key=lambda T: _cost(_moved(views, camera, T), pairs)[0], default=None)
+
+
+def _descended(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str, widths: Sequence[float]
+) -> Float64 | None:
+    """T_camera_corrected: Gauss-Newton on point-to-plane residuals, each weighed by Tukey's biweight of its width."""
+    its = _with(views, pairs, camera)
+    T = np.eye(4)
+    for width in widths:
+        moved = _moved(views, camera, T)
+        H, g, total = np.zeros((6, 6)), np.zeros(6), 0.0
+        for i, j in its:
+            rows, residual = _rows(moved[i], moved[j], camera)
+            weight = np.where(np.abs(residual) < width, np.square(1 - np.square(residual / width)), 0.0)
+            H += (rows * weight[:, None]).T @ rows
+            g += (rows * weight[:, None]).T @ residual
+            total += float(weight.sum())
+        if total < MIN_LANDED / 20:
+            return None
+        values, vectors = np.linalg.eigh(H / total)
+        inverse = np.where(values > FLAT, 1 / np.maximum(values, FLAT), 0.0)
+        step = -vectors @ (inverse * (vectors.T @ (g / total)))
+        change = np.eye(4)
+        change[:3, :3], change[:3, 3] = cv2.Rodrigues(step[:3])[0], step[3:]
+        T = T @ change
+    return T
+
+
+def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
+    """Derivative (K, 6) by a small turn and move in the camera's own frame, and residual (K,) [m], of the points of
+    view a that land on a surface of view b.
+    """
+    points, lands, surface, normals = _landed(a, b)
+    lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * WIDE[0])
+    points, surface, normals = points[lands], surface[lands], normals[lands]
+    rows = np.zeros((len(points), 6))
+    if a.frame.camera == camera:
+        R = (invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera)[:3, :3]
+        along = normals @ R
+        rows += np.hstack([np.cross(a.points[lands], along), along])
+    if b.frame.camera == camera:
+        rows -= np.hstack([np.cross(points, normals), normals])
+    return rows, np.einsum("ki,ki->k", points - surface, normals)
+
+
+def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
+    """Mean distance from surfaces [m], each cut at `CUT`, and the share of points that fit."""
+    total = num = num_good = 0.0
+    for i, j in pairs:
+        off, depth = _distances(views[i], views[j])
+        total += float(np.minimum(off, CUT).sum())
+        num_good += float((off < FIT * depth).sum())
+        num += len(off)
+    return (total / num, num_good / num) if num >= MIN_LANDED else (CUT, 0.0)
+
+
+def _moved(views: Sequence[_View], camera: str, T: Float64) -> list[_View]:
+    """The views with T_world_camera of one camera followed by T."""
+    return [
+        replace(view, frame=replace(view.frame, T_world_camera=view.frame.T_world_camera @ T))
+        if view.frame.camera == camera
+        else view
+        for view in views
+    ]
+
+
+def _all_moved(views: Sequence[_View], moves: Sequence[Move]) -> list[_View]:
+    moved = list(views)
+    for move in moves:
+        moved = _moved(moved, move.camera, move.T_camera_corrected)
+    return moved
+
+
+def _move(camera: str, T: Float64, before: float, after: float) -> Move:
+    angle = float(np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3])[0])))
+    distance = float(np.linalg.norm(T[:3, 3]))
+    return Move(camera=camera, T_camera_corrected=T, distance=distance, angle=angle, before=before, after=after)

@@ -1,0 +1,247 @@
+"""The offset between a robot's clock and its cameras', from when both see the robot move."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.checks.state_motion import CameraMotion, ImageMotion, correlation, predicted_change, silhouettes
+from splatctrl_cli.records import Float64, JointState
+
+MAX_OFFSET = 2.0  # [s] searched on either side
+MAX_SHARE = 0.25  # of the log that may be searched on either side
+MIN_INTERVALS = 10  # between frames
+MIN_MOTION = 0.02  # [rad or m] that a joint must move
+MIN_CORRELATION = 0.6  # of summed motion
+MIN_PIXEL_CORRELATION = 0.3  # of motion pixel by pixel, which noise and the background lower
+MIN_LEAD = 0.05  # over the next best peak
+STEPS_PER_INTERVAL = 6  # offsets tried per time between frames
+MAX_CAMERAS = 2  # that are compared pixel by pixel, those in which most changes
+PIXEL_ERROR = 0.15  # of the time between frames: found on the simulated log, per camera (docs/replay.md)
+SUM_ERROR = 1.0  # likewise
+Score = Callable[[float], float]
+FEW = 1000  # states by which a joint is seen to move
+Stamps = NDArray[np.int64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotPoints:
+    """A robot's spheres at each joint state: centers (T, S, 3) [m], world, and radii (S,) [m]."""
+
+    centers: Float64
+    radii: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockOffset:
+    """What two clocks differ by, and how sure that is.
+
+    offset_s: a frame's stamp minus the stamp of the joint state at that instant [s], None where it cannot be told;
+    uncertainty_s: the larger of how the cameras disagree and what the method was found to err by; correlation,
+    runner_up: of image and joint motion at the best offset and at the next best peak; reason: why it cannot be told.
+    """
+
+    offset_s: float | None
+    uncertainty_s: float | None
+    correlation: float
+    runner_up: float
+    num_intervals: int
+    reason: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """One line for a report."""
+        if self.offset_s is None or self.uncertainty_s is None:
+            return f"clocks of cameras and robot: cannot tell their offset: {self.reason}"
+        return (
+            f"clocks of cameras and robot: frames are stamped {1e3 * self.offset_s:+.0f} ms against the joint states "
+            f"(+-{1e3 * self.uncertainty_s:.0f} ms, correlation {self.correlation:.2f})"
+        )
+
+
+def estimate_clock_offset(
+    states: Sequence[JointState], motion: ImageMotion, robot: RobotPoints | None = None
+) -> ClockOffset:
+    """The offset at which the robot's motion and the images' correlate best.
+
+    states: by stamp. With `robot` and cameras that stand still, the change of every pixel between two frames is
+    compared with that of the silhouette of the robot's spheres; else the change of whole images with the distance the
+    joints move, which is coarser. The mean over cameras has its peak, by a parabola, at the offset. It cannot be told
+    where nothing moves, where the correlation is low, where another peak is as good, or at the end of the search.
+    """
+    cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]
+    num = sum(len(camera.changes) for camera in cameras)
+    if len(states) < 3 or num < MIN_INTERVALS:
+        return _unknown(num, f"expected at least {MIN_INTERVALS} times between frames and 3 states")
+    states, robot = _near(states, robot, cameras)
+    if len(states) < 3:
+        return _unknown(num, f"no joint states within {MAX_OFFSET:g} s of the frames")
+    position = np.array([state.position for state in states])
+    if np.ptp(position, axis=0).max() < MIN_MOTION:
+        return _unknown(num, "no joint moves")
+    start = states[0].stamp_ns
+    seconds = np.array([state.stamp_ns - start for state in states]) * 1e-9
+    offsets, step = _offsets(float(seconds[-1]), cameras)
+    if not len(offsets):
+        return _unknown(num, "the log is too short")
+    interval = step * STEPS_PER_INTERVAL
+    fixed = sorted((c for c in cameras if c.is_fixed), key=lambda c: -float(np.sum(c.changes)))[:MAX_CAMERAS]
+    if robot is not None and fixed:
+        scores = [_pixel_scores(seconds, robot, step, camera, start, offsets) for camera in fixed]
+        return _peak(offsets, np.array(scores), num, MIN_PIXEL_CORRELATION, PIXEL_ERROR * interval)
+    scores = [_sum_scores(seconds, position, camera, start, offsets) for camera in cameras]
+    return _peak(offsets, np.array(scores), num, MIN_CORRELATION, SUM_ERROR * interval)
+
+
+def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
+    """The states (K,) of stamps (T,) that rise which `estimate_clock_offset` looks at: it finds the same from them as
+    from all, and of a log that is longer or denser than its frames they are few.
+    """
+    cameras = [camera for camera in motion.cameras.values() if camera.changes]
+    if not cameras:
+        return np.zeros(0, dtype=np.int64)
+    first_ns, last_ns = _span(cameras)
+    first = int(np.searchsorted(stamp_ns, first_ns))
+    near = stamp_ns[first : int(np.searchsorted(stamp_ns, last_ns, side="right"))]
+    if len(near) < 3:
+        return np.arange(first, first + len(near))
+    seconds = np.asarray((near - near[0]) * 1e-9, dtype=np.float64)
+    offsets, step = _offsets(float(seconds[-1]), cameras)
+    is_asked = np.zeros(len(near), dtype=np.bool_)
+    is_asked[np.linspace(0, len(near) - 1, FEW).astype(np.int64)] = True  # whether a joint moves
+    for camera in cameras:
+        at = _since(camera, int(near[0]))
+        for offset in offsets:
+            for times in (at - offset, step * np.round((at - offset) / step)):
+                after = _after(seconds, times)
+                is_asked[after] = is_asked[after - 1] = True
+    return first + np.flatnonzero(is_asked)
+
+
+def _span(cameras: Sequence[CameraMotion]) -> tuple[int, int]:
+    """First and last stamp [ns] that an offset within `MAX_OFFSET` can bring to a frame."""
+    reach = round(MAX_OFFSET * 1e9)
+    return min(c.stamps_ns[0] for c in cameras) - reach, max(c.stamps_ns[-1] for c in cameras) + reach
+
+
+def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, float]:
+    """The offsets [s] to try over states of `span_s`, none where these are too few, and the step between them."""
+    step = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras) / STEPS_PER_INTERVAL
+    count = int(min(MAX_OFFSET, MAX_SHARE * span_s) / step) if step > 0 else 0
+    if count < 2 * STEPS_PER_INTERVAL:
+        return np.zeros(0), step
+    return np.asarray(step * np.arange(-count, count + 1), dtype=np.float64), step
+
+
+def _since(camera: CameraMotion, start: int) -> Float64:
+    """Seconds of its frames since a stamp [ns]."""
+    return np.array([stamp - start for stamp in camera.stamps_ns]) * 1e-9
+
+
+def _near(
+    states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
+) -> tuple[list[JointState], RobotPoints | None]:
+    """The states, and the robot's points at them, that an offset within `MAX_OFFSET` can bring to a frame."""
+    first, last = _span(cameras)
+    near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
+    points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
+    return [states[index] for index in near], points
+
+
+def _pixel_scores(
+    seconds: Float64, robot: RobotPoints, step: float, camera: CameraMotion, start: int, offsets: Float64
+) -> Float64:
+    """With the robot at every `step` from the first state on, between states linearly."""
+    number = np.round((_since(camera, start) - offsets[:, None]) / step).astype(np.int64)  # (O, K + 1)
+    is_inside = (number >= 0) & (number * step < seconds[-1] + step / 2)
+    wanted = np.unique(number[is_inside])
+    centers = _at(seconds, robot.centers.reshape(len(seconds), -1), wanted * step).reshape(len(wanted), -1, 3)
+    depth = silhouettes(centers, robot.radii, camera)
+    changes = np.array(camera.changes)
+    scores = np.zeros(len(offsets))
+    for i, inside in enumerate(is_inside):
+        keep = _kept(inside)
+        if keep.any():
+            of = np.searchsorted(wanted, number[i])
+            a, b = depth[of[:-1][keep]], depth[of[1:][keep]]
+            scores[i] = correlation(predicted_change(a, b), changes[keep])
+    return scores
+
+
+def _sum_scores(seconds: Float64, position: Float64, camera: CameraMotion, start: int, offsets: Float64) -> Float64:
+    at = _since(camera, start)
+    change = np.array([image.mean() for image in camera.changes])
+    scores = np.zeros(len(offsets))
+    for i, offset in enumerate(offsets):
+        keep = _kept((at - offset >= 0) & (at - offset <= seconds[-1]))
+        if keep.any():
+            moved = np.abs(np.diff(_at(seconds, position, at - offset), axis=0)).mean(axis=1)
+            scores[i] = correlation(moved[keep], change[keep])
+    return scores
+
+
+def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+    """Times between frames (K,) that lie in the log of joints, none where these are too few to judge."""
+    keep = is_inside[1:] & is_inside[:-1]
+    return keep if keep.sum() >= max(MIN_INTERVALS // 2, len(keep) // 2) else np.zeros_like(keep)
+
+
+def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
+    """Rows (K, D) of a curve (T, D) at times (K,), linearly."""
+    after = _after(seconds, at)
+    before = after - 1
+    share = np.clip((at - seconds[before]) / (seconds[after] - seconds[before]), 0.0, 1.0)[:, None]
+    return np.asarray((1 - share) * curve[before] + share * curve[after])
+
+
+def _after(seconds: Float64, at: Float64) -> Index:
+    """The state (K,) that ends the interval in which each time lies, or the nearest interval."""
+    return np.clip(np.searchsorted(seconds, at), 1, len(seconds) - 1)
+
+
+def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: float) -> ClockOffset:
+    """The peak of the mean of scores (C, O); error [s]: what the method errs by."""
+    score = scores.mean(axis=0)
+    best = int(np.argmax(score))
+    inner = score[1:-1]
+    peaks = np.flatnonzero((inner >= score[:-2]) & (inner > score[2:])) + 1
+    others = score[peaks[np.abs(peaks - best) > STEPS_PER_INTERVAL]]
+    top, runner_up = float(score[best]), float(others.max(initial=0.0))
+    reason = ""
+    if top < least:
+        reason = f"images and joints do not move alike (correlation {top:.2f})"
+    elif best in {0, len(score) - 1}:
+        reason = f"it exceeds the {offsets[-1]:.2f} s that are searched"
+    elif top - runner_up < MIN_LEAD:
+        reason = f"the motion repeats: offsets of {offsets[best]:+.2f} s and another fit alike"
+    if reason:
+        return _unknown(num, reason, top, runner_up)
+    single = np.array([_vertex(offsets, row, int(np.argmax(row))) for row in scores])
+    disagreement = float(single.std() / np.sqrt(len(single)))
+    return ClockOffset(
+        offset_s=_vertex(offsets, score, best),
+        uncertainty_s=max(disagreement, error),
+        correlation=top,
+        runner_up=runner_up,
+        num_intervals=num,
+    )
+
+
+def _vertex(offsets: Float64, score: Float64, best: int) -> float:
+    """Of the parabola through the scores within half a time between frames of the best."""
+    reach = min(max(STEPS_PER_INTERVAL // 2, 2), best, len(score) - 1 - best)
+    if reach == 0:
+        return float(offsets[best])
+    near = slice(best - reach, best + reach + 1)
+    width = float(offsets[best + reach] - offsets[best])
+    a, b, _ = np.polyfit((offsets[near] - offsets[best]) / width, score[near], 2)
+    shift = float(np.clip(-b / (2 * a), -1.0, 1.0)) if a < 0 else 0.0
+    return float(offsets[best]) + shift * width
+
+
+def _unknown(num: int, reason: str, top: float = 0.0, runner_up: float = 0.0) -> ClockOffset:
+    return ClockOffset(
+        offset_s=None, uncertainty_s=None, correlation=top, runner_up=runner_up, num_intervals=num, reason=reason
+    )

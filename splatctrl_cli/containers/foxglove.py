@@ -1,0 +1,178 @@
+"""Foxglove's schemas as the ROS messages that they stand for, from protobuf, JSON or their ROS twins.
+
+Fields are those of docs.foxglove.dev ("Schemas"): in JSON times are {sec, nsec} and bytes base64, in protobuf times
+are google.protobuf.Timestamp.
+"""
+
+import base64
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.containers.protobuf import MessageTypes
+from splatctrl_cli.containers.raw_log import Topic
+
+_STANDS_FOR = {
+    "CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "RawImage": "sensor_msgs/msg/Image",
+    "CameraCalibration": "sensor_msgs/msg/CameraInfo",
+    "FrameTransform": "tf2_msgs/msg/TFMessage",
+    "FrameTransforms": "tf2_msgs/msg/TFMessage",
+    "JointStates": "sensor_msgs/msg/JointState",
+}
+_VECTORS = "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+_TRANSFORM = f"builtin_interfaces/Time timestamp\nstring parent_frame_id\nstring child_frame_id\n{_VECTORS}"
+_STAMPED = "builtin_interfaces/Time timestamp\nstring frame_id\n"
+_SIZED = f"{_STAMPED}uint32 width\nuint32 height\n"
+DEFINITIONS = {  # for bags without any; foxglove/schemas, ros_foxglove_msgs/ros2
+    "foxglove_msgs/msg/CompressedImage": f"{_STAMPED}uint8[] data\nstring format\n",
+    "foxglove_msgs/msg/RawImage": f"{_SIZED}string encoding\nuint32 step\nuint8[] data\n",
+    "foxglove_msgs/msg/CameraCalibration": (
+        f"{_SIZED}string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n"
+    ),
+    "foxglove_msgs/msg/FrameTransform": _TRANSFORM,
+    "foxglove_msgs/msg/FrameTransforms": "foxglove_msgs/FrameTransform[] transforms\n",
+}
+_PREFIXES = ("foxglove.", "foxglove_msgs/msg/", "foxglove_msgs/")
+
+
+def stands_for(schema: str) -> str:
+    """The ROS type of a Foxglove schema, "" for any other type."""
+    prefix = next((prefix for prefix in _PREFIXES if schema.startswith(prefix)), None)
+    return "" if prefix is None else _STANDS_FOR.get(schema.removeprefix(prefix), "")
+
+
+def standing_in(topic: Topic) -> Topic:
+    """A topic of a ROS bag, with the type that its messages stand for where that is Foxglove's (foxglove_msgs)."""
+    ros_type = stands_for(topic.type_name)
+    return replace(topic, type_name=ros_type, schema=topic.type_name) if ros_type else topic
+
+
+def read_foxglove(schema: str, encoding: str, definition: str, data: bytes) -> Any:
+    """The ROS message that `data` stand for; definition: the FileDescriptorSet of protobuf, a byte a character.
+
+    Raises ValueError, KeyError, TypeError or AttributeError where they do not decode.
+    """
+    if encoding == "json":
+        return as_ros(schema, _object(json.loads(data)))
+    return as_ros(schema, _types(definition).read(schema, data))
+
+
+def as_ros(schema: str, message: Any) -> Any:
+    """A decoded Foxglove message as the ROS message that it stands for."""
+    return _READERS[schema.replace("/", ".").rpartition(".")[2]](message)
+
+
+@lru_cache(maxsize=16)
+def _types(definition: str) -> MessageTypes:
+    return MessageTypes(definition.encode("latin-1"))
+
+
+def _object(value: Any) -> Any:
+    """JSON objects as objects with fields."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{key: _object(item) for key, item in value.items()})
+    return [_object(item) for item in value] if isinstance(value, list) else value
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CameraInfo:
+    header: Any
+    width: int
+    height: int
+    distortion_model: str
+    d: Any
+    k: Any
+    p: Any
+
+
+def _header(message: Any, frame_id: str) -> Any:
+    time = getattr(message, "timestamp", None)
+    seconds = _either(time, "sec", "seconds")
+    nanoseconds = _either(time, "nsec", "nanos", "nanosec")
+    return SimpleNamespace(stamp=SimpleNamespace(sec=int(seconds), nanosec=int(nanoseconds)), frame_id=frame_id)
+
+
+def _either(message: Any, *names: str) -> Any:
+    """The first of some fields that a message has; 0 where it has none, as JSON writers leave zeros out."""
+    return next((getattr(message, name) for name in names if hasattr(message, name)), 0)
+
+
+def _frame(message: Any) -> str:
+    return str(getattr(message, "frame_id", ""))
+
+
+def _data(message: Any) -> Any:
+    value = message.data
+    return np.frombuffer(base64.b64decode(value, validate=True) if isinstance(value, str) else value, dtype=np.uint8)
+
+
+def _compressed_image(message: Any) -> Any:
+    return SimpleNamespace(header=_header(message, _frame(message)), format=message.format, data=_data(message))
+
+
+def _raw_image(message: Any) -> Any:
+    return SimpleNamespace(
+        header=_header(message, _frame(message)),
+        width=int(message.width),
+        height=int(message.height),
+        encoding=str(message.encoding),
+        step=int(message.step),
+        is_bigendian=0,
+        data=_data(message),
+    )
+
+
+def _calibration(message: Any) -> Any:
+    return _CameraInfo(
+        header=_header(message, _frame(message)),
+        width=int(message.width),
+        height=int(message.height),
+        distortion_model=str(_either(message, "distortion_model") or ""),
+        d=_numbers(_either(message, "D", "d"), 0),
+        k=_numbers(_either(message, "K", "k"), 9),
+        p=_numbers(_either(message, "P", "p"), 12),
+    )
+
+
+def _numbers(values: Any, count: int) -> Any:
+    """As an array; `count` zeros where nothing is written."""
+    array = np.asarray([] if isinstance(values, int) else values, dtype=np.float64)
+    return array if array.size else np.zeros(count)
+
+
+def _transform(message: Any) -> Any:
+    t, r = message.translation, message.rotation
+    return SimpleNamespace(
+        header=_header(message, str(message.parent_frame_id)),
+        child_frame_id=str(message.child_frame_id),
+        transform=SimpleNamespace(
+            translation=SimpleNamespace(**{key: float(_either(t, key)) for key in "xyz"}),
+            rotation=SimpleNamespace(**{key: float(_either(r, key)) for key in "xyzw"}),
+        ),
+    )
+
+
+def _joint_states(message: Any) -> Any:
+    """Without velocities: one that is not set cannot be told from zero."""
+    return SimpleNamespace(
+        header=_header(message, ""),
+        name=[str(joint.name) for joint in message.joints],
+        position=np.array([float(_either(joint, "position")) for joint in message.joints]),
+        velocity=np.zeros(0),
+    )
+
+
+_READERS: dict[str, Callable[[Any], Any]] = {
+    "CompressedImage": _compressed_image,
+    "RawImage": _raw_image,
+    "CameraCalibration": _calibration,
+    "FrameTransform": lambda message: SimpleNamespace(transforms=[_transform(message)]),
+    "JointStates": _joint_states,
+    "FrameTransforms": lambda message: SimpleNamespace(transforms=[_transform(item) for item in message.transforms]),
+}

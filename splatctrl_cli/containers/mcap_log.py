@@ -1,0 +1,201 @@
+"""The messages of an MCAP file, by its own records; what is damaged is left out and counted.
+
+The `mcap` package's readers allocate what a record announces, and its indexed reader needs an intact summary: it
+raises on valid files without one and yields nothing from a truncated file.
+"""
+
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from splatctrl_cli.containers.foxglove import stands_for
+from splatctrl_cli.containers.mcap_file import McapFile
+from splatctrl_cli.containers.mcap_index import LogIndex, index_by_heads
+from splatctrl_cli.containers.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    FIRST_OPCODE,
+    MESSAGE,
+    SCHEMA,
+    STATISTICS,
+    BadRecordError,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Schema,
+    Statistics,
+    parse_record,
+)
+from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.files.unpacking import BadBlockError, Budget, unpacked_start
+
+_HEAD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+
+
+class McapLog:
+    """One MCAP file."""
+
+    container = "MCAP"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.files = (path,)
+        self._file = McapFile(path)
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Topic] = {}
+        self._statistics: Statistics | None = None
+        self._budget = Budget(self._file.size)
+        self._whole: tuple[int, int] | None = None  # the file's state when a pass found all its checksums right
+        for part in self._file.summary():  # so that a damaged chunk hides no channel of others
+            if part.opcode in {SCHEMA, CHANNEL, STATISTICS}:
+                self._declare(part.opcode, part.content, Damage())
+
+    def topics(self) -> tuple[Topic, ...]:
+        """The channels of the summary section, and those met while reading."""
+        return tuple(self._channels.values())
+
+    def index(self) -> LogIndex:
+        """What the file says of itself: by its summary, else by the heads of its records."""
+        found = self._statistics
+        if found is not None:
+            chunks = tuple(self._file.chunk_indexes())
+            if len(chunks) == found.chunk_count:
+                return LogIndex(
+                    counts=dict(found.channel_message_counts),
+                    first_ns=found.message_start_time,
+                    last_ns=found.message_end_time,
+                    chunks=chunks,
+                    notes=(),
+                )
+        return index_by_heads(self._file)
+
+    def topic_of(self, channel: int) -> Topic | None:
+        """The topic of a channel, if it has been declared so far."""
+        return self._channels.get(channel)
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield messages in file order; what is damaged is left out, a cut chunk read as far as it goes.
+
+        Checksums are compared until one pass, to the end, has found all of them right.
+        """
+        self._budget = Budget(self._file.size)
+        state, count = self._forget_changed(), damage.count
+        for part in self._file.parts(damage, is_known=self._whole is not None):
+            if part.opcode == CHUNK and part.content:
+                yield from self._chunk_messages(part.content, part.offset, damage, names, is_cut=part.is_cut)
+            elif part.opcode == MESSAGE and part.content:
+                message = self._message(part.content, 0, len(part.content), part.offset, damage, names)
+                if message is not None:
+                    yield message
+            elif part.opcode in {SCHEMA, CHANNEL}:
+                self._declare(part.opcode, part.content, damage)
+        self._whole = state if damage.count == count else None
+
+    def messages_of(
+        self, chunks: Collection[ChunkIndex], damage: Damage, names: Collection[str] | None = None
+    ) -> Iterator[RawMessage]:
+        """Yield the messages of these chunks only, wherever in the file they lie."""
+        self._forget_changed()
+        for index in chunks:
+            content = self._file.chunk_at(index)
+            yield from self._chunk_messages(content, index.chunk_start_offset, damage, names, is_cut=False)
+
+    def _forget_changed(self) -> tuple[int, int]:
+        """The state of the file; its checksums count as unknown where it is another than when they were compared."""
+        state = self._file.state()
+        self._whole = self._whole if state == self._whole else None
+        return state
+
+    def _chunk_messages(
+        self, content: bytes, offset: int, damage: Damage, names: Collection[str] | None, *, is_cut: bool
+    ) -> Iterator[RawMessage]:
+        records = self._records_in(content, offset, damage, is_cut=is_cut)
+        at, end = 0, len(records)
+        while at + _HEAD.size <= end:
+            opcode, length = _HEAD.unpack_from(records, at)
+            start, at = at + _HEAD.size, at + _HEAD.size + length
+            if at > end or opcode < FIRST_OPCODE:
+                if not is_cut:
+                    damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are no record")
+                return
+            if opcode == MESSAGE:
+                message = self._message(records, start, at, offset, damage, names)
+                if message is not None:
+                    yield message
+            elif opcode in {SCHEMA, CHANNEL}:
+                self._declare(opcode, records[start:at], damage)
+
+    def _records_in(self, content: bytes, offset: int, damage: Damage, *, is_cut: bool) -> bytes:
+        """The records of a chunk, or of its start where the file ends in it; none where it is damaged."""
+        try:
+            chunk = parse_record(CHUNK, content)
+            assert isinstance(chunk, Chunk)
+            if is_cut or len(chunk.records) < chunk.compressed_size:
+                return unpacked_start(chunk.records, chunk.compression, chunk.uncompressed_size)
+            records = self._budget.unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
+            is_known = self._whole is not None
+            if chunk.uncompressed_crc and not is_known and zlib.crc32(records) != chunk.uncompressed_crc:
+                raise BadBlockError("checksum differs")
+        except (BadRecordError, BadBlockError) as error:
+            if not is_cut:  # the cut has been counted
+                damage.add(f"{self.path.name}: the chunk at byte {offset} was left out: {error}")
+            return b""
+        return records
+
+    def _message(
+        self, records: bytes, start: int, end: int, offset: int, damage: Damage, names: Collection[str] | None
+    ) -> RawMessage | None:
+        """The message in these bytes of `records`, found at `offset`; None where it is not wanted or no message."""
+        if end - start < _MESSAGE.size:
+            damage.add(f"{self.path.name}: a message record of {end - start} bytes")
+            return None
+        channel, _, log_time_ns, _ = _MESSAGE.unpack_from(records, start)
+        topic = self._channels.get(channel)
+        if topic is None:
+            damage.add(f"{self.path.name}: a message of undeclared channel {channel}")
+            return None
+        if names is not None and topic.name not in names:
+            return None
+        data = records[start + _MESSAGE.size : end]
+        return RawMessage(topic=topic, log_time_ns=log_time_ns, data=data, file=self.path.name, offset=offset)
+
+    def _declare(self, opcode: int, content: bytes, damage: Damage) -> None:
+        """Take a schema, a channel or the statistics."""
+        try:
+            record = parse_record(opcode, content)
+        except BadRecordError as error:
+            damage.add(f"{self.path.name}: a schema or channel was left out: {error}")
+            return
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._add_channel(record)
+        elif isinstance(record, Statistics):
+            self._statistics = record
+
+    def _add_channel(self, channel: Channel) -> None:
+        schema = self._schemas.get(channel.schema_id)
+        self._channels[channel.id] = _topic(channel, schema)
+
+
+def _topic(channel: Channel, schema: Schema | None) -> Topic:
+    if schema is None:
+        return Topic(name=channel.topic, type_name="", encoding=channel.message_encoding)
+    is_ros, is_protobuf = schema.encoding in {"ros2msg", "ros2idl", "ros1msg"}, schema.encoding == "protobuf"
+    type_name, ros_type = ros_type_name(schema.name) if is_ros else schema.name, stands_for(schema.name)
+    return Topic(
+        name=channel.topic,
+        type_name=ros_type or type_name,
+        encoding=channel.message_encoding,
+        definition=schema.data.decode("utf-8" if is_ros else "latin-1", "replace") if is_ros or is_protobuf else "",
+        definition_format={"ros2idl": "idl", "protobuf": "protobuf"}.get(schema.encoding, "msg"),
+        schema=type_name if ros_type else "",
+    )
+
+
+def ros_type_name(name: str) -> str:
+    """``package/msg/Type`` of ROS 1's ``package/Type``; other names as they are."""
+    package, slash, kind = name.partition("/")
+    return f"{package}/msg/{kind}" if slash and "/" not in kind else name

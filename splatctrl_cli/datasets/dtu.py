@@ -1,0 +1,344 @@
+"""DTU scans in MVSNet's layout: reads real ones and writes ours.
+
+ROOT/Cameras/[train/]00000000_cam.txt (world-to-camera and K), ROOT/Cameras/pair.txt,
+ROOT/Rectified/SCAN_train/rect_001_3_r5000.png (view 0, light 3), ROOT/Depths_raw/SCAN/depth_map_0000.pfm with
+depth_visual_0000.png (above 10 where the depth counts). Lengths there are millimetres, here metres.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.pfm import read_pfm, write_pfm
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.logs.messages import decode_file
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
+
+MILLIMETRES = 1000.0
+LIGHT = 3  # of seven; the one MVSNet's own lists test with
+RAW = (1600, 1200)  # pixels of DTU's cameras; 640x512 is half of that, cropped about the middle
+CROPPED = (640, 512)
+CROP = (80, 44)  # pixels cut off left and top of the half-size image
+VISIBLE_ABOVE = 10  # of depth_visual
+PLAUSIBLE_DEPTH = (0.02, 20.0)  # [m] median of a scan
+LEAST_SPREAD = 0.005  # of the depth, by which the cameras stand apart
+BRIGHT = 128  # from which a mask says yes
+
+
+@dataclass(frozen=True, kw_only=True)
+class DtuView:
+    """One view: color (H, W, 3) uint8 RGB, depth (H, W) float32 [m] (0 = none), K in pixels, camera pose [m].
+
+    mask (H, W): True on the object, None where no mask is known.
+    """
+
+    name: str
+    color: UInt8
+    depth: Float32
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+    mask: Bool | None = None
+
+
+Shrink = Callable[[DtuView], DtuView]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DtuScan:
+    """The views of one scan, their numbers, the files that were read, and the names of views without_depth."""
+
+    name: str
+    views: tuple[DtuView, ...]
+    numbers: tuple[int, ...]
+    files: tuple[Path, ...]
+    without_depth: tuple[str, ...]
+
+
+def read_dtu(
+    root: Path, scan: str | None = None, masks: Path | None = None, shrink: Shrink = lambda view: view
+) -> DtuScan:
+    """The views of scan `scan` (default: the only one) of a DTU folder; `masks` holds NNN.png by view number.
+
+    `shrink` makes of each view the one that is kept, before the next is read.
+
+    K is scaled to the images (the file's K may be for 1600x1200 or for a quarter of the image). Depth of another
+    size than the image is sampled, not blended: a larger map at the pixels that the image's come from; a smaller map
+    sets only the pixels it was made for. A view without depth is left out. Raises InputError naming the file.
+    """
+    scan, folder = _scan_folder(root, scan)
+    images = _images(folder)
+    views: list[DtuView] = []
+    numbers: list[int] = []
+    files: list[Path] = []
+    without_depth: list[str] = []
+    for number, path in images.items():
+        color = read_image(path)
+        size = (color.shape[1], color.shape[0])
+        camera = _camera_file(root, number)
+        K, T_world_camera = _read_camera(camera)
+        depth_path = _depth_file(root, scan, number)
+        if depth_path is None:
+            without_depth.append(path.name)
+            continue
+        visual = depth_path.with_name(f"depth_visual_{number:04d}.png")
+        depth = read_depth(depth_path, visual, size)
+        mask_path = None if masks is None else _mask_file(masks, number)
+        numbers.append(number)
+        view = DtuView(
+            name=path.stem,
+            color=color,
+            depth=depth,
+            intrinsics=_fitted(K, size, camera),
+            T_world_camera=T_world_camera,
+            mask=None if mask_path is None else read_mask(mask_path, size),
+        )
+        views.append(shrink(view))
+        files += [path, camera, depth_path, *([visual] if visual.exists() else [])]
+        files += [] if mask_path is None else [mask_path]
+    if not views:
+        raise InputError(
+            f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
+        )
+    check_lengths(f"{root}: scan '{scan}'", views)
+    return DtuScan(
+        name=scan,
+        views=tuple(views),
+        numbers=tuple(numbers),
+        files=tuple(files),
+        without_depth=tuple(without_depth),
+    )
+
+
+def check_lengths(where: str, views: Sequence[DtuView]) -> None:
+    """Raise InputError where depth or the cameras' distances were no millimetres: of a table seen from near, not from
+    a thousandth or a thousand times as far."""
+    known = [view.depth[view.depth > 0] for view in views]
+    medians = [float(np.median(depth)) for depth in known if depth.size]
+    if not medians:
+        return
+    median, (low, high) = float(np.median(medians)), PLAUSIBLE_DEPTH
+    if not low <= median <= high:
+        raise InputError(
+            f"{where}: depth: expected {MILLIMETRES * low:g} to {MILLIMETRES * high:g} mm, got a median of"
+            f" {MILLIMETRES * median:.3g}",
+            remedy="lengths have to be millimetres; metres times 1000 are",
+        )
+    centers = np.array([view.T_world_camera[:3, 3] for view in views])
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    if 0 < spread < LEAST_SPREAD * median:
+        raise InputError(
+            f"{where}: cameras: expected millimetres, as the depth's median of {MILLIMETRES * median:.0f} mm, got"
+            f" cameras within {MILLIMETRES * spread:.3g} mm of their middle",
+            remedy="translations have to be millimetres; metres times 1000 are",
+        )
+
+
+def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
+    """Write views as one scan of a new DTU folder; a view's K is for its own image size."""
+    cameras = root / "Cameras"
+    rectified = root / "Rectified" / f"{scan}_train"
+    depths = root / "Depths_raw" / scan
+    for folder in (cameras, rectified, depths):
+        folder.mkdir(parents=True, exist_ok=True)
+    cameras.joinpath("pair.txt").write_text(_pairs(views), encoding="utf-8")
+    for number, view in enumerate(views):
+        cameras.joinpath(f"{number:08d}_cam.txt").write_text(_camera_text(view), encoding="utf-8")
+        image = rectified / f"rect_{number + 1:03d}_{LIGHT}_r5000.png"
+        image.write_bytes(cv2.imencode(".png", view.color[:, :, ::-1])[1].tobytes())
+        write_pfm(depths / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
+        visual = np.where(view.depth > 0, 255, 0).astype(np.uint8)
+        depths.joinpath(f"depth_visual_{number:04d}.png").write_bytes(cv2.imencode(".png", visual)[1].tobytes())
+
+
+def scan_folders(root: Path) -> dict[str, Path]:
+    """The folders of images by scan. Raises InputError where there is no Rectified."""
+    rectified = root / "Rectified"
+    if not rectified.is_dir():
+        raise InputError(
+            f"{root}: expected a DTU folder with Cameras, Rectified and Depths_raw, or scans with cameras_sphere.npz,"
+            " got none",
+            remedy="give the folder that holds Rectified, or the scans in IDR's layout",
+        )
+    return {path.name.removesuffix("_train"): path for path in sorted(rectified.iterdir()) if path.is_dir()}
+
+
+def _scan_folder(root: Path, scan: str | None) -> tuple[str, Path]:
+    folders = scan_folders(root)
+    if scan is None and len(folders) == 1:
+        scan = next(iter(folders))
+    if scan is None or scan not in folders:
+        got = "several scans" if scan is None else f"no scan '{scan}'"
+        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}")
+    return scan, folders[scan]
+
+
+def _images(folder: Path) -> dict[int, Path]:
+    """Image of each view number, of light 3 where there is a choice."""
+    found: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        match = re.fullmatch(r"rect_(\d+)_(\d+|max)(_r5000)?\.(png|jpg)", path.name)
+        if match:
+            number = int(match[1]) - 1
+            if number not in found or match[2] == str(LIGHT):
+                found[number] = path
+    if not found:
+        raise InputError(f"{folder}: expected images such as rect_001_3_r5000.png, got none")
+    return dict(sorted(found.items()))
+
+
+def read_image(path: Path) -> UInt8:
+    """The image (H, W, 3) as RGB, its orientation tag ignored. Raises InputError for what is none, or was cut."""
+    image = decode_file(path.read_bytes(), color=True) if path.is_file() else None
+    if image is None:
+        raise InputError(f"{path}: not an image that can be read", remedy="copy the file anew")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> Bool:
+    """(H, W) True where the image is bright in every channel; of another size, the nearest pixel says."""
+    image = read_image(path)
+    if image.shape[1::-1] != size:
+        width, height = size
+        if image.shape[1] * height != image.shape[0] * width:
+            raise InputError(
+                f"{path}: expected a mask of {width}x{height} or of that shape, got {image.shape[1]}x{image.shape[0]}"
+            )
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    return np.asarray((image >= BRIGHT).all(axis=2))
+
+
+def _mask_file(folder: Path, number: int) -> Path:
+    """``007.png`` or the like, in the folder or in its ``mask``, as IDR's archive and RegNeRF's have it."""
+    for place in (folder, folder / "mask"):
+        for path in sorted(place.glob("*.png")):
+            if path.stem.isdecimal() and int(path.stem) == number:
+                return path
+    raise InputError(
+        f"{folder}: expected a mask {number:03d}.png, got none", remedy="give the folder of this scan's masks"
+    )
+
+
+def _camera_file(root: Path, number: int) -> Path:
+    """The camera of the training images where there is one, else of the full images."""
+    candidates = [root / "Cameras" / part / f"{number:08d}_cam.txt" for part in ("train", ".")]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(f"{candidates[-1]}: missing", remedy="every image needs its camera file")
+
+
+def _read_camera(path: Path) -> tuple[Float64, Float64]:
+    """K (3, 3) as written and T_world_camera (4, 4) [m]."""
+    words = path.read_text(encoding="utf-8", errors="replace").split()
+    try:
+        extrinsic = np.array(words[words.index("extrinsic") + 1 :][:16], dtype=np.float64).reshape(4, 4)
+        K = np.array(words[words.index("intrinsic") + 1 :][:9], dtype=np.float64).reshape(3, 3)
+    except ValueError:
+        raise InputError(f"{path}: expected 'extrinsic' (4x4) and 'intrinsic' (3x3), got another text") from None
+    R = extrinsic[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise InputError(f"{path}: extrinsic: expected a rotation in its first three columns")
+    extrinsic[:3, 3] /= MILLIMETRES
+    return K, invert_transform(extrinsic)
+
+
+def _fitted(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
+    """K for an image of `size` (width, height), whichever of the sizes in use the file's K was made for.
+
+    Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). In an image made smaller they are at
+    (u + 0.5) scale - 0.5, as `shrunk` has it; but MVSNet's cameras for 640x512, and for a quarter of that, are
+    multiples of those for 1600x1200 (train/ has 4 x 82.9 = 823.2 / 2 - 80), and its loaders take them so.
+    """
+    width, height = size
+    shift, crop = 0.0, (0, 0)
+    if _is_centered(K, width, height):
+        scale = 1.0
+    elif _is_centered(K, width / 4, height / 4):
+        scale = 4.0
+    elif _is_centered(K, *RAW) and size == CROPPED:
+        scale, crop = 0.5, CROP
+    elif _is_centered(K, *RAW) and width * RAW[1] == height * RAW[0]:
+        scale = width / RAW[0]
+        shift = 0.5 * scale - 0.5
+    else:
+        raise InputError(
+            f"{path}: principal point ({K[0, 2]:g}, {K[1, 2]:g}) fits no image of {width}x{height}, nor a quarter of "
+            f"it, nor 1600x1200"
+        )
+    return Intrinsics(
+        fx=float(K[0, 0] * scale),
+        fy=float(K[1, 1] * scale),
+        cx=float(K[0, 2] * scale + shift - crop[0]),
+        cy=float(K[1, 2] * scale + shift - crop[1]),
+        width=width,
+        height=height,
+    )
+
+
+def _is_centered(K: Float64, width: float, height: float) -> bool:
+    return bool(abs(K[0, 2] / width - 0.5) < 0.1 and abs(K[1, 2] / height - 0.5) < 0.1)
+
+
+def _depth_file(root: Path, scan: str, number: int) -> Path | None:
+    for folder in (f"Depths_raw/{scan}", f"Depths/{scan}_train", f"Depths/{scan}"):
+        path = root / folder / f"depth_map_{number:04d}.pfm"
+        if path.is_file():
+            return path
+    return None
+
+
+def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
+    """Depth (H, W) [m] at the pixels of an image of `size` (width, height), 0 = none."""
+    depth = read_pfm(path)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth / np.float32(MILLIMETRES), np.float32(0))
+    if visual.is_file():
+        shown = cv2.cvtColor(read_image(visual), cv2.COLOR_RGB2GRAY)
+        if shown.shape != depth.shape:
+            raise InputError(f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
+        depth = np.where(shown > VISIBLE_ABOVE, depth, np.float32(0))
+    width, height = size
+    if depth.shape == (height, width):
+        return depth
+    if depth.shape == (RAW[1], RAW[0]) and size == CROPPED:
+        return np.ascontiguousarray(depth[2 * CROP[1] :: 2, 2 * CROP[0] :: 2][:height, :width])
+    smaller = depth.shape[1] // width
+    if smaller >= 2 and (width * smaller, height * smaller) == depth.shape[::-1]:
+        return np.ascontiguousarray(depth[smaller // 2 :: smaller, smaller // 2 :: smaller])
+    factor = width // depth.shape[1] if depth.shape[1] else 0
+    if factor >= 2 and (depth.shape[1] * factor, depth.shape[0] * factor) == size:
+        spread = np.zeros((height, width), dtype=np.float32)
+        spread[::factor, ::factor] = depth
+        return spread
+    raise InputError(f"{path}: {depth.shape[1]}x{depth.shape[0]} does not fit an image of {width}x{height}")
+
+
+def _camera_text(view: DtuView) -> str:
+    T_camera_world = invert_transform(view.T_world_camera)
+    T_camera_world[:3, 3] *= MILLIMETRES
+    k = view.intrinsics
+    K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+    known = view.depth[view.depth > 0].astype(np.float64) * MILLIMETRES
+    near, far = (float(np.floor(known.min())), float(np.ceil(known.max()))) if known.size else (425.0, 935.0)
+    rows = ["extrinsic", *_rows(T_camera_world), "", "intrinsic", *_rows(K), "", f"{near:g} {(far - near) / 191:.6g}"]
+    return "\n".join(rows) + "\n"
+
+
+def _rows(matrix: Float64) -> list[str]:
+    return [" ".join(f"{value + 0.0:.10g}" for value in row) for row in matrix]
+
+
+def _pairs(views: Sequence[DtuView]) -> str:
+    """For each view the others, nearest camera first; the score falls with the distance of the cameras [mm]."""
+    centers = np.array([view.T_world_camera[:3, 3] for view in views]) * MILLIMETRES
+    lines = [str(len(views))]
+    for number in range(len(views)):
+        gaps = np.linalg.norm(centers - centers[number], axis=1)
+        order = [int(i) for i in np.argsort(gaps, kind="stable") if i != number][:10]
+        words = [f"{other} {1e6 / (1000 + gaps[other]):.2f}" for other in order]
+        lines += [str(number), " ".join([str(len(order)), *words])]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,264 @@
+"""A folder of colour and depth images with a TOML description, as records."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.datasets.folder_description import CameraTable, Description, read_description
+from splatctrl_cli.datasets.folder_views import HOLDOUT, View, find_files, views_of
+from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import DAMAGE, npy_of
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.logs.masks import human_mask
+from splatctrl_cli.logs.messages import decode_file, metres, num_invalid
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.registration import DepthToColor, Undistortion
+from splatctrl_cli.logs.shot import Shot, check_depth, is_kept, is_png
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
+
+__all__ = ["HOLDOUT", "ImageFolderSource"]
+
+_NOT_FOR_FOLDERS = (
+    *("world_frame", "camera_topics", "camera_pose_topics", "human_topics"),
+    *("joint_topic", "stamps"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Lens:
+    """What a camera's images go through: undistortion and registration, where it needs them."""
+
+    intrinsics: Intrinsics
+    undistortion: Undistortion | None
+    registration: DepthToColor | None
+
+
+class ImageFolderSource:
+    """Records of an image folder; no joint states."""
+
+    joint_names: tuple[str, ...] = ()
+    world_frame = "world"
+
+    def __init__(self, path: Path, options: SourceOptions, description: Description | None = None) -> None:
+        options.refuse(_NOT_FOR_FOLDERS, "an image folder", path)
+        if description is None:
+            options.refuse(("intrinsics",), "a folder whose description has [camera]", path)
+        self.name = path.name
+        self._description = with_transforms(description or read_description(path, options.root))
+        self._loss = LossReport()
+        self._damaged: list[str] = []
+        self._num_invalid = 0
+        self._views = views_of(self._description, options, self._loss)
+        self._lenses: dict[str, _Lens] = {}
+        _check_names(path, {view.lens.name for view in self._views}, options)
+        names = tuple(sorted({view.camera for view in self._views}))
+        if options.cameras is not None:
+            for name in options.cameras:
+                if name not in names:
+                    raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(names)}")
+            self._views = [view for view in self._views if view.camera in options.cameras]
+        self.cameras = names if options.cameras is None else options.cameras
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the description says when the images were taken."""
+        stamps = self._description.stamps
+        return stamps.rate is not None or stamps.names
+
+    @property
+    def loss(self) -> LossReport:
+        """Unpaired and unposed images, and those that did not decode while `records` was read."""
+        loss = self._loss
+        return replace(
+            loss,
+            damaged=loss.damaged + len(self._damaged),
+            invalid_depth=self._num_invalid,
+            notes=[*loss.notes, *self._damaged],
+        )
+
+    def records(self) -> Iterator[Record]:
+        """Frames by stamp."""
+        for item in self.shots():
+            yield item.frame if isinstance(item, Shot) else item
+
+    def shots(self) -> Iterator[Shot | JointState]:
+        """Shots by stamp."""
+        self._damaged, self._num_invalid = [], 0
+        checked: set[str] = set()
+        for view in self._views:
+            shot = self._shot(view)
+            if shot is None:
+                continue
+            if view.camera not in checked and check_depth(shot.frame.depth, str(view.depth), view.depth_scale):
+                checked.add(view.camera)
+            yield shot
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every view."""
+        return ((view.stamp_ns, view.camera, view.T_world_camera) for view in self._views)
+
+    def count_views(self) -> dict[str, int]:
+        """Views by camera."""
+        return {name: sum(view.camera == name for view in self._views) for name in self.cameras}
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the description, the pose file and the images, by path below the root."""
+        return dict(self._digests)
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
+        description = self._description
+        of_views = ((view.color, view.depth, view.human, view.valid) for view in self._views)
+        files = [path for paths in of_views for path in paths if path is not None]
+        if description.poses is not None:
+            files.extend(path for _, path in find_files(description.root, description.poses.file))
+        named = {str(path.relative_to(description.root)): path for path in files}
+        first = {description.path.name: description.path} if description.path.is_file() else {}
+        return {name: sha256(path) for name, path in {**first, **dict(sorted(named.items()))}.items()}
+
+    def _shot(self, view: View) -> Shot | None:
+        color_bytes = view.color.read_bytes()
+        color = decode_file(color_bytes, color=True)
+        depth = self._depth(view)
+        if color is None or depth is None:
+            broken = view.color if color is None else view.depth
+            self._damaged.append(f"{broken}: not an image that can be read")
+            return None
+        lens = self._lens(view)
+        _check_size(view.color, color, view.lens)
+        if self._description.is_depth_resized:
+            depth = cv2.resize(depth, (view.lens.width, view.lens.height), interpolation=cv2.INTER_NEAREST)
+        _check_size(view.depth, depth, self._description.depth_camera or view.lens)
+        if lens.registration is not None:
+            depth = lens.registration.warp(depth)
+        if lens.undistortion is not None:
+            color = lens.undistortion.color(np.asarray(color))
+            depth = lens.undistortion.depth(depth) if lens.registration is None else depth
+        human = None if view.human is None else self._human(view.human, lens)
+        valid = self._valid(view, lens)
+        depth = depth if valid is None else np.where(valid, depth, np.float32(0))
+        is_counts = lens.registration is None and not _is_float(self._description.depth.encoding, view.depth)
+        is_plain = lens.undistortion is None
+        return Shot.of(
+            RgbdFrame(
+                stamp_ns=view.stamp_ns,
+                camera=view.camera,
+                color=np.asarray(color, dtype=np.uint8),
+                depth=np.asarray(depth, dtype=np.float32),
+                intrinsics=lens.intrinsics,
+                T_world_camera=view.T_world_camera,
+                human=human,
+                valid=valid,
+            ),
+            color_file=color_bytes if is_plain and is_kept(color_bytes) else None,
+            depth_unit=view.depth_scale if is_counts else None,
+            depth_file=self._depth_file(view) if is_counts and is_plain and valid is None else None,
+            origin=f"{view.color.name} {view.depth.name}",
+        )
+
+    def _depth_file(self, view: View) -> bytes | None:
+        """The PNG of a view's depth, where its counts are the depth as they are."""
+        table = self._description.depth
+        if table.encoding != "uint16" or table.invalid > 0 or self._description.is_depth_resized:
+            return None
+        data = view.depth.read_bytes()
+        return data if is_png(data) else None
+
+    def _lens(self, view: View) -> _Lens:
+        """That of a view's camera, made once."""
+        table = view.lens
+        if table.name not in self._lenses:
+            undistortion, depth_camera = _undistortion(table), self._description.depth_camera
+            registration = None
+            if depth_camera is not None:
+                registration = DepthToColor(
+                    depth_intrinsics=depth_camera.intrinsics,
+                    color_intrinsics=table.intrinsics,
+                    T_color_depth=self._description.T_color_depth,
+                    undistortion=_undistortion(depth_camera),
+                )
+            self._lenses[table.name] = _Lens(
+                intrinsics=table.intrinsics, undistortion=undistortion, registration=registration
+            )
+        return self._lenses[table.name]
+
+    def _valid(self, view: View, lens: _Lens) -> Bool | None:
+        """Pixels that the lens saw and the view's mask leaves; a mask that cannot be read leaves none."""
+        seen = None if lens.undistortion is None else lens.undistortion.valid
+        if view.valid is None:
+            return seen
+        mask = self._human(view.valid, lens)
+        if mask is None:
+            return np.zeros((lens.intrinsics.height, lens.intrinsics.width), np.bool_)
+        return np.asarray((mask > 0) if seen is None else (mask > 0) & seen)
+
+    def _human(self, path: Path, lens: _Lens) -> UInt8 | None:
+        pixels = decode_file(path.read_bytes(), color=False)
+        if pixels is None:
+            self._damaged.append(f"{path}: not an image that can be read")
+            return None
+        human = human_mask(pixels, lens.intrinsics, str(path))
+        return human if lens.undistortion is None else lens.undistortion.labels(human)
+
+    def _depth(self, view: View) -> Float32 | None:
+        table, path = self._description.depth, view.depth
+        if _is_float(table.encoding, path):
+            pixels = _float_pixels(path)
+            if pixels is None:
+                return None
+            self._num_invalid += num_invalid(pixels)
+            depth = pixels * np.float32(view.depth_scale)
+            return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+        counts = decode_file(path.read_bytes(), color=False)
+        if counts is None:
+            return None
+        if counts.dtype != np.uint16 or counts.ndim != 2:
+            raise InputError(
+                f"{path}: expected a 16-bit grey image, got {counts.dtype} with {counts.ndim} axes",
+                remedy="see docs/input.md",
+            )
+        if table.encoding == "uint16-rotated3":
+            counts = (counts >> 3) | (counts << 13)
+        return metres(np.where(counts == table.invalid, np.uint16(0), counts), view.depth_scale)
+
+
+def _is_float(encoding: str, path: Path) -> bool:
+    """Whether a depth file holds floats; a .npy does, whatever the others of its folder are (nerfstudio)."""
+    return encoding == "float32" or path.suffix == ".npy"
+
+
+def _undistortion(camera: CameraTable) -> Undistortion | None:
+    if not np.any(camera.distortion):
+        return None
+    return Undistortion(camera.intrinsics, camera.distortion_model, np.array(camera.distortion, dtype=np.float64))
+
+
+def _check_names(path: Path, lenses: set[str], options: SourceOptions) -> None:
+    for name in (*options.camera_poses, *options.intrinsics):
+        if name not in lenses:
+            raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(sorted(lenses))}")
+
+
+def _float_pixels(path: Path) -> NDArray[np.float32] | None:
+    if path.suffix == ".npy":
+        try:
+            return np.asarray(npy_of(path.read_bytes()), dtype=np.float32)
+        except DAMAGE:
+            return None
+    pixels = decode_file(path.read_bytes(), color=False)
+    return None if pixels is None else pixels.astype(np.float32)
+
+
+def _check_size(path: Path, pixels: NDArray[Any], camera: CameraTable) -> None:
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",
+            remedy="correct the size, or describe the depth camera in [depth_camera]",
+        )

@@ -1,0 +1,167 @@
+"""nerfstudio's and instant-ngp's ``transforms.json`` with depth: lens, files and pose of each frame, or one lens.
+
+Fields, defaults and axes (OpenGL) are those of nerfstudio's documentation ("Data conventions") and of its
+nerfstudio/data/dataparsers/nerfstudio_dataparser.py and data/utils/data_utils.py: masks are 0 where a pixel is not to
+be used, depth of another size is brought to that of the images by nearest pixels, and poses that were scaled
+(``applied_scale``) are scaled back, so that they fit metric depth. instant-ngp says ``depth_path``,
+``integer_depth_scale`` [m per count], ``camera_angle_x``, ``is_fisheye``, and leaves the centre out where it is the
+image's (NVlabs/instant-ngp, scripts/nerfcapture2nerf.py, and src/nerf_loader.cu).
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.datasets.folder_description import (
+    CameraTable,
+    DepthTable,
+    Description,
+    ListedView,
+    PosesTable,
+    SplitTable,
+    StampsTable,
+)
+from splatctrl_cli.datasets.layout import Lenses, image_size
+from splatctrl_cli.datasets.poses import read_nerfstudio
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.records import Float64
+
+FILE = "transforms.json"
+_RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # nerfstudio's CAMERA_MODEL_TO_TYPE
+_MODELS = {**dict.fromkeys(_RADIAL, "plumb_bob"), "OPENCV_FISHEYE": "equidistant"}
+_DEPTHS = ("depth_file_path", "depth_path")
+_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
+
+
+def matches(folder: Path) -> bool:
+    """Whether the folder has a transforms.json."""
+    return (folder / FILE).is_file()
+
+
+def read(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description; depth is in millimetres unless the file or --depth-scale says otherwise."""
+    options.refuse(("intrinsics",), "a folder with transforms.json", folder)
+    description = Description(
+        path=folder / FILE,
+        root=folder,
+        poses=PosesTable(format="nerfstudio", file=FILE, axes="opengl"),
+        camera=None,
+        depth_camera=None,
+        frames=None,
+        depth=DepthTable(),
+        stamps=StampsTable(),
+        split=SplitTable(),
+    )
+    return with_transforms(description)
+
+
+def with_transforms(description: Description) -> Description:
+    """With the camera and the views of a transforms.json where the description leaves them to it."""
+    table = description.poses
+    is_whole = bool(description.listed or (description.camera and description.frames))
+    if is_whole or table is None or table.format != "nerfstudio":
+        return description
+    path = description.root / table.file
+    content, matrices = read_nerfstudio(path)
+    lenses = Lenses()
+    views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
+    if not views:
+        raise InputError(f"{path}: no frames", remedy="give a transforms.json with frames")
+    if description.frames is not None:
+        if len(lenses) > 1:
+            raise InputError(
+                f"{path}: {len(lenses)} different lenses beside [frames]",
+                remedy="leave [frames] out, or give [camera]",
+            )
+        return replace(description, camera=views[0].camera)
+    listed = tuple(sorted(_short(views), key=lambda v: v.name))
+    return replace(description, camera=views[0].camera, listed=listed, is_depth_resized=True)
+
+
+def _view(
+    content: dict[str, Any],
+    entry: dict[str, Any],
+    path: Path,
+    lenses: Lenses,
+    description: Description,
+    matrices: dict[str, Float64],
+) -> ListedView:
+    """A frame; its own values stand before those of the file."""
+    name, said = str(entry["file_path"]), {**content, **entry}
+    color = _image(path.parent / name)
+    depth = next((str(entry[key]) for key in _DEPTHS if entry.get(key)), None)
+    if depth is None and description.frames is None:
+        raise InputError(
+            f"{path}: {name}: depth_file_path is missing",
+            remedy="record depth, or give [frames] in a description (docs/input.md)",
+        )
+    scale = next((said[key] for key in _SCALES if key in said), None)
+    mask = entry.get("mask_path")
+    try:
+        applied = float(content.get("applied_scale", 1.0))
+        matrix = matrices[name].copy()
+        matrix[:3, 3] *= 1.0 / applied
+        unit = None if scale is None else float(scale)
+    except (TypeError, ValueError, ZeroDivisionError) as error:
+        raise InputError(f"{path}: {name}: expected numbers, got {error}", remedy="correct the file") from None
+    return ListedView(
+        name=name,
+        color=color,
+        depth=path.parent / (depth or ""),
+        matrix=matrix,
+        camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
+        depth_scale=unit,
+        valid=None if not mask else path.parent / str(mask),
+    )
+
+
+def _image(path: Path) -> Path:
+    """An image by a name that may leave `.png` or `.jpg` out, as Blender's scenes do."""
+    if path.suffix:
+        return path
+    return next((file for end in (".png", ".jpg") if (file := path.with_name(path.name + end)).is_file()), path)
+
+
+def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
+    """The lens of a frame."""
+    model = "OPENCV_FISHEYE" if said.get("is_fisheye") else str(said.get("camera_model", "OPENCV"))
+    if model not in _MODELS:
+        raise InputError(
+            f"{path}: camera_model: expected one of {', '.join(_MODELS)}, got {model!r}",
+            remedy="undistort the images",
+        )
+    keys = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2", "k3")
+    try:
+        distortion = [float(said.get(key, 0.0)) for key in keys]
+        if "k4" not in keys and float(said.get("k4", 0.0)):
+            raise InputError(
+                f"{path}: camera_model {model}: expected no k4, got {said['k4']}", remedy="undistort the images"
+            )
+        width, height = (int(said["w"]), int(said["h"])) if {"w", "h"} <= said.keys() else image_size(image)
+        fx = float(said["fl_x"]) if "fl_x" in said else width / 2 / math.tan(float(said["camera_angle_x"]) / 2)
+        return CameraTable(
+            width=width,
+            height=height,
+            fx=fx,
+            fy=float(said.get("fl_y", fx)),
+            cx=float(said.get("cx", width / 2)),
+            cy=float(said.get("cy", height / 2)),
+            pixel_center=0.5,  # nerfstudio's convention
+            distortion=distortion if np.any(distortion) else [],
+            distortion_model=_MODELS[model],
+        )
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        remedy = "give [camera] and [frames] in a description"
+        raise InputError(f"{path}: no usable {error} of the lens", remedy=remedy) from None
+
+
+def _short(views: list[ListedView]) -> list[ListedView]:
+    """Views by the stem of their colour file where that is theirs alone, else by its path without suffix."""
+    stems = [Path(view.name).stem for view in views]
+    if len(set(stems)) == len(stems):
+        return [replace(view, name=stem) for view, stem in zip(views, stems, strict=True)]
+    return [replace(view, name=str(Path(view.name).with_suffix(""))) for view in views]

@@ -1,0 +1,71 @@
+"""SUN3D: ``image/NUMBER-MICROSECONDS.jpg``, ``depth/NUMBER-MICROSECONDS.png``, ``intrinsics.txt``, ``extrinsics/``.
+
+As the dataset's own reader takes them (SUN3DreaderWithAnnotation, readSUN3Dannotation.m): depth with its bits rotated
+left by three, in millimetres, registered to colour; the depth nearest in time belongs to an image; the last file of
+``extrinsics/`` holds a 3x4 matrix for each image in order, camera to world; the first pixel's centre is at 1.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
+from splatctrl_cli.datasets.layout import described, given_lens, image_size, images_of, pose_or_none
+from splatctrl_cli.datasets.layout_tum import paired_views
+from splatctrl_cli.datasets.poses import read_numbers, stamp_of_text
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.records import Float64
+
+
+def matches(folder: Path) -> bool:
+    """Whether the folder is such a sequence."""
+    has_folders = all((folder / name).is_dir() for name in ("image", "depth", "extrinsics"))
+    return has_folders and (folder / "intrinsics.txt").is_file()
+
+
+def read(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description; images within the pairing tolerance of a depth image."""
+    colors, depths = _by_stamp(folder / "image"), _by_stamp(folder / "depth")
+    extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
+    poses = _poses(extrinsics[-1]) if extrinsics else []
+    at = {stamp_ns: pose_or_none(poses[index]) for index, (stamp_ns, _) in enumerate(colors) if index < len(poses)}
+    views, unpaired = paired_views(colors, depths, at.get, options)
+    return described(
+        folder,
+        folder,
+        views,
+        poses=PosesTable(format="matrix-rows", file="extrinsics/*.txt"),
+        camera=given_lens(options, views[0].color) or _lens(folder, views[0].color) if views else None,
+        depth=DepthTable(encoding="uint16-rotated3"),
+        has_stamps=True,
+        unpaired=unpaired,
+    )
+
+
+def _by_stamp(folder: Path) -> list[tuple[int, Path]]:
+    found = [(stamp_of_text(f"{path.stem.partition('-')[2]}e-6"), path) for path in images_of(folder).values()]
+    return [(stamp_ns, path) for stamp_ns, path in found if stamp_ns is not None]
+
+
+def _poses(path: Path) -> list[Float64]:
+    """T_world_camera (4, 4) of each image."""
+    values = read_numbers(path)
+    if len(values) % 12:
+        raise InputError(f"{path}: expected 3x4 matrices, got {len(values)} numbers", remedy="copy the file again")
+    rows = np.array(values).reshape(-1, 3, 4)
+    bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))
+    return list(np.concatenate([rows, bottom], axis=1))
+
+
+def _lens(folder: Path, image: Path) -> CameraTable:
+    file = folder / "intrinsics.txt"
+    values = read_numbers(file)
+    if len(values) != 9:
+        raise InputError(
+            f"{file}: expected a 3x3 matrix, got {len(values)} numbers",
+            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+        )
+    width, height = image_size(image)
+    fx, _, cx, _, fy, cy = values[:6]
+    return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, pixel_center=1.0)

@@ -1,0 +1,177 @@
+"""TUM RGB-D and what others publish in its form: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, all by stamps.
+
+Depth counts 1/5000 m. Files, factor and cameras are those of the dataset's page (Sturm et al., A benchmark for the
+evaluation of RGB-D SLAM systems, IROS 2012; "File Formats" and "Intrinsic Camera Calibration"; the same in
+raulmur/ORB_SLAM2, Examples/RGB-D/TUM1.yaml to TUM3.yaml). Poses are those of the colour camera. Depth is registered
+to the colour image as it was taken, so both are undistorted alike.
+
+Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and the camera in the frame of the markers
+that groundtruth.txt follows, T_camera = T_ros^-1 T_groundtruth T_ros T_m. The rotation of T_m has a scale of 1.059
+there, which is left out. ETH3D SLAM (Schöps et al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ListedView, PosesTable
+from splatctrl_cli.datasets.layout import described, given_lens, pinhole
+from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.pairing import pair_by_stamp
+from splatctrl_cli.records import Float64
+
+SCALE = 1.0 / 5000.0  # [m] per count
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """A series of recordings: the pattern of its names, fx, fy, cx, cy and k1, k2, p1, p2, k3."""
+
+    pattern: str
+    lens: tuple[float, float, float, float]
+    distortion: tuple[float, ...] = ()
+
+
+SERIES = (
+    Series(
+        pattern="(freiburg|fr)_?1",
+        lens=(517.3, 516.5, 318.6, 255.3),
+        distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    ),
+    Series(
+        pattern="(freiburg|fr)_?2",
+        lens=(520.9, 521.0, 325.1, 249.7),
+        distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    ),
+    Series(pattern="(freiburg|fr)_?3", lens=(535.4, 539.2, 320.1, 247.6)),
+    Series(
+        pattern="bonn",
+        lens=(542.822841, 542.576870, 315.593520, 237.756098),
+        distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0),
+    ),
+)
+_BONN = SERIES[-1]
+_BONN_T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_BONN_SCALE = 1.0593  # of the rotation below, as published
+_BONN_T_M = np.array(
+    [
+        [1.0157 / _BONN_SCALE, 0.1828 / _BONN_SCALE, -0.2389 / _BONN_SCALE, 0.0113],
+        [0.0009 / _BONN_SCALE, -0.8431 / _BONN_SCALE, -0.6413 / _BONN_SCALE, -0.0098],
+        [-0.3009 / _BONN_SCALE, 0.6147 / _BONN_SCALE, -0.8085 / _BONN_SCALE, 0.0111],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+_BONN_NOTE = (
+    "Bonn: poses are moved from the markers to the camera as its page says, without the scale of 1.059 in that"
+    " transform; depth is as published (--depth-scale 2.1186e-4 scales it by as much)"
+)
+
+
+def matches(folder: Path) -> bool:
+    """Whether the folder lists its images in rgb.txt and depth.txt."""
+    return all((folder / name).is_file() for name in ("rgb.txt", "depth.txt"))
+
+
+def read(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description: pairs within the pairing tolerance, poses interpolated."""
+    colors, depths = listed(folder / "rgb.txt"), listed(folder / "depth.txt")
+    series = _series(folder)
+    file = folder / "groundtruth.txt"
+    trajectory = Trajectory(read_tum(file) if file.is_file() else {})
+    views, unpaired = paired_views(colors, depths, trajectory.at, options)
+    if series is _BONN:
+        views = [_from_markers(view) for view in views]
+    return described(
+        folder / "rgb.txt",
+        folder,
+        views,
+        poses=PosesTable(format="tum", file=file.name),
+        camera=_lens(folder, series, options, views[0].color) if views else None,
+        depth=DepthTable(scale=SCALE),
+        has_stamps=True,
+        unpaired=unpaired,
+        notes=(_BONN_NOTE,) if series is _BONN else (),
+    )
+
+
+def paired_views(
+    colors: list[tuple[int, Path]],
+    depths: list[tuple[int, Path]],
+    pose_at: Callable[[int], Float64 | None],
+    options: SourceOptions,
+) -> tuple[list[ListedView], tuple[int, int]]:
+    """Views of stamps [ns] and files, posed where a pose is known, and how many files have no partner."""
+    tolerance_ns = round(options.pairing_tolerance_s * 1e9)
+    pairs = pair_by_stamp([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns)
+    views = [
+        ListedView(
+            name=f"{colors[i][0] / 1e9:.6f}",
+            color=colors[i][1],
+            depth=depths[j][1],
+            matrix=pose_at(colors[i][0]),
+            stamp_ns=colors[i][0],
+        )
+        for i, j in pairs
+    ]
+    return views, (len(colors) - len(pairs), len(depths) - len(pairs))
+
+
+def listed(path: Path) -> list[tuple[int, Path]]:
+    """Stamp [ns] and file of each line ``stamp path``."""
+    found = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        words = line.split()
+        if words and not line.startswith("#"):
+            stamp_ns = stamp_of_text(words[0])
+            if stamp_ns is None or len(words) != 2:
+                raise InputError(f"{path}:{number}: expected 'stamp file', got {line!r}", remedy="correct the line")
+            found.append((stamp_ns, path.parent / words[1]))
+    return found
+
+
+def _series(folder: Path) -> Series | None:
+    """The series of recordings that a folder's name is of, else the name in the heads of its lists."""
+    names = [folder.resolve().name]
+    for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        if (folder / file).is_file():
+            with (folder / file).open(encoding="utf-8", errors="replace") as stream:
+                names += [line for line in stream.readlines(1000)[:4] if line.startswith("#")]
+    pairs = ((name.lower(), series) for name in names for series in SERIES)
+    return next((series for name, series in pairs if re.search(rf"(?<![a-z]){series.pattern}(?!\d)", name)), None)
+
+
+def _lens(folder: Path, series: Series | None, options: SourceOptions, image: Path) -> CameraTable:
+    given = given_lens(options, image)
+    if given is not None:
+        return given
+    calibration = folder / "calibration.txt"
+    if calibration.is_file():
+        values = read_numbers(calibration)
+        if len(values) != 4:
+            raise InputError(
+                f"{calibration}: expected fx fy cx cy, got {len(values)} numbers",
+                remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+            )
+        return pinhole(values, image)
+    if series is not None:
+        return pinhole(series.lens, image, series.distortion)
+    raise InputError(
+        f"{folder}: expected calibration.txt, or a name with one of freiburg1, freiburg2, freiburg3, bonn, whose"
+        f" cameras are known, got {folder.name!r}",
+        remedy="give --intrinsics camera=FX,FY,CX,CY (the Kinect's default: 525,525,319.5,239.5)",
+    )
+
+
+def _from_markers(view: ListedView) -> ListedView:
+    return view if view.matrix is None else replace(view, matrix=marker_to_camera(view.matrix))
+
+
+def marker_to_camera(T_ground_truth: Float64) -> Float64:
+    """T_world_camera (4, 4) of a pose in Bonn's groundtruth.txt."""
+    T_world_camera: Float64 = _BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m")
+    return T_world_camera

@@ -1,0 +1,93 @@
+"""The dataset layouts that are known by their own files, so that their folders need no description."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatctrl_cli.captures.capture_journal import check_not_partial
+from splatctrl_cli.datasets import (
+    layout_arkit,
+    layout_bop,
+    layout_frames,
+    layout_icl,
+    layout_nerfstudio,
+    layout_redwood,
+    layout_replica,
+    layout_scannet,
+    layout_sun3d,
+    layout_tum,
+)
+from splatctrl_cli.datasets.folder_description import Description
+from splatctrl_cli.datasets.image_folder import ImageFolderSource
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.listing import names_in
+from splatctrl_cli.logs.options import SourceOptions
+
+_LOGS = (".mcap", ".bag", ".db3")
+_MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is none itself
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """A layout: its name, whether a folder has it, and the folder as a description."""
+
+    name: str
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, SourceOptions], Description]
+
+
+LAYOUTS = tuple(
+    Layout(name=name, matches=module.matches, read=module.read)
+    for name, module in (
+        ("TUM RGB-D", layout_tum),
+        ("BOP scene", layout_bop),
+        ("ScanNet export", layout_scannet),
+        ("7-Scenes", layout_frames),
+        ("nerfstudio", layout_nerfstudio),
+        ("ICL-NUIM", layout_icl),
+        ("Replica", layout_replica),
+        ("ARKitScenes", layout_arkit),
+        ("SUN3D", layout_sun3d),
+        ("Open3D scene", layout_redwood),
+    )
+)
+
+
+def layout_of(folder: Path) -> Layout | None:
+    """The layout of a folder, None where it has none of these."""
+    return next((layout for layout in LAYOUTS if layout.matches(folder)), None)
+
+
+def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
+    """The records of a dataset's folder. Raises InputError where it has no layout that is known."""
+    check_not_partial(folder)
+    layout = layout_of(folder)
+    if layout is None:
+        names = ", ".join(known.name for known in LAYOUTS)
+        inside = readable_in(folder)
+        raise InputError(
+            f"{folder}: a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
+            remedy=f"give one that is in it: {inside}"
+            if inside
+            else "give the capture, the bag, one scene of the dataset, or for other images a .toml (docs/input.md)",
+        )
+    options.refuse(("root",), f"a folder laid out as {layout.name}", folder)
+    return ImageFolderSource(folder, options, layout.read(folder, options))
+
+
+def readable_in(folder: Path) -> str:
+    """What of a folder can be read by itself, in words; empty where nothing."""
+    found = []
+    for name in names_in(folder)[:_MOST_LOOKED_AT]:
+        path = folder / name
+        if path.is_file() and path.suffix in _LOGS:
+            found.append(path.name)
+        elif path.is_dir() and (layout := layout_of(path)) is not None:
+            found.append(f"{path.name} ({layout.name})")
+        elif path.is_dir() and (path / "metadata.yaml").is_file():
+            found.append(f"{path.name} (ROS 2 bag)")
+        elif path.is_dir() and (path / "capture.json").is_file():
+            found.append(f"{path.name} (capture)")
+    return ", ".join(found[:_MOST_NAMED]) + (
+        f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    )

@@ -1,0 +1,253 @@
+"""Outputs that appear whole or not at all, and the ``run.json`` in every output folder."""
+
+import errno
+import hashlib
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli import __version__
+from splatctrl_cli.errors import UsageError, WriteError
+from splatctrl_cli.files.output_lock import held, remove
+
+MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
+PARTIAL = ".partial"  # ends the name of an output that is not whole
+PACKAGES = ("numpy", "scipy", "torch", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
+_WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
+WITH_PARTS = ("reconstruct", "sdf-bake", "replay")  # commands whose folders others rely on
+NO_PARTS = ("run.json", "checkpoint")  # what holds the digests, and what only an interrupted run reads
+
+
+def is_write_failure(error: OSError, output: Path | None = None) -> bool:
+    """Whether `error` came from writing: a disk that is full or broken, or a file in `output`. Else from reading."""
+    if error.errno in _WRITE_FAILURES:
+        return True
+    if output is None or not isinstance(error.filename, str):
+        return False
+    return Path(error.filename).absolute().is_relative_to(output.absolute())
+
+
+@contextmanager
+def output_path(
+    path: Path, *, force: bool, is_folder: bool, checkpoint: str | None = None, resume: bool = False
+) -> Iterator[Path]:
+    """Yield ``NAME.partial`` (an empty folder, or a file name to write to); rename it to `path` on success.
+
+    A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``. `checkpoint` names the file in that
+    folder from which a run can go on: where it is there, a failure to write leaves the folder, too. With `resume`
+    such a folder is yielded as it is, and no failure removes it.
+    Where `path` is a link, all of this happens to what it leads to, and the link stays.
+    Raises UsageError when `path` has no name of its own, exists without `force`, is not of the kind to write, is
+    a folder that no command wrote, or is being written by another run, and when its parent cannot be written;
+    WriteError where `is_write_failure` (a full disk); every other error as it is.
+    """
+    try:
+        path = followed(path)
+        _check_replaceable(path, is_folder=is_folder)
+        _check_not_there(path, force=force)
+        partial = partial_path(path)
+        partial.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
+
+    def can_go_on() -> bool:
+        return checkpoint is not None and (partial / checkpoint).is_file()
+
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held(partial, is_folder=is_folder))
+            is_resumed = resume and can_go_on()
+            if not is_resumed:
+                _empty(partial)
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be written: {error.strerror}", remedy="give another --out") from None
+        try:
+            _check_not_there(path, force=force)  # another run may have ended since
+            yield partial
+            _replace(partial, path)
+        except Exception as error:
+            failed_to_write = isinstance(error, OSError) and is_write_failure(error, partial)
+            is_kept = can_go_on() and (failed_to_write or is_resumed)
+            if not is_kept:
+                remove(partial)
+            if isinstance(error, OSError) and failed_to_write:
+                remedy = f"make room and go on from {partial} with --resume" if is_kept else "make room"
+                raise WriteError(
+                    f"{error.filename or path}: writing failed: {error.strerror or error}",
+                    remedy=f"{remedy}, or give another --out",
+                ) from error
+            raise
+
+
+def followed(path: Path) -> Path:
+    """Where an output is written: a link stays, and what it leads to is replaced. Raises UsageError for a loop."""
+    if not path.is_symlink():
+        return path
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise UsageError(f"{path}: is a link to itself", remedy="give another --out")
+    return target
+
+
+def partial_path(path: Path) -> Path:
+    """``NAME.partial``, under which an output is written: beside what a link leads to."""
+    target = followed(path)
+    return target.with_name(target.name + PARTIAL)
+
+
+def check_can_be_written(path: Path) -> None:
+    """Raise UsageError for an output that no command can write, before any work: its nearest folder says so."""
+    try:
+        target = followed(path).absolute()
+        above = next(folder for folder in target.parents if folder.exists())
+        is_good = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
+        reason = "" if is_good else f"{above} is {'read-only' if above.is_dir() else 'no folder'}"
+    except OSError as error:
+        reason = str(error.strerror)
+    if reason:
+        raise UsageError(f"{path}: cannot be written: {reason}", remedy="give another --out")
+
+
+def write_durably(path: Path, write: Callable[[Path], object]) -> None:
+    """Call `write` with a temporary name, and put what it wrote in the place of `path` in one step, on disk."""
+    temporary = path.with_name(path.name + ".new")
+    try:
+        write(temporary)
+        flush(temporary)
+        temporary.replace(path)
+        flush(path.parent)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def flush(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _check_replaceable(path: Path, *, is_folder: bool) -> None:
+    """Raise UsageError where --force could remove what no command wrote: a folder is ours if empty or marked."""
+    if path.name in ("", ".."):
+        raise UsageError(f"{path}: has no name of its own to write under", remedy="give another --out")
+    if is_folder and path.is_file():
+        raise UsageError(f"{path}: is a file, expected a folder to write", remedy="give another --out")
+    if not is_folder and path.is_dir():
+        raise UsageError(f"{path}: is a folder, expected a file to write", remedy="give another --out")
+    if path.is_dir() and any(path.iterdir()) and not any((path / name).is_file() for name in MARKERS):
+        raise UsageError(f"{path}: was not written by splatctrl (no run.json)", remedy="give another --out")
+
+    if path.is_dir() and os.path.ismount(path):
+        raise UsageError(f"{path}: is where a disk is mounted", remedy="give a folder in it")
+    if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+        raise UsageError(f"{path}: cannot be replaced: it is read-only", remedy="give another --out")
+
+
+def _check_not_there(path: Path, *, force: bool) -> None:
+    if not force and path.exists():
+        raise UsageError(f"{path}: already exists", remedy="give --force to replace it, or another --out")
+
+
+def _empty(partial: Path) -> None:
+    if partial.is_dir():
+        for entry in partial.iterdir():
+            remove(entry)
+    else:
+        os.truncate(partial, 0)
+
+
+def _replace(partial: Path, path: Path) -> None:
+    old = path.with_name(path.name + ".partial.old")  # no name that a person gives to a copy
+    if path.is_dir() and not path.is_symlink():
+        remove(old)
+        path.rename(old)
+        partial.rename(path)
+    else:
+        partial.replace(path)
+    remove(old)  # also that of a run which was killed right above
+
+
+class Stopwatch:
+    """Wall time by stage, for ``run.json``."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of the block to stage `name`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def part_digests(folder: Path) -> dict[str, str]:
+    """sha256 by name, relative to `folder`, of every file in it and in its folders."""
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return {name: sha256(folder / name) for name in names if name.partition("/")[0] not in NO_PARTS}
+
+
+def write_run(
+    folder: Path,
+    *,
+    command: str,
+    config: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    metrics: Mapping[str, Any],
+    stopwatch: Stopwatch,
+    seed: int = 0,
+    verdict: Mapping[str, Any] | None = None,
+) -> None:
+    """Write ``run.json``: what ran, with what, on what (sha256 by name), how long, what came out and, of a command
+    that judges, its verdict; of WITH_PARTS also the sha256 of every file, which is checked when one is opened: it is
+    to be written last.
+
+    ``--resume`` is left out of the arguments: an interrupted run leaves what an uninterrupted one does.
+    """
+    run = {
+        "command": command,
+        "arguments": [argument for argument in sys.argv[1:] if argument != "--resume"],
+        "splatctrl": __version__,
+        "versions": {name: metadata.version(name) for name in PACKAGES},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "seed": seed,
+        "config": config,
+        "inputs": inputs,
+        "metrics": metrics,
+        **({} if verdict is None else {"verdict": verdict}),
+        "seconds": {name: round(value, 4) for name, value in stopwatch.seconds.items()},
+    }
+    if command in WITH_PARTS:
+        run["parts"] = part_digests(folder)
+    write_json(folder / "run.json", run)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Indented JSON without NaN, ending in a newline."""
+    path.write_text(json.dumps(value, indent=2, allow_nan=False, default=_plain) + "\n", encoding="utf-8")
+
+
+def sha256(path: Path) -> str:
+    """sha256 of a file, hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _plain(value: object) -> object:
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)

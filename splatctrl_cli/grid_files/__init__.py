@@ -1,0 +1,1 @@
+"""The files that hold a baked distance grid, one format a file."""

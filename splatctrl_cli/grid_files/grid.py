@@ -1,0 +1,164 @@
+"""Baked distance fields as ``.npz``, the file that programs of this project read back. Same grid, same bytes.
+
+Members: ``origin`` (3,) float64 [m], ``voxel`` () float64 [m], ``header`` () str (JSON), one array a channel
+(`grid_channels.CHANNELS`), uncompressed: floats hardly compress, and readers can map them.
+"""
+
+import errno
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import DAMAGE, check_numbers, npy_head, savez
+from splatctrl_cli.grid_files.grid_channels import (
+    GridHead,
+    check_finite,
+    check_grid,
+    check_layout,
+    header_text,
+    parse_header,
+)
+from splatctrl_cli.grid_files.vti import write_vti
+from splatctrl_cli.records import DistanceGrid
+
+__all__ = ["is_grid_npz", "read_npz", "read_npz_head", "write_npz", "write_vti"]
+
+PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
+
+
+MOST_PACKED = 1 << 29  # bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Member:
+    dtype: np.dtype[np.generic]
+    shape: tuple[int, ...]
+
+
+def write_npz(path: Path, grid: DistanceGrid) -> None:
+    """Write the grid. Raises InputError for channels that a file cannot hold."""
+    check_grid(grid)
+    members: dict[str, NDArray[np.generic]] = {
+        "origin": np.asarray(grid.origin, dtype="<f8"),
+        "voxel": np.asarray(grid.voxel, dtype="<f8"),
+        "header": np.asarray(header_text(grid)),
+    }
+    savez(path, {**members, **grid.channels}, level=0)
+
+
+def read_npz(path: Path) -> DistanceGrid:
+    """The grid that `write_npz` wrote.
+
+    Raises InputError for a file that is missing, damaged, of another version or not ours: members, types, shapes,
+    checksums and finiteness are all checked (NaN is let through in sdf and gradient where the header's ``unknown``
+    is ``nan``), and pickled objects are never loaded.
+    """
+    with _opened(path) as archive:
+        head = _head(path, archive, _members(archive))
+        channels = {name: _array(archive, name) for name in head.channels}
+    grid = DistanceGrid(origin=head.origin, voxel=head.voxel, channels=channels, header=head.header)
+    check_finite(str(path), grid)
+    return grid
+
+
+def read_npz_head(path: Path) -> GridHead:
+    """What `read_npz` reads without the channels' values, which it does not check. Raises InputError as that does."""
+    with _opened(path) as archive:
+        return _head(path, archive, _members(archive))
+
+
+def is_grid_npz(path: Path) -> bool:
+    """Whether the file is a ``.npz`` with the members that every distance grid has."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {"origin.npy", "voxel.npy", "header.npy", "sdf.npy"} <= set(archive.namelist())
+    except (*DAMAGE, OSError):
+        return False
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file", remedy="bake one with sdf-bake") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: expected a file, got a folder", remedy="give the field.npz in it") from None
+    except (*DAMAGE, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in {None, errno.EINVAL}:  # bz2's; a place before the start
+            raise
+        raise InputError(f"{path}: not a whole distance grid: {error}", remedy="bake it again") from None
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, _Member]:
+    """Type and shape by name, as long as what the archive says is there. Raises ValueError where it is not."""
+    members: dict[str, _Member] = {}
+    for entry in archive.infolist():
+        name = entry.filename.removesuffix(".npy")
+        if name in members or name == entry.filename:
+            raise ValueError(f"{entry.filename}: expected one .npy of each name")
+        with archive.open(entry) as stream:
+            shape, _, dtype = npy_head(stream)
+            check_numbers(dtype)
+            size = stream.tell() + dtype.itemsize * prod(shape)
+        if entry.file_size != size:
+            raise ValueError(f"{entry.filename}: expected {size} bytes, got {entry.file_size}")
+        members[name] = _Member(dtype=dtype, shape=shape)
+    _check_size(archive.infolist())
+    return members
+
+
+def _check_size(entries: Sequence[zipfile.ZipInfo]) -> None:
+    """Raise ValueError for a file whose compressed arrays hold more than a grid that is stored would.
+
+    Stored arrays, as `write_npz` writes them, are as large as the file.
+    """
+    packed = [entry for entry in entries if entry.compress_type != zipfile.ZIP_STORED]
+    size = sum(entry.file_size for entry in packed)
+    if size > MOST_PACKED:
+        raise ValueError(
+            f"{size} bytes in compressed arrays, expected at most {MOST_PACKED}, or arrays not compressed"
+        )
+
+
+def _head(path: Path, archive: zipfile.ZipFile, members: dict[str, _Member]) -> GridHead:
+    missing = {*PLACE, "header", "sdf"} - members.keys()
+    if missing:
+        raise InputError(
+            f"{path}: expected the arrays origin, voxel, header and sdf, got {', '.join(members) or 'none'}",
+            remedy="give a field.npz that sdf-bake wrote",
+        )
+    text = members["header"]
+    if text.dtype.kind != "U" or text.shape != ():
+        raise InputError(
+            f"{path}: header: expected one string, got {text.dtype} {text.shape}", remedy="bake it again"
+        )
+    header = parse_header(str(path), str(_array(archive, "header")))
+    for name, expected in PLACE.items():
+        got = (members[name].dtype.str, members[name].shape)
+        if got != expected:
+            raise InputError(f"{path}: {name}: expected {expected}, got {got}", remedy="bake it again")
+    origin, voxel = _array(archive, "origin").astype(np.float64), float(_array(archive, "voxel").astype(np.float64))
+    if not np.isfinite(origin).all():
+        raise InputError(f"{path}: origin: expected 3 finite float64, got {origin.tolist()}", remedy="bake it again")
+    if not 0.0 < voxel < np.inf:
+        raise InputError(f"{path}: voxel: expected a size above 0 m, got {voxel}", remedy="bake it again")
+    layout = {name: (m.dtype.str, m.shape) for name, m in members.items() if name not in {*PLACE, "header"}}
+    shape = check_layout(str(path), layout)
+    return GridHead(origin=origin, voxel=voxel, shape=shape, channels=tuple(layout), header=header)
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.generic]:
+    with archive.open(f"{name}.npy") as stream:
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+        if stream.read(1):  # reading to the end is what checks the sum
+            raise ValueError(f"{name}.npy goes on after its array")
+    return np.asarray(array, order="C")

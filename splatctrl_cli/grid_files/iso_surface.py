@@ -1,0 +1,119 @@
+"""The surface on which a baked distance has one value, as a triangle mesh: ``.ply``, ``.obj``, ``.stl``.
+
+Marching cubes of scikit-image (Lewiner et al. 2003), a slab of the grid at a time; the slabs share a layer of cells,
+where their vertices are the same numbers and are joined.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.grid_files.grid_channels import CHUNK, check_grid
+from splatctrl_cli.records import DistanceGrid, Float32, Float64
+
+SUFFIXES = (".ply", ".obj", ".stl")
+STEP = 2.0**-13  # [cells] to which vertices are rounded: float32 has no more in a grid of some hundred layers
+FURTHEST = np.float32(1e9)  # [m] in the place of what is not known, where no cube is looked at
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Triangles: vertices (V, 3) float64 [m], world; faces (F, 3) int64, seen anticlockwise from larger distances."""
+
+    vertices: Float64
+    faces: NDArray[np.int64]
+
+
+def iso_surface(grid: DistanceGrid, level: float = 0.0, channel: str = "sdf") -> Surface:
+    """Where `channel` is `level` [m], linear between cell centres. Cubes with a corner that is NaN have no surface.
+
+    Raises UsageError for a channel that is not there or no distance, NotEvaluableError where no cube crosses `level`.
+    """
+    shape = check_grid(grid)
+    values = grid.channels.get(channel)
+    if values is None or values.ndim != 3 or values.dtype != np.float32:
+        raise UsageError(f"surface of {channel}: expected a distance of the grid: {', '.join(grid.channels)}")
+    if min(shape) < 2:
+        raise NotEvaluableError(
+            f"surface: expected at least 2 cells along each axis, got {shape}", remedy="bake a larger --box"
+        )
+    step = max(1, CHUNK // max(1, values.nbytes // shape[0]))
+    vertices, faces, count = [], [], 0
+    lowest, highest = np.inf, -np.inf
+    for start in range(0, shape[0] - 1, step):
+        slab = np.array(values[start : start + step + 1], np.float32)
+        is_known = np.isfinite(slab)
+        if not is_known.any():
+            continue
+        lowest, highest = min(lowest, float(slab[is_known].min())), max(highest, float(slab[is_known].max()))
+        found = _marching_cubes(slab, is_known, level)
+        if found is not None:
+            vertices.append(found[0] + (start, 0.0, 0.0))
+            faces.append(found[1].astype(np.int64) + count)
+            count += len(found[0])
+    if not vertices:
+        is_any = lowest <= highest
+        got = f"values from {lowest:.4g} to {highest:.4g} m" if is_any else "no cell that has a distance"
+        raise NotEvaluableError(
+            f"surface: expected {channel} to cross {level:g} m, got {got}",
+            remedy="give a level between them, or bake with a smaller voxel",
+        )
+    return _joined(grid, np.concatenate(vertices), np.concatenate(faces))
+
+
+def write_surface(path: Path, surface: Surface) -> None:
+    """Write by the suffix: ``.ply`` and ``.obj`` with normals at the vertices, ``.stl`` with those of the faces.
+
+    Raises UsageError for another suffix.
+    """
+    import trimesh
+
+    if path.suffix not in SUFFIXES:
+        raise UsageError(f"{path}: expected a suffix of {', '.join(SUFFIXES)}, got {path.suffix}")
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    options: dict[str, dict[str, object]] = {
+        ".ply": {"vertex_normal": True},
+        ".obj": {"include_normals": True, "header": None},
+        ".stl": {},
+    }
+    content = mesh.export(file_type=path.suffix[1:], **options[path.suffix])
+    path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+
+
+def _marching_cubes(
+    slab: Float32, is_known: NDArray[np.bool_], level: float
+) -> tuple[Float64, NDArray[np.int32]] | None:
+    """Vertices [cells] and faces, None where no cube of eight known corners crosses `level`."""
+    from skimage.measure import marching_cubes
+
+    whole = np.ones([n - 1 for n in slab.shape], bool)
+    for corner in np.ndindex(2, 2, 2):
+        whole &= is_known[tuple(slice(i, n - 1 + i) for i, n in zip(corner, slab.shape, strict=True))]
+    is_all = bool(whole.all())
+    is_above = np.where(is_known, slab, FURTHEST) > level
+    if is_above.all() or not is_above.any():
+        return None
+    mask = None
+    if not is_all:
+        mask = np.zeros(slab.shape, bool)
+        mask[1:, 1:, 1:] = whole
+        slab = np.where(is_known, slab, FURTHEST)
+    try:
+        vertices, faces, _, _ = marching_cubes(
+            slab, level, mask=mask, gradient_direction="descent", allow_degenerate=True
+        )
+    except (RuntimeError, ValueError):  # which say that no cube crosses the level
+        return None
+    return vertices.astype(np.float64), faces
+
+
+def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> Surface:
+    """The mesh with equal vertices made one, in world, without the triangles that have lost a corner by it."""
+    unique, index = np.unique(np.round(vertices / STEP), axis=0, return_inverse=True)
+    joined = index.reshape(-1)[faces]
+    first, second, third = joined.T
+    is_triangle = (first != second) & (second != third) & (third != first)
+    return Surface(vertices=grid.origin + grid.voxel * STEP * unique, faces=joined[is_triangle])

@@ -1,1 +1,0 @@
-"""Everything that touches a file format: logs, captures, splat files, grids, run folders."""

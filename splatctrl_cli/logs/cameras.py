@@ -1,0 +1,164 @@
+"""RGB-D cameras in a log: which colour, depth and CameraInfo topics belong together, by name and by content."""
+
+import re
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from splatctrl_cli.logs.messages import ImageMessage
+from splatctrl_cli.logs.options import CameraTopics
+from splatctrl_cli.logs.realsense import device_of
+from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
+
+_TRANSPORTS = {"compressed", "compressedDepth"}
+_LONGEST_NAME = 80  # characters of a camera's name; a file system has 255 bytes
+_REGISTERED_WORDS = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")
+
+
+def image_topics(survey: Survey, kind: str) -> list[TopicSurvey]:
+    """Topics whose first image is of this kind: color, depth or other."""
+    topics = survey.of_type(IMAGE, COMPRESSED_IMAGE)
+    return [t for t in topics if t.first_image is not None and t.first_image.kind == kind]
+
+
+def find_cameras(survey: Survey, without: Collection[str] = ()) -> tuple[CameraTopics, ...]:
+    """Cameras by name: colour and depth topics that share a namespace, deepest namespaces first.
+
+    /cam0/color/image_raw and /cam0/depth/image_raw make camera `cam0`. Registered depth is preferred to raw depth,
+    colour to grey, rectified images to raw ones, uncompressed to compressed. Topics in `without` are left out.
+    """
+    colors = [topic for topic in image_topics(survey, "color") if topic.topic.name not in without]
+    depths = image_topics(survey, "depth")
+    groups: dict[tuple[str, ...], list[TopicSurvey]] = {}
+    for depth in depths:
+        prefixes = [common_prefix(depth.topic.name, color.topic.name) for color in colors]
+        device = device_of(depth.topic.name)
+        if prefixes:
+            groups.setdefault((device,) if device else max(prefixes, key=len), []).append(depth)
+    cameras: list[CameraTopics] = []
+    taken: set[str] = set()
+    for namespace in sorted(groups, key=lambda parts: (-len(parts), parts)):
+        free = [
+            c for c in colors if c.topic.name not in taken and _parts(c.topic.name)[: len(namespace)] == namespace
+        ]
+        if not free:
+            continue
+        taken.update(c.topic.name for c in free)
+        color = min(free, key=_color_rank)
+        cameras.append(_camera(survey, namespace, color, groups[namespace]))
+    return _with_unique_names(cameras)
+
+
+def _camera(
+    survey: Survey, namespace: tuple[str, ...], color: TopicSurvey, depths: list[TopicSurvey]
+) -> CameraTopics:
+    info = find_info(survey, color, namespace)
+    with_info = [(depth, find_info(survey, depth, namespace)) for depth in depths]
+    depth, depth_info = min(
+        with_info,
+        key=lambda item: (
+            not is_registered(survey, color.topic.name, item[0].topic.name, info, item[1]),
+            not _says_registered(item[0].topic.name),
+            item[0].topic.type_name == COMPRESSED_IMAGE,
+            item[0].topic.name,
+        ),
+    )
+    name = "/".join(namespace)
+    return CameraTopics(
+        name=name, color=color.topic.name, depth=depth.topic.name, info=info or "", depth_info=depth_info or ""
+    )
+
+
+def find_info(survey: Survey, image: TopicSurvey, namespace: tuple[str, ...] | None = None) -> str:
+    """The CameraInfo topic of an image topic, "" if there is none.
+
+    It shares more of its path than the camera's namespace, or lies in the image's own folder or the namespace's, or
+    has the image's frame and size.
+    """
+    folder = _parts(image.topic.name)[:-1]
+    level = len(folder) - 1 if namespace is None else len(namespace)
+    found: list[tuple[int, int, str]] = []
+    for info in survey.of_type(CAMERA_INFO):
+        calibration = info.calibration
+        if calibration is None:
+            continue
+        info_folder = _parts(info.topic.name)[:-1]
+        shared = len(common_prefix(info.topic.name, image.topic.name))
+        is_near = shared > level or info_folder in {folder, folder[:level]}
+        if is_near or (image.first_image is not None and _fits(calibration, image.first_image)):
+            found.append((-shared, len(info_folder), info.topic.name))
+    return min(found)[2] if found else ""
+
+
+def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info: str) -> bool:
+    """Whether depth pixels already lie on colour pixels: same size, same frame (or a name that says so), same K."""
+    color_image, depth_image = survey.topics[color].first_image, survey.topics[depth].first_image
+    if color_image is None or depth_image is None:
+        return False
+    if (color_image.width, color_image.height) != (depth_image.width, depth_image.height):
+        return False
+    T_color_depth = survey.realsense.T_between(color, depth)
+    if T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6):
+        return False
+    if color_image.frame_id != depth_image.frame_id and not _says_registered(depth):
+        return False
+    calibration = survey.topics[info].calibration if info else None
+    depth_calibration = survey.topics[depth_info].calibration if depth_info else None
+    return calibration is None or depth_calibration is None or _same_lens(calibration, depth_calibration)
+
+
+def common_prefix(name: str, other: str) -> tuple[str, ...]:
+    """The leading path parts that two topics share, their last parts left out."""
+    shared: list[str] = []
+    for a, b in zip(_parts(name)[:-1], _parts(other)[:-1], strict=False):
+        if a != b:
+            break
+        shared.append(a)
+    return tuple(shared)
+
+
+def _same_lens(a: Calibration, b: Calibration) -> bool:
+    return bool(abs(a.K - b.K).max() <= 0.01 * a.K[0, 0])
+
+
+def _fits(calibration: Calibration, image: ImageMessage) -> bool:
+    same_size = (calibration.width, calibration.height) == (image.width, image.height)
+    return same_size and calibration.frame_id == image.frame_id and image.frame_id != ""
+
+
+def _says_registered(topic: str) -> bool:
+    return any(word in topic for word in _REGISTERED_WORDS)
+
+
+def _color_rank(topic: TopicSurvey) -> tuple[bool, bool, bool, bool, str]:
+    image, name = topic.first_image, topic.topic.name
+    is_gray = image is not None and image.is_gray
+    is_infrared = any(part.startswith(("infra", "ir")) for part in _parts(name))
+    return (is_gray, is_infrared, "rect" not in name, topic.topic.type_name == COMPRESSED_IMAGE, name)
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    parts = tuple(part for part in name.split("/") if part)
+    return parts[:-1] if len(parts) > 1 and parts[-1] in _TRANSPORTS else parts
+
+
+def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
+    """The last part of the namespace where that is unique, else all of it; `camera` where there is none.
+
+    A name becomes a folder: characters but letters, digits, ``_``, ``-`` and ``.`` become ``_``, and it begins with
+    none of the last two.
+    """
+    short = [_folder_name(camera.name.rpartition("/")[2]) for camera in cameras]
+    long = [_folder_name(camera.name.replace("/", "_")) for camera in cameras]
+    names = [name if short.count(name) == 1 else long[i] for i, name in enumerate(short)]
+    named = [
+        replace(camera, name=name if names.count(name) == 1 else f"{name}_{i}")
+        for i, (camera, name) in enumerate(zip(cameras, names, strict=True))
+    ]
+    return tuple(sorted(named, key=lambda camera: camera.name))
+
+
+def _folder_name(name: str) -> str:
+    return re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:_LONGEST_NAME] or "camera"

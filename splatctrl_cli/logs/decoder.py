@@ -1,0 +1,167 @@
+"""Messages of the standard types from their bytes, by the definitions the log itself carries."""
+
+import re
+import struct
+from functools import lru_cache
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from splatctrl_cli.containers.foxglove import DEFINITIONS, as_ros, read_foxglove
+from splatctrl_cli.containers.raw_log import RawMessage, Topic
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+_KNOWN = frozenset(  # what is read by its fields
+    {
+        *(IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, JOINT_STATE, TRANSFORMS[0], "std_msgs/msg/Header"),
+        *("builtin_interfaces/msg/Time", "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/Transform"),
+        *("geometry_msgs/msg/Vector3", "geometry_msgs/msg/Quaternion", "geometry_msgs/msg/Twist"),
+        *("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Pose", "geometry_msgs/msg/Point"),
+    }
+)
+_MOST_TEXT = 1 << 20  # characters of a definition
+_MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is no number
+_MOST_STORES = 32  # of definitions that were compiled and are kept
+_ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
+
+
+class UndecodableMessageError(ValueError):
+    """A message whose bytes do not fit its type."""
+
+
+def is_ros(topic: Topic) -> bool:
+    """Whether the topic's messages are in a ROS encoding, or stand for a ROS message in another."""
+    return topic.encoding in {"cdr", "ros1"} or is_foxglove(topic)
+
+
+def is_foxglove(topic: Topic) -> bool:
+    """Whether the topic's messages stand for ROS messages in protobuf or JSON."""
+    return topic.schema != "" and topic.encoding in {"protobuf", "json"}
+
+
+class MessageDecoder:
+    """Decodes messages, one type store per definition met, so that one odd definition spoils no other topic."""
+
+    def __init__(self) -> None:
+        self._stores: dict[Topic, Any] = {}
+        self._refused: dict[Topic, str] = {}
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object with its fields. Raises UndecodableMessageError."""
+        topic = message.topic
+        store = None if is_foxglove(topic) else self._store(topic)
+        try:
+            if store is None:
+                return read_foxglove(topic.schema, topic.encoding, topic.definition, message.data)
+            read = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
+            decoded = read(message.data, topic.schema or topic.type_name)
+            return as_ros(topic.schema, decoded) if topic.schema else decoded
+        except Exception as error:  # generated code over foreign bytes: there is no list of what it raises
+            raise UndecodableMessageError(
+                f"{topic.name}: a {topic.schema or topic.type_name} that does not decode: {error}"
+            ) from None
+
+    def _store(self, topic: Topic) -> Any:
+        if topic not in self._stores and topic not in self._refused:
+            try:
+                self._stores[topic] = _type_store(topic)
+            except Exception as error:  # a parser over foreign text, RecursionError and MemoryError included
+                self._refused[topic] = " ".join(str(error).split())[:200] or type(error).__name__
+        if topic in self._refused:
+            raise UndecodableMessageError(
+                f"{topic.name}: the definition of {topic.type_name} is not usable: {self._refused[topic]}"
+            )
+        return self._stores[topic]
+
+
+def header_stamp_ns(message: RawMessage) -> int:
+    """Stamp of a message that begins with a std_msgs/Header, without decoding the rest.
+
+    The stamp follows four bytes (CDR's encapsulation, or ROS 1's `seq`) as two 32-bit words. Foxglove's messages are
+    decoded. Raises UndecodableMessageError for a message too short.
+    """
+    if is_foxglove(message.topic):
+        return stamp_ns(MessageDecoder().decode(message).header)
+    start = 0 if message.topic.schema and message.topic.encoding == "ros1" else 4  # foxglove_msgs have no `seq`
+    is_little = message.topic.encoding == "ros1" or message.data[1:2] in {b"\x01", b"\x03", b"\x07", b"\x09"}
+    try:
+        seconds, nanoseconds = struct.unpack_from("<iI" if is_little else ">iI", message.data, start)
+    except struct.error:
+        raise UndecodableMessageError(f"{message.topic.name}: a message of {len(message.data)} bytes") from None
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def stamp_ns(header: Any) -> int:
+    """Stamp of a decoded std_msgs/Header."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def _type_store(topic: Topic) -> Any:
+    if not topic.definition and topic.schema in DEFINITIONS:
+        return _foxglove_store()
+    if not topic.definition:
+        return get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
+    _check_definition(topic.definition)
+    return _store_of(topic.definition, topic.definition_format, topic.schema or topic.type_name)
+
+
+@lru_cache(maxsize=_MOST_STORES)
+def _store_of(definition: str, form: str, type_name: str) -> Any:
+    """The types of a definition; kept, as to compile them takes some ten milliseconds."""
+    store = get_typestore(Stores.EMPTY)
+    if form == "idl":
+        separator = "=" * 80 + "\n"
+        parts = [part for part in definition.split(separator) if part.strip()]
+        for part in parts:
+            body = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+            store.register(get_types_from_idl(body))
+    else:
+        store.register(get_types_from_msg(definition, type_name))
+    _check_fields(store)
+    return store
+
+
+def _check_fields(store: Any) -> None:
+    """Raise ValueError where a type with a standard name lacks a standard field; cases, lengths and more are free."""
+    standard = _standard().fielddefs
+    for name in sorted(_KNOWN & store.fielddefs.keys()):
+        there = {field.lower(): _kind(description) for field, description in store.fielddefs[name][1]}
+        for field, description in standard[name][1]:
+            if there.get(field) != _kind(description):
+                raise ValueError(f"{name} has not the field {field} of the standard")
+
+
+@lru_cache(maxsize=1)
+def _foxglove_store() -> Any:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, name))
+    return store
+
+
+@lru_cache(maxsize=1)
+def _standard() -> Any:
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _kind(description: Any) -> object:
+    """What a field holds, without the lengths of arrays, sequences and strings."""
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return detail
+    return detail[0] if kind == Nodetype.BASE else [_kind(detail[0])]
+
+
+def _check_definition(text: str) -> None:
+    """Raise ValueError for a definition that would take much memory or time to compile."""
+    if len(text) > _MOST_TEXT:
+        raise ValueError(f"{len(text)} characters, at most {_MOST_TEXT} are read")
+    largest = max((int("".join(sizes)[:12]) for sizes in _ARRAY.findall(text)), default=0)
+    if largest > _MOST_ITEMS:
+        raise ValueError(f"an array of {largest} items, at most {_MOST_ITEMS} are read")

@@ -1,0 +1,247 @@
+"""A ROS log as records: cameras found, colour and depth paired, poses from tf, joints in one order.
+
+Two passes: the first takes all but the images (transforms may follow the images that need them) and plans every
+frame; the second takes only planned images and holds no more of them than the log's disorder demands. For `ingest`,
+files that a capture can hold as they are stay undecoded.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from splatctrl_cli.containers.raw_log import Damage, RawLog
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.logs.frame_plan import FramePlan, Index, Planned
+from splatctrl_cli.logs.image_rate import dropped, first_of_each
+from splatctrl_cli.logs.joint_topics import topics_of, with_joints
+from splatctrl_cli.logs.joints import joint_records
+from splatctrl_cli.logs.masks import human_mask, mask_by_color
+from splatctrl_cli.logs.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid
+from splatctrl_cli.logs.options import SourceOptions, still_note
+from splatctrl_cli.logs.pairing import paired
+from splatctrl_cli.logs.planned_images import PlannedImages, keeps_files
+from splatctrl_cli.logs.rig import Camera, build_cameras, nearest_gap_ns
+from splatctrl_cli.logs.shot import Place, Shot, check_depth, is_kept, is_png, merged
+from splatctrl_cli.logs.survey import Survey, survey
+from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8
+
+_SECOND = 1_000_000_000
+
+
+class RosLogSource:
+    """Records of an MCAP, ROS 1 bag or ROS 2 bag."""
+
+    has_clock = True
+
+    def __init__(self, log: RawLog, options: SourceOptions, joints: Sequence[str] | None = None) -> None:
+        options.refuse(("root", "holdout"), "a log", log.path)
+        self.name = log.path.name
+        self._log = log
+        self._options = options
+        found = survey(log, by_log_time=options.stamps == "log")
+        _check_not_empty(log, found)
+        self._rig = _rig(log, found, options)
+        self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
+        self.cameras = tuple(camera.name for camera in self._rig)
+        self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
+        self.world_frame = self._rig[0].world_frame
+        loss, first_note = LossReport(), len(self._loss.notes)
+        self.joint_names, self._joints = joint_records(found, options, loss, joints)
+        self.joint_topics = topics_of(found, loss, first_note, options)
+        self._loss = with_joints(self._loss, loss, first_note)
+        self._plan = self._planned(found)
+        self._damage = Damage()
+        self._num_invalid = 0
+
+    @property
+    def loss(self) -> LossReport:
+        """What did not become records; images that do not decode are added while `records` is read."""
+        loss = self._loss
+        return replace(
+            loss,
+            damaged=loss.damaged + self._damage.count,
+            invalid_depth=self._num_invalid,
+            notes=[*loss.notes, *self._damage.notes],
+        )
+
+    def records(self) -> Iterator[Record]:
+        """Joint states and frames by stamp."""
+        for item in self._merged(lazily=False):
+            yield item.frame if isinstance(item, Shot) else item
+
+    def shots(self) -> Iterator[Shot | JointState]:
+        """Joint states and shots by stamp; image files that need no change are only decoded on demand."""
+        return self._merged(lazily=True)
+
+    def _merged(self, *, lazily: bool) -> Iterator[Shot | JointState]:
+        self._damage, self._num_invalid = Damage(), 0
+        return merged(self._joints, self._shots(lazily=lazily))
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every planned frame."""
+        return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the log's files."""
+        return dict(self._digests)
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
+        names = [file.name for file in self._log.files]
+        is_unique = len(set(names)) == len(names)
+        return {
+            file.name if is_unique else f"{file.parent.name}/{file.name}": sha256(file) for file in self._log.files
+        }
+
+    def _planned(self, found: Survey) -> FramePlan:
+        plan = FramePlan(self._rig)
+        for camera in self._rig:
+            (color, color_ns), (depth, depth_ns) = (
+                self._images(found, topic) for topic in (camera.color_topic, camera.depth_topic)
+            )
+            tolerance_ns = round(self._options.pairing_tolerance_s * _SECOND)
+            pairs = paired(color_ns, depth_ns, tolerance_ns)
+            if not len(pairs):
+                gap = nearest_gap_ns(color_ns.tolist(), depth_ns.tolist()) / _SECOND
+                raise InputError(
+                    f"{self._log.path}: camera {camera.name}: no colour and depth image within"
+                    f" {tolerance_ns / 1e6:g} ms of each other, the closest are {gap * 1e3:.4g} ms apart",
+                    remedy=f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right",
+                )
+            self._loss.unpaired_color += len(color) - len(pairs)
+            self._loss.unpaired_depth += len(depth) - len(pairs)
+            self._add(plan, found, camera, color_ns[pairs[:, 0]], color[pairs[:, 0]], depth[pairs[:, 1]])
+        return plan
+
+    def _images(self, found: Survey, topic: str) -> tuple[Index, Index]:
+        """Number and stamp of each image but those that came again; these and missing ones are counted."""
+        stamps = np.array(found.topics[topic].stamps_ns, dtype=np.int64)
+        if len(stamps) > 1 and not stamps.any():
+            raise InputError(
+                f"{self._log.path}: topic {topic}: expected stamps, got 0 in all {len(stamps)} headers",
+                remedy="give --stamps log to take the times of logging",
+            )
+        kept = first_of_each(stamps)
+        drops = dropped(stamps)
+        self._loss.duplicate_images += len(stamps) - len(kept)
+        self._loss.dropped_images += drops.num_images
+        if drops.num_images:
+            self._loss.notes.append(
+                f"{topic}: about {drops.num_images} images were dropped in {drops.num_gaps} gaps of a period of"
+                f" {drops.period_ns / 1e6:.4g} ms"
+            )
+        return kept, stamps[kept]
+
+    def _add(
+        self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
+    ) -> None:
+        """Plan the pairs of a camera, those without a pose counted. Raises InputError where none has one."""
+        tolerance_ns = round(self._options.pose_tolerance_s * _SECOND)
+        pairing_ns = round(self._options.pairing_tolerance_s * _SECOND)
+        masks = mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
+        poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
+        num = plan.add(camera, stamp_ns, color, depth, masks, poses)
+        if not num:
+            raise InputError(
+                f"{self._log.path}: camera {camera.name}: tf has no pose of frame {camera.frame_id!r} in"
+                f" {camera.world_frame!r} at the time of any image ({_times(found, camera)})",
+                remedy="check the clocks of the recording, or give --camera-pose",
+            )
+        self._loss.without_pose += len(color) - num
+
+    def _shots(self, *, lazily: bool) -> Iterator[Shot]:
+        images = PlannedImages(self._log, self._plan)
+        checked: set[str] = set()
+
+        def decodes(camera: Camera) -> bool:
+            return not lazily or camera.name not in checked  # the first depth is looked at
+
+        for planned, (color, depth, *masks), places in images.of_frames(self._damage, decodes):
+            human = self._human(planned.camera, masks[0]) if masks else None
+            if not depth.is_counts:
+                self._num_invalid += num_invalid(depth.pixels)
+            shot = _shot(planned, color, depth, human, places)
+            camera = planned.camera
+            if camera.name not in checked:
+                scale = _scale(depth, camera.depth_scale)
+                if check_depth(shot.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
+                    checked.add(camera.name)
+            yield shot
+
+    def _human(self, camera: Camera, mask: ImageMessage) -> UInt8:
+        human = human_mask(mask.pixels, camera.intrinsics, f"{self._log.path}: topic {camera.human_topic}")
+        return human if camera.undistortion is None else camera.undistortion.labels(human)
+
+
+def _shot(
+    planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, places: tuple[Place, ...]
+) -> Shot:
+    camera = planned.camera
+    is_counts = depth.is_counts and camera.depth_to_color is None
+    keeps_color, keeps_depth, _ = keeps_files(camera)
+    return Shot(
+        stamp_ns=planned.stamp_ns,
+        camera=camera.name,
+        intrinsics=camera.intrinsics,
+        T_world_camera=planned.T_world_camera,
+        read_color=partial(_color, camera, color),
+        read_depth=partial(_depth, camera, depth),
+        human=human,
+        valid=None if camera.undistortion is None else camera.undistortion.valid,
+        color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
+        depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
+        depth_unit=_scale(depth, camera.depth_scale) if is_counts else None,
+        origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
+        places=places,
+    )
+
+
+def _color(camera: Camera, image: ImageMessage) -> UInt8:
+    pixels = color_of(image)
+    return pixels if camera.undistortion is None else camera.undistortion.color(pixels)
+
+
+def _depth(camera: Camera, image: ImageMessage) -> Float32:
+    metres = depth_of(image, camera.depth_scale)
+    if camera.depth_to_color is not None:
+        return camera.depth_to_color.warp(metres)
+    return metres if camera.undistortion is None else camera.undistortion.depth(metres)
+
+
+def _scale(depth: ImageMessage, scale: float | None) -> float:
+    if scale is not None:
+        return scale
+    return MILLIMETRE if depth.is_counts else 1.0
+
+
+def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:
+    """The cameras. Raises InputError for what they lack, which in a damaged log may be what was lost."""
+    try:
+        return build_cameras(log, found, options)
+    except InputError as error:
+        if not found.damage.count:
+            raise
+        raise InputError(
+            f"{error.message}; but the log is damaged: {found.damage.notes[0]}",
+            remedy=f"copy the file again; if this is all there is: {error.remedy}",
+        ) from None
+
+
+def _check_not_empty(log: RawLog, found: Survey) -> None:
+    if found.num_messages:
+        return
+    if found.damage.count:
+        raise InputError(
+            f"{log.path}: nothing usable before the damage ({found.damage.notes[0]})", remedy="copy the file again"
+        )
+    raise InputError(f"{log.path}: the log holds no messages", remedy="record it again, or give another file")
+
+
+def _times(found: Survey, camera: Camera) -> str:
+    stamps = found.topics[camera.color_topic].stamps_ns
+    images = f"images {min(stamps) / 1e9:.3f} to {max(stamps) / 1e9:.3f} s"
+    span = found.tf.span_ns(camera.frame_id)
+    return images if span is None else f"{images}, tf {span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"

@@ -1,0 +1,163 @@
+"""A frame together with how its source stored it, so that `ingest` can keep what is lossless without decoding it."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.decoder import UndecodableMessageError
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, RecordSource, RgbdFrame, UInt8
+
+PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where an image was recorded.
+
+    offset: the byte of the file at which its record, or that of its chunk, begins; -1 where there is no such place.
+    """
+
+    file: str
+    offset: int
+    log_time_ns: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """A frame whose images are decoded when they are asked for, and how its source stored them.
+
+    read_color, read_depth: give the frame's color and depth, or raise UndecodableMessageError;
+    color_file: the bytes of a JPEG or PNG that decode to exactly the frame's color, None where there are none;
+    depth_file: those of a 16-bit PNG of which the depth is exactly ``counts * float32(depth_unit)``, or None;
+    depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
+    origin: where it came from, in words; places: of the colour and the depth message, empty where there are none.
+    """
+
+    stamp_ns: int
+    camera: str
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+    read_color: Callable[[], UInt8]
+    read_depth: Callable[[], Float32]
+    color_file: bytes | None
+    depth_unit: float | None
+    origin: str
+    human: UInt8 | None = None
+    valid: Bool | None = None
+    places: tuple[Place, ...] = ()
+    depth_file: bytes | None = None
+
+    @classmethod
+    def of(cls, frame: RgbdFrame, **stored: Any) -> "Shot":
+        """A shot of a frame that is decoded already."""
+        return cls(
+            stamp_ns=frame.stamp_ns,
+            camera=frame.camera,
+            intrinsics=frame.intrinsics,
+            T_world_camera=frame.T_world_camera,
+            read_color=lambda: frame.color,
+            read_depth=lambda: frame.depth,
+            human=frame.human,
+            valid=frame.valid,
+            **stored,
+        )
+
+    @cached_property
+    def color(self) -> UInt8:
+        """Of the frame. Raises InputError where the image does not decode."""
+        with self._refused():
+            return self.read_color()
+
+    @cached_property
+    def depth(self) -> Float32:
+        """Of the frame. Raises InputError where the image does not decode."""
+        with self._refused():
+            return self.read_depth()
+
+    @property
+    def frame(self) -> RgbdFrame:
+        """The frame, with both images decoded. Raises InputError where one does not."""
+        return RgbdFrame(
+            stamp_ns=self.stamp_ns,
+            camera=self.camera,
+            color=self.color,
+            depth=self.depth,
+            intrinsics=self.intrinsics,
+            T_world_camera=self.T_world_camera,
+            human=self.human,
+            valid=self.valid,
+        )
+
+    @contextmanager
+    def _refused(self) -> Iterator[None]:
+        try:
+            yield
+        except UndecodableMessageError as error:
+            raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
+
+
+class ShotSource(RecordSource, Protocol):
+    """A record source that also says how its frames were stored."""
+
+    @property
+    def world_frame(self) -> str:
+        """The frame of poses, as the source names it."""
+        ...
+
+    def shots(self) -> Iterator[Shot | JointState]:
+        """As `records`, with the frames as shots."""
+        ...
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp, without its images."""
+        ...
+
+
+def is_kept(data: bytes | None) -> bool:
+    """Whether an image file's bytes are of a kind that captures hold: JPEG or PNG."""
+    return data is not None and data.startswith((b"\x89PNG\r\n", b"\xff\xd8\xff"))
+
+
+def is_png(data: bytes | None) -> bool:
+    """Whether these are the bytes of a PNG file."""
+    return data is not None and data.startswith(b"\x89PNG\r\n")
+
+
+def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot | JointState]:
+    """Joint states (sorted) and shots (sorted) by stamp, joint states first."""
+    states = iter(joints)  # a file's, a block at a time
+    state = next(states, None)
+    for shot in shots:
+        while state is not None and state.stamp_ns <= shot.stamp_ns:
+            yield state
+            state = next(states, None)
+        yield shot
+    if state is not None:
+        yield state
+    yield from states
+
+
+def check_depth(depth: Float32, where: str, scale: float) -> bool:
+    """Whether a depth image [m] holds any depth; raises InputError when its median is implausible.
+
+    `scale` [m per count] is what turned counts into metres.
+    """
+    valid = depth[depth > 0]
+    if valid.size == 0:
+        return False
+    median = float(np.median(valid))
+    low, high = PLAUSIBLE_DEPTH
+    if not low <= median <= high:
+        counts = median / scale
+        fits = [s for s in (1e-3, 1e-4, 1.0, 1e-2, 1e-5, 1e-6) if 0.15 <= counts * s <= 8.0]
+        remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
+        raise InputError(
+            f"{where}: median depth {median:.4g} m is implausible (expected {low:g} to {high:g} m)",
+            remedy=f"is the depth scale {scale:g} m per count wrong? {remedy}",
+        )
+    return True

@@ -1,0 +1,171 @@
+"""Joint states out of decoded messages of the types that robots publish them in."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.logs.decoder import JOINT_STATE, UndecodableMessageError, stamp_ns
+from splatctrl_cli.records import Float64
+
+FRANKA_STATES = ("franka_msgs/msg/FrankaRobotState", "franka_msgs/msg/FrankaState")
+CONTROLLER_STATE = "control_msgs/msg/JointTrajectoryControllerState"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+STATE_TYPES = (JOINT_STATE, *FRANKA_STATES, CONTROLLER_STATE, TRAJECTORY)
+STANDARD_TYPES = (JOINT_STATE, TRAJECTORY)  # known without a definition in the log
+NAMELESS = tuple(f"joint{number}" for number in range(1, 8))  # what a Franka's q[0..6] are called
+_MAX_SKEW = 1e-2  # largest entry of R^T R - I of a pose that a robot logs
+
+
+def _none() -> Float64:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawJoints:
+    """One joint state as recorded, in the order of its names.
+
+    position (J,); velocity, commanded_velocity (J,) or empty; log_time_ns: when it was logged; T_base_ee (4, 4): the
+    end effector that the robot's own controller reports.
+    """
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: Float64
+    velocity: Float64
+    log_time_ns: int = 0
+    commanded_velocity: Float64 = field(default_factory=_none)
+    T_base_ee: Float64 | None = None
+
+
+def read_states(message: Any, type_name: str, log_time_ns: int) -> list[RawJoints]:
+    """The joint states of a message of `STATE_TYPES`, log time [ns]. Raises UndecodableMessageError."""
+    if type_name == JOINT_STATE:
+        return [_joint_state(message, log_time_ns)]
+    if type_name in FRANKA_STATES:
+        return [_franka(message, log_time_ns)]
+    if type_name == CONTROLLER_STATE:
+        return [_controller(message, log_time_ns)]
+    return _trajectory(message, log_time_ns)
+
+
+def rigid_or_none(T: Float64) -> Float64 | None:
+    """A pose (4, 4) where it is one: finite, a rotation, not the zeros of a field that nobody filled."""
+    R = T[:3, :3]
+    is_rigid = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < _MAX_SKEW and np.linalg.det(R) > 0
+    return T if is_rigid else None
+
+
+def pose_of_columns(values: Float64) -> Float64 | None:
+    """T (4, 4) of 16 numbers, columns one after the other, as libfranka stores poses (franka/robot_state.h)."""
+    return rigid_or_none(values.reshape(4, 4).T)
+
+
+def pose_of_quat(position: Float64, quat_xyzw: Float64) -> Float64 | None:
+    """T (4, 4) of a position [m] and a quaternion, None where its length is not one."""
+    length = float(np.linalg.norm(quat_xyzw))
+    if not (np.isfinite(position).all() and abs(length - 1.0) < _MAX_SKEW):
+        return None
+    return transform_from(position, quat_xyzw)
+
+
+def _joint_state(message: Any, log_time_ns: int) -> RawJoints:
+    names = tuple(str(name) for name in message.name)
+    position, velocity = _array(message.position), _array(message.velocity)
+    if len(position) != len(names) or len(velocity) not in {0, len(names)}:
+        raise UndecodableMessageError(
+            f"a JointState with {len(names)} names, {len(position)} positions and {len(velocity)} velocities"
+        )
+    return RawJoints(
+        stamp_ns=stamp_ns(message.header),
+        names=names,
+        position=position,
+        velocity=velocity,
+        log_time_ns=log_time_ns,
+    )
+
+
+def _franka(message: Any, log_time_ns: int) -> RawJoints:
+    """FrankaRobotState of franka_ros2 (states with names, PoseStamped), or the older one of bare arrays."""
+    fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
+    if "measured_joint_state" in fields:
+        measured, desired, pose = fields["measured_joint_state"], fields["desired_joint_state"], fields["o_t_ee"].pose
+        p, r = pose.position, pose.orientation
+        position, velocity = _array(measured.position), _array(measured.velocity)
+        names = tuple(str(name) for name in measured.name)
+        commanded = _array(desired.velocity)
+        T = pose_of_quat(np.array([p.x, p.y, p.z]), np.array([r.x, r.y, r.z, r.w]))
+    else:
+        position, velocity, commanded = (_array(fields[name]) for name in ("q", "dq", "dq_d"))
+        names, T = (), pose_of_columns(_array(fields["o_t_ee"]))
+    if not names and len(position) == len(NAMELESS):
+        names = NAMELESS
+    return _checked("a Franka state", message, names, position, velocity, commanded, log_time_ns, T)
+
+
+def _controller(message: Any, log_time_ns: int) -> RawJoints:
+    """`feedback` and `reference`, where they are filled, else `actual` and `desired` of before (control_msgs)."""
+    names = tuple(str(name) for name in message.joint_names)
+    actual = _filled(message, ("feedback", "actual"), len(names))
+    wanted = _filled(message, ("reference", "desired"), len(names))
+    if actual is None:
+        raise UndecodableMessageError(f"a controller state of {len(names)} joints without positions")
+    commanded = _none() if wanted is None else _array(wanted.velocities)
+    position, velocity = _array(actual.positions), _array(actual.velocities)
+    return _checked("a controller state", message, names, position, velocity, commanded, log_time_ns, None)
+
+
+def _filled(message: Any, fields: tuple[str, ...], num_joints: int) -> Any:
+    there = [getattr(message, name) for name in fields if name in message.__dataclass_fields__]
+    return next((point for point in there if len(point.positions) == num_joints), None)
+
+
+def _checked(
+    what: str,
+    message: Any,
+    names: tuple[str, ...],
+    position: Float64,
+    velocity: Float64,
+    commanded: Float64,
+    log_time_ns: int,
+    T_base_ee: Float64 | None,
+) -> RawJoints:
+    if len(position) != len(names):
+        raise UndecodableMessageError(f"{what} with {len(names)} names and {len(position)} positions")
+    return RawJoints(
+        stamp_ns=stamp_ns(message.header),
+        names=names,
+        position=position,
+        velocity=velocity if len(velocity) == len(names) else _none(),
+        log_time_ns=log_time_ns,
+        commanded_velocity=commanded if len(commanded) == len(names) else _none(),
+        T_base_ee=T_base_ee,
+    )
+
+
+def _trajectory(message: Any, log_time_ns: int) -> list[RawJoints]:
+    """Every point of a planned motion; a header without a stamp means that it begins when it is sent."""
+    names = tuple(str(name) for name in message.joint_names)
+    start_ns = stamp_ns(message.header) or log_time_ns
+    states = []
+    for point in message.points:
+        since, position, velocity = point.time_from_start, _array(point.positions), _array(point.velocities)
+        if len(position) != len(names):
+            raise UndecodableMessageError(f"a trajectory of {len(names)} joints with {len(position)} positions")
+        after_ns = int(since.sec) * 1_000_000_000 + int(since.nanosec)
+        states.append(
+            RawJoints(
+                stamp_ns=start_ns + after_ns,
+                names=names,
+                position=position,
+                velocity=velocity if len(velocity) == len(names) else _none(),
+                log_time_ns=log_time_ns + after_ns,
+                commanded_velocity=velocity if len(velocity) == len(names) else _none(),
+            )
+        )
+    return states
+
+
+def _array(values: Any) -> Float64:
+    return np.asarray(values, dtype=np.float64)

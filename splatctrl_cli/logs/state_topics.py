@@ -1,0 +1,213 @@
+"""The joint states of a log's topics: which topic, joints spread over several topics, names without a prefix."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.rows import RowFile, Rows, Table, absent, ranges
+from splatctrl_cli.logs.decoder import JOINT_STATE
+from splatctrl_cli.logs.joint_log import JointStream
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.state_clock import checked_stamps
+from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY
+from splatctrl_cli.logs.state_track import RawTrack
+from splatctrl_cli.logs.survey import Survey, TopicSurvey
+from splatctrl_cli.records import Bool, LossReport
+
+BRIDGED = 0.5  # [s] at most between the states of another topic that a position is interpolated over
+STILL = 1e-3  # [rad or m] by which a joint may differ across a longer gap
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stream:
+    """States of one topic that name the same joints, under the names to take them by."""
+
+    where: str
+    names: tuple[str, ...]
+    states: JointStream
+
+    @property
+    def has_poses(self) -> bool:
+        return self.states.column("T_base_ee") is not None
+
+
+def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> list[TopicSurvey]:
+    """The topics with joint states, planned motions only where nothing measured is there.
+
+    Raises InputError where --joint-topic is none of them.
+    """
+    found = [t for t in survey.of_type(*STATE_TYPES) if t.joints.streams]
+    for topic in survey.of_type(*STATE_TYPES):
+        if not topic.topic.definition and topic.topic.type_name not in STANDARD_TYPES:
+            kind = topic.topic.type_name
+            loss.notes.append(f"{topic.topic.name}: the log has no definition of {kind}: its states are not read")
+    if options.joint_topic is not None:
+        chosen = [t for t in found if t.topic.name == options.joint_topic]
+        if not chosen:
+            raise InputError(
+                f"joint topic {options.joint_topic}: not a topic of the log with joint states",
+                remedy=f"use one of: {', '.join(t.topic.name for t in found) or 'none there'}",
+            )
+        return chosen
+    measured = [t for t in found if t.topic.type_name != TRAJECTORY]
+    return measured or found
+
+
+def main_topic(topics: Sequence[TopicSurvey], loss: LossReport) -> TopicSurvey:
+    """/joint_states, else the JointState topic with most messages, else the fullest of another type."""
+
+    def rank(topic: TopicSurvey) -> tuple[bool, bool, int, str]:
+        name = topic.topic.name
+        return (name == "/joint_states", topic.topic.type_name == JOINT_STATE, topic.count, name)
+
+    chosen = max(topics, key=rank)
+    others = sorted(t.topic.name for t in topics if t is not chosen)
+    if others:
+        loss.notes.append(f"joint states are taken from {chosen.topic.name}, not from {', '.join(others)}")
+    return chosen
+
+
+def track_of_topic(topic: TopicSurvey, loss: LossReport) -> RawTrack:
+    """The states of a topic that name the most joints; others (a gripper that publishes alone) are noted."""
+    streams = _streams([topic])
+    chosen = max(streams, key=lambda s: (len(s.names), len(s.states), sorted(s.names)))
+    others = len(topic.joints) - len(chosen.states)
+    if others:
+        loss.notes.append(f"{chosen.where}: {others} of {len(topic.joints)} states name other joints: left out")
+    return _raw(chosen, chosen.names, loss)
+
+
+def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: LossReport) -> RawTrack:
+    """The states of the joints `wanted` as far as the topics have them, from as few topics as hold them.
+
+    The topic with the most of them gives the stamps, of equals one with end-effector poses, then /joint_states; other
+    joints are interpolated between the states of their topics. States outside of these, or in a gap of more than
+    `BRIDGED` over which a joint moved, are left out with a note.
+    """
+    streams = _renamed(_streams(topics), wanted, loss)
+
+    def rank(stream: _Stream) -> tuple[int, bool, bool, int, str]:
+        covered = len(set(stream.names) & set(wanted))
+        return (covered, stream.has_poses, stream.where == "/joint_states", len(stream.states), stream.where)
+
+    base = max(streams, key=rank)
+    track = _raw(base, base.names, loss)
+    missing = [name for name in wanted if name not in base.names]
+    used = [base.where]
+    while missing:
+        best = max(streams, key=lambda s: (len(set(s.names) & set(missing)), len(s.states), s.where))
+        added = tuple(name for name in missing if name in best.names)
+        if not added:
+            break
+        track = _filled(track, _raw(best, added, loss), loss)
+        missing = [name for name in missing if name not in added]
+        used.append(best.where)
+    others = sorted({t.topic.name for t in topics} - set(used))
+    if others:
+        taken = ", ".join(dict.fromkeys(used))
+        loss.notes.append(f"joint states are taken from {taken}, not from {', '.join(others)}")
+    return track if missing else track.of_joints(wanted)
+
+
+def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
+    return [
+        _Stream(where=topic.topic.name, names=stream.names, states=stream)
+        for topic in topics
+        for stream in topic.joints.streams
+    ]
+
+
+def _renamed(streams: list[_Stream], wanted: Sequence[str], loss: LossReport) -> list[_Stream]:
+    """Streams of joint1 ... joint7 under the names of `wanted` that end so, where no stream has those."""
+    names = with_prefix(wanted)
+    if not names or any(set(stream.names) & set(names.values()) for stream in streams):
+        return streams
+    loss.notes.append(f"joints without a prefix are taken by their number: joint1 is {names['joint1']}, and so on")
+    return [replace(s, names=tuple(names.get(name, name) for name in s.names)) for s in streams]
+
+
+def with_prefix(wanted: Sequence[str]) -> dict[str, str]:
+    """joint1 ... joint7 -> the names of `wanted` that end so after one prefix; empty unless one prefix fits."""
+    first = NAMELESS[0]
+    prefixes = [name.removesuffix(first) for name in wanted if name.endswith(first)]
+    fitting = [prefix for prefix in prefixes if all(prefix + short in wanted for short in NAMELESS)]
+    return {short: fitting[0] + short for short in NAMELESS} if len(fitting) == 1 else {}
+
+
+def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
+    """The states of a stream with `names` as columns."""
+    states = stream.states
+    order = np.array([stream.names.index(name) for name in names], dtype=np.int64)
+    position, velocity = states.column("position"), states.column("velocity")
+    commanded, poses = states.column("commanded_velocity"), states.column("T_base_ee")
+    assert position is not None
+    return RawTrack(
+        where=stream.where,
+        names=names,
+        stamp_ns=checked_stamps(states.stamp_ns, states.log_time_ns, stream.where, loss),
+        position=position.of_columns(order),
+        velocity=absent(len(states), len(names)) if velocity is None else velocity.of_columns(order),
+        commanded_velocity=None if commanded is None else commanded.of_columns(order),
+        T_base_ee=poses,
+    )
+
+
+def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
+    """`track` with the joints of `other`, interpolated at its stamps; states where that cannot be are left out."""
+    order = np.argsort(other.stamp_ns, kind="stable")
+    at = other.stamp_ns[order]
+    stamps = track.stamp_ns
+    after = np.clip(np.searchsorted(at, stamps), 1, max(len(at) - 1, 1))
+    if len(at) == 1:
+        at, order = np.repeat(at, 2), np.repeat(order, 2)
+    before = after - 1
+    gap = (at[after] - at[before]) * 1e-9
+    is_still = _is_still(other.position, order[before], order[after])
+    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= BRIDGED) | is_still)
+    share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
+
+    names = ", ".join(other.names)
+    if not keep.any():
+        raise InputError(
+            f"{track.where} and {other.where}: mixed clocks: at no state of {track.where} is {names} known",
+            remedy="give another --joint-topic, or record both by one clock",
+        )
+    loss.notes.append(f"{track.where}: {names} of {other.where} are interpolated at its {len(stamps)} states")
+    if not keep.all():
+        lost = f"{int((~keep).sum())} of {len(stamps)} states left out"
+        loss.notes.append(f"{track.where}: {lost}: {names} of {other.where} are unknown then")
+
+    def joined(one: Table, two: Table) -> Table:
+        file = RowFile((len(track.names) + len(other.names),))
+        for first, last in ranges(len(stamps)):
+            part = slice(first, last)
+            between = (1 - share[part]) * two[order[before[part]]] + share[part] * two[order[after[part]]]
+            file.append(np.hstack([one[part], between]))
+        return Rows(file)
+
+    commanded = track.commanded_velocity
+    filled = RawTrack(
+        where=track.where,
+        names=(*track.names, *other.names),
+        stamp_ns=stamps,
+        position=joined(track.position, other.position),
+        velocity=joined(track.velocity, other.velocity),
+        commanded_velocity=None
+        if commanded is None or other.commanded_velocity is None
+        else joined(commanded, other.commanded_velocity),
+        T_base_ee=track.T_base_ee,
+        T_world_ee=track.T_world_ee,
+    )
+    return filled.select(keep)
+
+
+def _is_still(table: Table, before: NDArray[np.int64], after: NDArray[np.int64]) -> Bool:
+    """Pairs of states (T,) of which no joint differs."""
+    is_still = np.zeros(len(before), dtype=np.bool_)
+    for first, last in ranges(len(before)):
+        change = np.abs(table[after[first:last]] - table[before[first:last]])
+        is_still[first:last] = change.max(axis=1) < STILL
+    return is_still

@@ -1,0 +1,172 @@
+"""A first pass over a log: topics, stamps, frames, calibrations, joints; of images the first of each topic."""
+
+from array import array
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.logs.decoder import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    TRANSFORMS,
+    MessageDecoder,
+    UndecodableMessageError,
+    header_stamp_ns,
+    is_ros,
+    stamp_ns,
+)
+from splatctrl_cli.logs.image_rate import StampClock
+from splatctrl_cli.logs.joint_log import JointLog
+from splatctrl_cli.logs.messages import ImageMessage, read_image
+from splatctrl_cli.logs.realsense import OPTION, TRANSFORM, RealSense
+from splatctrl_cli.logs.state_messages import STANDARD_TYPES, STATE_TYPES, RawJoints, read_states
+from splatctrl_cli.logs.tf_tree import TfTree
+from splatctrl_cli.records import Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """What a CameraInfo says: size [px], K (3, 3) of the raw image with its distortion, projection (3, 3) of the
+    rectified image (the left part of P; zero where unset), frame.
+    """
+
+    width: int
+    height: int
+    K: Float64
+    projection: Float64
+    distortion_model: str
+    distortion: Float64
+    frame_id: str
+
+
+@dataclass(kw_only=True)
+class TopicSurvey:
+    """What a log holds of one topic; stamps_ns and clock (image topics only) are of the headers in file order."""
+
+    topic: Topic
+    count: int = 0
+    first_log_ns: int = 0
+    last_log_ns: int = 0
+    stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    clock: StampClock = field(default_factory=StampClock)
+    first_image: ImageMessage | None = None
+    calibration: Calibration | None = None
+    joints: JointLog = field(default_factory=JointLog)
+
+
+@dataclass(kw_only=True)
+class Survey:
+    """Everything of a log but its images; by_log_time: stamps are the times of logging, not those of headers."""
+
+    by_log_time: bool = False
+    topics: dict[str, TopicSurvey] = field(default_factory=dict)
+    tf: TfTree = field(default_factory=TfTree)
+    realsense: RealSense = field(default_factory=RealSense)
+    damage: Damage = field(default_factory=Damage)
+
+    @property
+    def num_messages(self) -> int:
+        """Messages of all topics."""
+        return sum(topic.count for topic in self.topics.values())
+
+    def of_type(self, *types: str) -> list[TopicSurvey]:
+        """Topics of these types that hold messages, by name."""
+        found = [t for t in self.topics.values() if t.topic.type_name in types and t.count and is_ros(t.topic)]
+        return sorted(found, key=lambda t: t.topic.name)
+
+
+def survey(log: RawLog, *, by_log_time: bool = False) -> Survey:
+    """Read `log` once; a message that does not decode is counted as damage.
+
+    by_log_time: take the times of logging for the stamps of images, transforms and joint states.
+    """
+    result = Survey(by_log_time=by_log_time)
+    decoder = MessageDecoder()
+    for topic in log.topics():
+        result.topics.setdefault(topic.name, TopicSurvey(topic=topic))
+    for message in log.messages(result.damage):
+        add_message(result, decoder, message)
+    return result
+
+
+def add_message(result: Survey, decoder: MessageDecoder, message: RawMessage) -> None:
+    """Count one message, and take from it what a survey keeps."""
+    entry = result.topics.setdefault(message.topic.name, TopicSurvey(topic=message.topic))
+    if entry.count == 0:
+        entry.topic = message.topic
+        entry.first_log_ns = entry.last_log_ns = message.log_time_ns
+    entry.count += 1
+    entry.first_log_ns = min(entry.first_log_ns, message.log_time_ns)
+    entry.last_log_ns = max(entry.last_log_ns, message.log_time_ns)
+    if is_ros(message.topic):
+        try:
+            _take(result, entry, decoder, message)
+        except (UndecodableMessageError, ValueError) as error:
+            result.damage.add(str(error))
+        except OverflowError:
+            result.damage.add(f"{message.topic.name}: a time beyond 2^63 ns")
+        except AttributeError as error:  # a definition of a known name with other fields
+            result.damage.add(f"{message.topic.name}: a {message.topic.type_name} of another definition: {error}")
+
+
+def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: RawMessage) -> None:
+    kind = message.topic.type_name
+    if kind in {IMAGE, COMPRESSED_IMAGE}:
+        entry.stamps_ns.append(-1)  # every image has its place, also one that does not decode
+        entry.stamps_ns[-1] = message.log_time_ns if result.by_log_time else header_stamp_ns(message)
+        entry.clock.see(entry.stamps_ns[-1], message.log_time_ns)
+        if entry.first_image is None:
+            entry.first_image = read_image(decoder.decode(message), kind)
+    elif kind == CAMERA_INFO and entry.calibration is None:
+        entry.calibration = _calibration(decoder.decode(message))
+    elif kind in STATE_TYPES and (message.topic.definition or kind in STANDARD_TYPES):
+        entry.joints.extend(_states(result, decoder.decode(message), message))
+    elif kind in {TRANSFORM, OPTION} and message.topic.name.startswith("/device_"):
+        result.realsense.add(message.topic.name, decoder.decode(message))
+    elif kind in TRANSFORMS:
+        is_static = message.topic.name.endswith("tf_static")
+        holds = message.topic.schema != ""  # Foxglove has no static transforms: one that comes once holds always
+        log_time_ns = message.log_time_ns if result.by_log_time else None
+        _add_transforms(result.tf, decoder.decode(message), log_time_ns, static=is_static, holds=holds)
+
+
+def _calibration(message: Any) -> Calibration | None:
+    fields = {name.lower(): getattr(message, name) for name in message.__dataclass_fields__}
+    K = np.asarray(fields["k"], dtype=np.float64).reshape(3, 3)
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        return None  # an uncalibrated driver publishes zeros
+    return Calibration(
+        width=int(message.width),
+        height=int(message.height),
+        K=K,
+        projection=np.asarray(fields["p"], dtype=np.float64).reshape(3, 4)[:, :3],
+        distortion_model=str(message.distortion_model),
+        distortion=np.asarray(fields["d"], dtype=np.float64),
+        frame_id=message.header.frame_id.strip("/"),
+    )
+
+
+def _states(result: Survey, decoded: Any, message: RawMessage) -> list[RawJoints]:
+    """Joint states; by log time all of a message move with its stamp."""
+    states = read_states(decoded, message.topic.type_name, message.log_time_ns)
+    if not result.by_log_time:
+        return states
+    late_ns = message.log_time_ns - stamp_ns(decoded.header)
+    return [replace(state, stamp_ns=state.stamp_ns + late_ns) for state in states]
+
+
+def _add_transforms(tree: TfTree, message: Any, log_time_ns: int | None, *, static: bool, holds: bool) -> None:
+    for item in message.transforms:
+        t, r = item.transform.translation, item.transform.rotation
+        tree.add(
+            item.header.frame_id,
+            item.child_frame_id,
+            stamp_ns(item.header) if log_time_ns is None else log_time_ns,
+            np.array([t.x, t.y, t.z], dtype=np.float64),
+            np.array([r.x, r.y, r.z, r.w], dtype=np.float64),
+            static=static,
+            holds=holds,
+        )

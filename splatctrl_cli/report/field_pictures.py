@@ -1,0 +1,201 @@
+"""Pictures of a baked field for its report: slices through a point, its gradient, the probability of collision."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.records import DistanceGrid, Float64, VoxelState
+from splatctrl_cli.report.pictures import (
+    CONTOURS,
+    INK,
+    WIDTH,
+    draw_distance,
+    draw_never_seen,
+    drawn_figure,
+    extent_of,
+    save_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LONGEST_SIDE = 600  # cells of a slice that are drawn along a side: a larger one is thinned out
+MAX_LENGTH = 1.5  # of a gradient, top of its colour bar
+BAR, MARK = "#0072b2", "#d55e00"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cut:
+    """A plane of cells across `axis`, every `step`-th of them along its sides; coordinates [m] of those."""
+
+    axis: int
+    index: int
+    step: int
+    plane: float
+    coordinates: tuple[Float64, Float64]
+    voxel: float
+
+    def of(self, grid: DistanceGrid, channel: str) -> NDArray[np.generic]:
+        """The channel in the plane as a picture has it: rows upwards along the later axis."""
+        where: list[Any] = [slice(None, None, self.step)] * 3
+        where[self.axis] = self.index
+        return np.asarray(np.swapaxes(grid.channels[channel][tuple(where)], 0, 1))
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of the axis to the right and the axis upwards."""
+        first, second = (name for axis, name in enumerate("xyz") if axis != self.axis)
+        return first, second
+
+
+def slices_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
+    """Write three slices of `sdf` through the cell nearest to `point` [m], across z, y and x.
+
+    Contour lines at 0, 2, 5 and 10 cm; space that no camera saw is veiled and hatched.
+    """
+    with _panels(grid, point) as (figure, panels):
+        for axes, cut in panels:
+            distance = _floats(cut, grid, "sdf")
+            image = draw_distance(axes, cut.coordinates, distance, cut.voxel, names_lines=False)
+            _veil(axes, cut, grid)
+        figure.colorbar(image, ax=[axes for axes, _ in panels], extend="both", label="distance [cm]", pad=0.01)
+        never = "; hatched: never seen" if _knows_seen(grid) else ""
+        lines = ", ".join(f"{100 * level:g}" for level in CONTOURS)
+        field = grid.header.get("sdf", "positive outside")
+        figure.suptitle(f"Distance in world: {field}; lines at {lines} cm{never}", fontsize=12)
+        save_figure(figure, path)
+
+
+def probability_picture(path: Path, grid: DistanceGrid, point: Sequence[float]) -> None:
+    """Write three slices of `probability` through the cell nearest to `point` [m]; the surface as a line."""
+    with _panels(grid, point) as (figure, panels):
+        for axes, cut in panels:
+            image = axes.imshow(
+                _floats(cut, grid, "probability"),
+                origin="lower",
+                extent=extent_of(cut.coordinates, cut.voxel),
+                cmap="cividis",
+                vmin=0.0,
+                vmax=1.0,
+                interpolation="nearest",
+            )
+            _surface(axes, cut, grid, "white")
+        figure.colorbar(image, ax=[axes for axes, _ in panels], label="probability of collision", pad=0.01)
+        figure.suptitle(f"Probability of collision, {grid.header.get('probability', '')}; white line: sdf = 0")
+        save_figure(figure, path)
+
+
+def gradient_picture(
+    path: Path, grid: DistanceGrid, histogram: Sequence[int], bin_width: float, point: Sequence[float]
+) -> None:
+    """Write the length of the gradient in a slice across z, and how many cells of the grid have which length.
+
+    histogram: cells by length, bin k about k times `bin_width`, the last with all that is longer. A distance has
+    length 1 (Eikonal equation).
+    """
+    (cut,) = _cuts(grid, point, axes=(2,))
+    sides = [float(np.ptp(c)) + cut.voxel for c in cut.coordinates]
+    height = float(np.clip(0.5 * (WIDTH - 2.5) * sides[1] / sides[0] + 1.2, 4.0, 8.0))
+    with drawn_figure(height) as figure:
+        left, right = figure.subplots(1, 2)
+        length = np.linalg.norm(_floats(cut, grid, "gradient"), axis=2)
+        image = left.imshow(
+            length,
+            origin="lower",
+            extent=extent_of(cut.coordinates, cut.voxel),
+            cmap="RdBu_r",
+            vmin=2.0 - MAX_LENGTH,
+            vmax=MAX_LENGTH,
+            interpolation="nearest",
+        )
+        _surface(left, cut, grid, INK)
+        figure.colorbar(image, ax=left, extend="both", label="length of the gradient", fraction=0.05, pad=0.02)
+        _label(left, cut)
+        _draw_histogram(right, histogram, bin_width)
+        save_figure(figure, path)
+
+
+def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> None:
+    shares = 100.0 * np.asarray(histogram) / max(1, sum(histogram))
+    middles = bin_width * np.arange(len(shares))
+    axes.bar(middles, shares, width=bin_width, color=BAR, edgecolor="white", linewidth=0.5)
+    axes.axvline(1.0, color=MARK, linewidth=1.5, linestyle=(0, (6, 3)))
+    axes.annotate(
+        "a distance: 1", (1.0, 1.0), xycoords=("data", "axes fraction"), xytext=(6, -6), textcoords="offset points",
+        va="top", color=MARK,
+    )  # fmt: skip
+    axes.set_yscale("symlog", linthresh=0.01)
+    ticks = [0, 0.01, 0.1, 1, 10, 100]
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_ylim(0.0, 130.0)
+    axes.set(
+        xlabel="length of the gradient (last bar: and longer)",
+        ylabel="cells [%]",
+        xlim=(-bin_width, middles[-1] + bin_width),
+    )
+    axes.set_title("All cells by the length of their gradient", pad=12)
+    axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+@contextmanager
+def _panels(grid: DistanceGrid, point: Sequence[float]) -> Iterator[tuple["Figure", list[tuple[Any, Cut]]]]:
+    """Axes for the slices across z, y and x, side by side at one scale."""
+    cuts = _cuts(grid, point, axes=(2, 1, 0))
+    sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])
+    height = float(np.clip((WIDTH - 3.2) * sides[:, 1].max() / sides[:, 0].sum() + 1.5, 3.2, 9.0))
+    with drawn_figure(height) as figure:
+        panels = figure.subplots(1, 3, gridspec_kw={"width_ratios": sides[:, 0]})
+        for axes, cut in zip(panels, cuts, strict=True):
+            _label(axes, cut)
+        yield figure, list(zip(panels, cuts, strict=True))
+
+
+def _cuts(grid: DistanceGrid, point: Sequence[float], *, axes: Sequence[int]) -> list[Cut]:
+    """The planes through the cell nearest to `point`, in the grid."""
+    shape = grid.channels["sdf"].shape
+    cuts = []
+    for axis in axes:
+        index = int(np.clip(round((point[axis] - float(grid.origin[axis])) / grid.voxel), 0, shape[axis] - 1))
+        first, second = (other for other in range(3) if other != axis)
+        step = max(1, -(-max(shape[first], shape[second]) // LONGEST_SIDE))
+        right, up = (grid.origin[i] + grid.voxel * np.arange(0, shape[i], step) for i in (first, second))
+        plane = float(grid.origin[axis]) + grid.voxel * index
+        cuts.append(
+            Cut(axis=axis, index=index, step=step, plane=plane, coordinates=(right, up), voxel=step * grid.voxel)
+        )
+    return cuts
+
+
+def _floats(cut: Cut, grid: DistanceGrid, channel: str) -> Float64:
+    return cut.of(grid, channel).astype(np.float64)
+
+
+def _label(axes: Any, cut: Cut) -> None:
+    right, up = cut.names
+    axes.set(xlabel=f"{right} [m]", ylabel=f"{up} [m]", aspect="equal")
+    axes.set_title(f"{'xyz'[cut.axis]} = {round(cut.plane, 2) + 0.0:.2f} m", pad=8)
+
+
+def _veil(axes: Any, cut: Cut, grid: DistanceGrid) -> None:
+    if _knows_seen(grid):
+        draw_never_seen(axes, cut.coordinates, cut.of(grid, "observed") == VoxelState.NEVER_SEEN, cut.voxel)
+
+
+def _knows_seen(grid: DistanceGrid) -> bool:
+    """Whether somebody looked: without an occupancy grid every cell is never seen, which is no news."""
+    return "observed" in grid.channels and "no occupancy" not in str(grid.header.get("observed"))
+
+
+def _surface(axes: Any, cut: Cut, grid: DistanceGrid, color: str) -> None:
+    """The line where sdf is 0."""
+    sdf = _floats(cut, grid, "sdf")
+    known = sdf[np.isfinite(sdf)]
+    if known.size and known.min() < 0 < known.max() and min(sdf.shape) > 1:
+        axes.contour(*cut.coordinates, sdf, levels=[0.0], colors=color, linewidths=1.5)

@@ -1,0 +1,282 @@
+"""Pictures of a replay: clearance over time and what happened then, what a controller commanded, how far it went.
+
+Curves of more states than a picture has columns are drawn as the range of their values in each column, so that no
+extreme is lost and a long log takes no longer than a short one.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.records import Float64, FloatRows
+from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, span_of
+from splatctrl_cli.report.time_axis import column, envelope, spans
+
+Intervals = Sequence[tuple[float, float]]
+"""First and last time [s] of each interval."""
+
+SMALLEST = 0.01  # [rad/s] half the height of a velocity's axis, at least: rounding is no difference
+STRIP = 0.28  # inches of height for each kind of event
+THIN = 0.05  # of a curve's range: a band is a line with something around it
+QUIET = "#9a9a9a"
+KIND_COLORS = {  # by what happened; Okabe and Ito
+    "below-margin": "#e69f00",
+    "in-collision": "#d55e00",
+    "without-distance": "#555555",
+    "unknown-space": "#cc79a7",
+    "outside-limits": "#56b4e9",
+    "stale-map": "#8a6d3b",
+    "scene": "#0072b2",
+    "self": "#009e73",
+    "limit": "#cc79a7",
+    "relaxed": "#e69f00",
+    "minimum-violation": "#d55e00",
+    "hold": "#222222",
+    "scaled-back": "#56b4e9",
+    "cannot-act": "#8a6d3b",
+}
+FIELD_STYLES: Mapping[str, tuple[str, Any, float]] = {  # colour, dashes, width
+    "exact": (CURVE_COLORS[0], "-", 2.6),
+    "barrier": (CURVE_COLORS[5], (0, (4, 2)), 1.5),
+    "certified": (CURVE_COLORS[2], "-", 1.2),
+    "truth": (INK, "-", 1.2),
+}
+FIELD_NAMES = {
+    "exact": "to the splats",
+    "barrier": "the controller's field",
+    "certified": "certified bound",
+    "truth": "truth",
+}
+
+
+def clearance_picture(
+    path: Path,
+    seconds: Float64,
+    curves: Mapping[str, FloatRows],
+    margin: float,
+    title: str,
+    events: Mapping[str, Intervals],
+) -> None:
+    """Write clearance curves (T,) [m] over `seconds` (T,), in cm, with the margin [m] as a line; below, a strip per
+    kind of event with its intervals.
+
+    Gaps (NaN) stay gaps; below the margin is shaded, and each curve's smallest value is marked.
+    """
+    shown = {kind: intervals for kind, intervals in events.items() if intervals}
+    with drawn_figure(4.8 + _strip_height(shown)) as figure:
+        axes, strip = _with_strip(figure, 4.4, shown)
+        found = [_clearance_curve(axes, seconds, values, name) for name, values in curves.items()]
+        lowest = min(0.0, *found)
+        bottom = lowest * 1.15 - 0.2 if lowest < 0 else 0.0
+        axes.axhspan(bottom, 100 * margin, color="#000000", alpha=0.06, linewidth=0)
+        axes.axhline(100 * margin, color=INK, linewidth=1.0, linestyle=(0, (6, 3)))
+        axes.annotate(
+            f"margin {100 * margin:g} cm",
+            (1.0, 100 * margin),
+            xycoords=("axes fraction", "data"),
+            xytext=(6, 0),
+            textcoords="offset points",
+            va="center",
+            annotation_clip=False,
+        )
+        if bottom < 0:
+            axes.axhline(0.0, color=KIND_COLORS["in-collision"], linewidth=1.0)
+        axes.set(ylabel="clearance [cm]")
+        axes.set_ylim(bottom=bottom)
+        axes.set_title(title, pad=30)
+        axes.legend(
+            frameon=False, loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, fontsize=10, borderaxespad=0.2
+        )
+        _tidy(axes, seconds)
+        _draw_strip(strip, axes, shown, seconds)
+        save_figure(figure, path)
+
+
+def commands_picture(
+    path: Path,
+    seconds: Float64,
+    velocity: FloatRows,
+    joints: Sequence[str],
+    limits: Float64,
+    interventions: Mapping[str, Intervals],
+    logged: FloatRows | None = None,
+) -> None:
+    """Write the commanded velocity of each joint (T, J) [rad/s] with its limit (J,), over a strip per kind of row
+    that shaped it, or of step that was not plainly taken. logged (T, J): what was done there, drawn behind.
+    """
+    height = 0.78 * len(joints)
+    with drawn_figure(height + 0.6 + _strip_height(interventions)) as figure:
+        *rows, strip = figure.subplots(
+            len(joints) + 1, 1, sharex=True, height_ratios=[0.78] * len(joints) + [_strip_height(interventions)]
+        )
+        for j, (axes, joint) in enumerate(zip(rows, joints, strict=True)):
+            beneath = 0.0
+            if logged is not None:
+                beneath = _curve(axes, seconds, column(logged, j), color=QUIET, width=2.6)
+            peak = _curve(axes, seconds, column(velocity, j), color=CURVE_COLORS[0], width=1.5)
+            _limit_axis(axes, joint, float(limits[j]), peak, beneath)
+            _tidy(axes, seconds)
+        beside = "" if logged is None else "; grey: as logged"
+        rows[0].set_title(
+            f"Commanded joint velocity [rad/s]; dashed: its limit, where it is in sight{beside}", pad=10
+        )
+        _draw_strip(strip, rows[-1], interventions, seconds)
+        figure.align_ylabels(rows)
+        save_figure(figure, path)
+
+
+def open_loop_picture(
+    path: Path,
+    seconds: Float64,
+    difference: FloatRows,
+    joints: Sequence[str],
+    margin: FloatRows,
+    shaped: Intervals,
+) -> None:
+    """Write commanded less logged velocity (T, J) [rad/s] over the room (T,) [m/s] that the logged velocity left.
+
+    shaped: intervals [s] in which a row shaped the command, shaded.
+    """
+    with drawn_figure(7.2) as figure:
+        above, below = figure.subplots(2, 1, sharex=True)
+        largest = 0.0
+        for color, style, (j, joint) in zip(
+            cycle(CURVE_COLORS), cycle(["-"] * 6 + ["--"] * 6), enumerate(joints), strict=False
+        ):
+            peak = _curve(above, seconds, column(difference, j), color=color, width=1.5, style=style, label=joint)
+            largest = max(largest, peak)
+        above.set_title("Commanded less logged joint velocity; shaded: a row shapes the command", pad=10)
+        above.set_ylabel("difference [rad/s]")
+        above.set_ylim(-max(1.1 * largest, SMALLEST), max(1.1 * largest, SMALLEST))
+        above.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        room = np.asarray(margin)
+        low = envelope(seconds, room)
+        _curve(below, seconds, room, color=CURVE_COLORS[0], width=1.8)
+        below.fill_between(
+            low.seconds, low.lowest, 0.0, where=low.lowest < 0, color=CURVE_COLORS[1], alpha=0.35, linewidth=0
+        )
+        below.axhline(0.0, color=INK, linewidth=1.2, linestyle=(0, (6, 3)))
+        below.set_title(
+            "Room that the logged velocity left in the tightest barrier row; below 0 it breaks it", pad=10
+        )
+        below.set(xlabel="time [s]", ylabel="h - G v [m/s]")
+        for axes in (above, below):
+            for start, length in spans(shaped, span_of(seconds)):
+                axes.axvspan(start, start + length, color="#000000", alpha=0.06, linewidth=0)
+            _tidy(axes, seconds)
+        save_figure(figure, path)
+
+
+def divergence_picture(
+    path: Path, seconds: Float64, joints: FloatRows, position: FloatRows, rotation: FloatRows
+) -> None:
+    """Write how far the arm is from the log (T,): joints [rad], its frame's position [m] and rotation [rad]."""
+    curves = (
+        ("all joints [rad]", joints, 1.0),
+        ("frame, position [cm]", position, 100.0),
+        ("frame, rotation [degrees]", rotation, float(np.degrees(1.0))),
+    )
+    with drawn_figure(7.8) as figure:
+        for color, axes, (label, values, factor) in zip(
+            CURVE_COLORS, figure.subplots(3, 1, sharex=True), curves, strict=False
+        ):
+            _curve(axes, seconds, factor * np.asarray(values), color=color, width=1.8)
+            axes.set_ylabel(label)
+            axes.set_ylim(bottom=0.0)
+            _tidy(axes, seconds)
+        figure.axes[0].set_title("Distance of the driven arm from the log at the same time", pad=10)
+        figure.axes[-1].set_xlabel("time [s]")
+        save_figure(figure, path)
+
+
+def _curve(
+    axes: Any, seconds: Float64, values: Float64, *, color: str, width: float, style: Any = "-", label: str = ""
+) -> float:
+    """A curve; of one that is too long the band from its lowest to its highest values, on a line where it is thin.
+
+    Returns how far its values are from zero at most.
+    """
+    of = envelope(seconds, values)
+    there = np.isfinite(of.lowest)
+    height = float(np.max(of.highest[there]) - np.min(of.lowest[there])) if there.any() else 0.0
+    is_thin = not there.any() or float(np.median((of.highest - of.lowest)[there])) <= THIN * height
+    if is_thin:
+        axes.plot(of.seconds, of.lowest, linestyle=style, color=color, linewidth=width, label=label or "_")
+    if not of.is_exact:
+        name = "_" if is_thin else label or "_"
+        axes.fill_between(of.seconds, of.lowest, of.highest, color=color, alpha=0.45, linewidth=0.7, label=name)
+    return float(np.nanmax(np.abs([of.lowest, of.highest]), initial=0.0))
+
+
+def _clearance_curve(axes: Any, seconds: Float64, metres: FloatRows, name: str) -> float:
+    """Returns the least value [cm]; infinity where there is none."""
+    centimetres = 100.0 * np.asarray(metres, dtype=np.float64)
+    color, style, width = FIELD_STYLES.get(name, (CURVE_COLORS[3], "-", 1.5))
+    label = FIELD_NAMES.get(name, name)
+    if not np.isfinite(centimetres).any():
+        axes.plot([], [], color=color, label=f"{label}, no value")
+        return np.inf
+    at = int(np.nanargmin(centimetres))
+    label = f"{label}, least {centimetres[at]:.1f} cm"
+    _curve(axes, seconds, centimetres, color=color, width=width, style=style, label=label)
+    axes.plot(seconds[at], centimetres[at], "o", color=color, markersize=6, markeredgecolor="white", clip_on=False)
+    return float(centimetres[at])
+
+
+def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float) -> None:
+    """The axis of one joint: as high as its velocity and what is drawn beneath it need, with the limit where it is in
+    sight, and in words.
+    """
+    height = max(1.25 * max(peak, beneath), SMALLEST)
+    axes.set_ylim(-height, height)
+    for side in (-limit, limit):
+        if abs(side) <= height:
+            axes.axhline(side, color=KIND_COLORS["in-collision"], linewidth=1.0, linestyle=(0, (6, 3)))
+    axes.axhline(0.0, color="#cccccc", linewidth=0.8, zorder=0)
+    axes.set_ylabel(joint, rotation=0, ha="right", va="center")
+    words = f"limit {limit:.3g}\npeak {peak:.3g}, {100 * peak / limit:.0f} %"
+    axes.annotate(
+        words,
+        (1.0, 0.5),
+        xycoords="axes fraction",
+        xytext=(8, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=9,
+    )
+    axes.locator_params(axis="y", nbins=3)
+
+
+def _strip_height(events: Mapping[str, Intervals]) -> float:
+    return STRIP * len(events) + 0.55 if events else 0.4
+
+
+def _with_strip(figure: Any, height: float, events: Mapping[str, Intervals]) -> tuple[Any, Any]:
+    """Axes over a strip for events that share the time."""
+    return tuple(figure.subplots(2, 1, sharex=True, height_ratios=[height, max(_strip_height(events), 0.05)]))
+
+
+def _draw_strip(axes: Any, above: Any, events: Mapping[str, Intervals], seconds: Float64) -> None:
+    """A row per kind with its intervals, which are also shaded faintly in the axes above; without any, a word."""
+    axes.set(xlabel="time [s]", xlim=span_of(seconds), ylim=(max(len(events), 1) - 0.4, -0.6))
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.set_yticks(range(len(events)), [f"{kind}  ({len(of)})" for kind, of in events.items()])
+    axes.tick_params(axis="y", length=0)
+    above.tick_params(axis="x", labelbottom=False)
+    for row, (kind, intervals) in enumerate(events.items()):
+        axes.axhline(row, color="#eeeeee", linewidth=6, zorder=0)
+        axes.broken_barh(
+            spans(intervals, span_of(seconds)), (row - 0.32, 0.64), color=KIND_COLORS.get(kind, QUIET), linewidth=0
+        )
+    if not events:
+        axes.text(0.0, 0.5, "no event", transform=axes.transAxes, va="center", color=QUIET)
+
+
+def _tidy(axes: Any, seconds: Float64) -> None:
+    axes.set_xlim(span_of(seconds))
+    axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,1 @@
+"""The folder of a reconstruction: splats, voxels and snapshots."""

@@ -1,0 +1,267 @@
+"""Reads the ``scene/`` folder that `SceneWriter` writes.
+
+splats.ply  occupancy.npz  audit.jsonl  snapshots.csv  snapshots/NNNNNN.ply and .npz  checkpoint/state.npz  run.json
+"""
+
+import csv
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.output import PARTIAL
+from splatctrl_cli.files.parts import Parts
+from splatctrl_cli.records import Balls, GaussianSet, KnownVoxels, OccupancyGrid, SplatSet
+from splatctrl_cli.scene_files.voxel_file import (
+    read_known_occupancy,
+    read_known_states,
+    read_occupancy,
+    read_states,
+    read_unrepresented,
+)
+from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply
+from splatctrl_cli.splat_files.splats import read_world_splats
+
+FORMAT = "splatctrl-scene 1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """The splat set as it was after the frames of `stamp_ns`."""
+
+    stamp_ns: int
+    path: Path
+    num_splats: int
+    parts: Parts | None = None  # of its scene
+
+    @property
+    def occupancy_path(self) -> Path:
+        """What was known of each voxel then."""
+        return self.path.with_suffix(".npz")
+
+    def occupancy(self) -> OccupancyGrid | None:
+        """The grid of that moment, as coarse as `write_states` keeps it; None in a scene of an older version."""
+        return read_states(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def known(self) -> KnownVoxels | None:
+        """What was known then of each voxel and when it was last seen; None in a scene of an older version."""
+        return read_known_states(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def unrepresented(self) -> Balls | None:
+        """The occupied voxels that had no splat then; None in a scene of an older version."""
+        return read_unrepresented(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def splats(self) -> SplatSet:
+        """The splats of that moment."""
+        return read_world_splats(self._checked(self.path))
+
+    @property
+    def _has_voxels(self) -> bool:
+        return self.occupancy_path.is_file() if self.parts is None else self.parts.has(self.occupancy_path)
+
+    def _checked(self, path: Path) -> Path:
+        return path if self.parts is None else self.parts.checked(path)
+
+
+T = TypeVar("T")
+
+
+def run_value(
+    run: Mapping[str, Any], keys: Sequence[str], kind: Callable[[Any], T], default: object = None, *, where: str
+) -> T:
+    """What `kind` makes of the value at `keys` of a ``run.json``; of the default where it is not there.
+
+    Raises InputError naming `where` for a value that is missing without a default, or of another kind.
+    """
+    value: Any = run
+    try:
+        for key in keys:
+            if default is not None and key not in value:
+                return kind(default)
+            value = value[key]
+        return kind(value)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        said = "nothing" if isinstance(error, KeyError) else str(error)
+        raise InputError(
+            f"{where}: {'.'.join(keys)}: expected what reconstruct writes, got {said}",
+            remedy="reconstruct the scene again",
+        ) from None
+
+
+def _names(value: list[Any]) -> tuple[str, ...]:
+    return tuple(str(name) for name in value)
+
+
+def _color(value: list[Any]) -> tuple[float, float, float]:
+    red, green, blue = (float(part) for part in value)
+    return red, green, blue
+
+
+def _inside(name: str) -> str:
+    """The name itself. Raises ValueError where it leads out of its folder."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise ValueError(f"{name} lies outside the scene")
+    return name
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """A scene that `reconstruct` wrote."""
+
+    path: Path
+
+    @cached_property
+    def run(self) -> dict[str, Any]:
+        """``run.json``. Raises InputError where it is none."""
+        file = self.path / "run.json"
+        try:
+            run = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{file}: cannot be read: {error}") from None
+        for name in ("metrics", "inputs", "config"):
+            if not isinstance(run, dict) or not isinstance(run.get(name, {}), dict):
+                raise InputError(f"{file}: {name}: expected an object", remedy="reconstruct the scene again")
+        return dict(run)
+
+    @cached_property
+    def parts(self) -> Parts:
+        """By which every file is checked when it is opened."""
+        return Parts.of_run(self.path, self.run)
+
+    @property
+    def has_digests(self) -> bool:
+        """False for a scene of an older version, whose files cannot be told from others."""
+        return self.parts.digests is not None
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that trained the scene."""
+        return self._metric("cameras", _names)
+
+    @property
+    def training_stamps_ns(self) -> frozenset[int]:
+        """The views that trained a scene without a clock, by their made-up stamps."""
+        return self._metric("training_stamps_ns", frozenset[int], ())
+
+    @property
+    def has_clock(self) -> bool:
+        """False where the stamps are made up."""
+        return self._metric("has_clock", bool)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the last frame."""
+        return self._metric("stamp_ns", int)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """What is seen where no splat is: a colour in [0, 1]; black in a scene of an older version."""
+        return self._metric("background", _color, (0.0, 0.0, 0.0))
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """True for what `reconstruct --method 3dgs` made: `gaussians` instead of splats and occupancy."""
+        return self._metric("method", "3dgs".__eq__, "")
+
+    def _metric(self, name: str, kind: Callable[[Any], T], default: object = None) -> T:
+        return run_value(self.run, ("metrics", name), kind, default, where=str(self.path / "run.json"))
+
+    def gaussians(self) -> GaussianSet:
+        """The Gaussians of a scene that is anisotropic. Raises InputError where it has none."""
+        gaussians = read_gaussian_ply(self.parts.checked(self.path / "splats.ply"))[0]
+        if not len(gaussians):
+            raise InputError(
+                f"{self.path}: expected Gaussians, got none: there is nothing to render",
+                remedy="reconstruct again with views that have depth; splats.ply is empty",
+            )
+        return gaussians
+
+    def splats(self) -> SplatSet:
+        """The final splats."""
+        self._expect_isotropic()
+        return read_world_splats(self.parts.checked(self.path / "splats.ply"))
+
+    def _expect_isotropic(self) -> None:
+        if self.is_anisotropic:
+            raise InputError(
+                f"{self.path}: made by --method 3dgs; distances are defined on isotropic splats",
+                remedy="reconstruct without --method, or 'splatctrl score' it",
+            )
+
+    def occupancy(self) -> OccupancyGrid:
+        """The final occupancy grid."""
+        self._expect_isotropic()
+        return read_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+
+    def known(self) -> KnownVoxels | None:
+        """What was known at the end, and when it was last seen; None in a scene of an older version."""
+        self._expect_isotropic()
+        return read_known_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+
+    @cached_property
+    def snapshots(self) -> tuple[Snapshot, ...]:
+        """By time. Raises InputError for a table that is not the one written, or whose stamps do not ascend."""
+        self._expect_isotropic()
+        path = self.parts.checked(self.path / "snapshots.csv")
+        taken = self._snapshots_in(path)
+        for before, after in pairwise(taken):
+            if after.stamp_ns <= before.stamp_ns:
+                raise InputError(
+                    f"{path}: stamp {after.stamp_ns} after {before.stamp_ns}: expected stamps that ascend",
+                    remedy="reconstruct the scene again",
+                )
+        return taken
+
+    def _snapshots_in(self, path: Path) -> tuple[Snapshot, ...]:
+        try:
+            with path.open(encoding="utf-8", newline="") as stream:
+                return tuple(
+                    Snapshot(
+                        stamp_ns=int(row["stamp_ns"]),
+                        path=self.path / _inside(row["file"]),
+                        num_splats=int(row["num_splats"]),
+                        parts=self.parts,
+                    )
+                    for row in csv.DictReader(stream)
+                )
+        except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+            raise InputError(f"{path}: cannot be read: {error}") from None
+
+    def snapshot_at(self, stamp_ns: int) -> Snapshot:
+        """The newest snapshot not later than `stamp_ns`; NotEvaluableError before the first."""
+        known = [s for s in self.snapshots if s.stamp_ns <= stamp_ns]
+        if not known:
+            raise NotEvaluableError(
+                f"{self.path}: no snapshot at or before stamp {stamp_ns}",
+                remedy="the scene was not known yet; ask for a later time",
+            )
+        return known[-1]
+
+    def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
+        """The occupied voxels without a splat, of `snapshot_at` or (None) at the end; None in an older scene."""
+        if stamp_ns is not None:
+            return self.snapshot_at(stamp_ns).unrepresented()
+        path = self.path / "occupancy.npz"
+        return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
+
+    def splats_at(self, stamp_ns: int) -> SplatSet:
+        """The splats of `snapshot_at`."""
+        return self.snapshot_at(stamp_ns).splats()
+
+
+def open_scene(path: Path) -> SceneFolder:
+    """The scene in a folder. Raises InputError where it is none."""
+    if not path.exists():
+        raise InputError(f"{path}: no such scene folder", remedy="give what 'splatctrl reconstruct' wrote")
+    if path.name.endswith(PARTIAL):
+        raise InputError(f"{path}: an interrupted run", remedy="continue it: the same command and --resume")
+    if not (path / "splats.ply").is_file() or not (path / "run.json").is_file():
+        raise InputError(
+            f"{path}: expected a scene folder with splats.ply and run.json",
+            remedy="give what 'splatctrl reconstruct' wrote",
+        )
+    return SceneFolder(path)

@@ -1,0 +1,178 @@
+"""Voxel files of a scene: ``occupancy.npz`` and the states beside each snapshot, with the evidence behind them."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import read_arrays, savez
+from splatctrl_cli.records import UNANSWERED, Balls, KnownVoxels, OccupancyGrid, UInt8, VoxelState
+
+MOST_VOXELS = 400_000_000  # as many as reconstruct makes
+_HEADER = 1 << 22  # bytes
+_SHORT = 0xFF  # `UNANSWERED` in one byte
+_GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
+_EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def write_occupancy(path: Path, known: KnownVoxels) -> None:
+    """Write ``occupancy.npz``: log_odds, num_updates, entity, what `_evidence` says, and a JSON header."""
+    header = {
+        "format": "splatctrl-occupancy 2",
+        "values": "log_odds of occupancy; num_updates 0 = never seen; entity bits 001 robot, 010 human, 100 swept",
+    }
+    arrays: dict[str, NDArray[np.generic]] = {
+        "header": _header(known, header),
+        "log_odds": known.grid.log_odds,
+        "num_updates": known.grid.num_updates,
+        "entity": known.grid.entity,
+        **_evidence(known),
+    }
+    savez(path, arrays)
+
+
+def write_states(path: Path, known: KnownVoxels, states: UInt8) -> None:
+    """Write `states` (X, Y, Z) of the voxels instead of their log-odds: a tenth of the size."""
+    header = {
+        "format": "splatctrl-voxel-states 2",
+        "values": {state.name.lower(): int(state) for state in VoxelState},
+    }
+    savez(path, {"header": _header(known, header), "states": states, **_evidence(known)}, level=3)
+
+
+def _header(known: KnownVoxels, special: Mapping[str, object]) -> NDArray[np.generic]:
+    """The JSON header: `special` and what both files have in common."""
+    common = {
+        "frame": "world",
+        "units": "m",
+        "origin": known.grid.origin.tolist(),
+        "voxel": known.grid.voxel,
+        "shape": list(known.last_seen.shape),
+        "last_seen": "1 + index into step_stamps_ns of the last time step with depth through or on it, 0 never, "
+        "the largest number: looked at in vain",
+        "unrepresented": "centres (K, 3) [m] of voxels that are occupied, not the robot, and have no splat",
+        "step_stamps_ns": known.step_stamps_ns.tolist(),
+    }
+    return np.array(json.dumps({**special, **common}))
+
+
+def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
+    """The arrays that both files have in common; last_seen in one byte where that holds it: twice as fast."""
+    balls = known.unrepresented
+    kind = np.uint8 if len(known.step_stamps_ns) < _SHORT else np.uint16
+    return {
+        "last_seen": known.last_seen.astype(kind),
+        "unrepresented": balls.centers,
+        "unrepresented_labels": balls.labels,
+    }
+
+
+def read_states(path: Path) -> OccupancyGrid:
+    """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
+    try:
+        arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
+        return _grid_of_states(arrays, json.loads(str(arrays["header"])))
+    except Exception as error:
+        raise InputError(f"{path}: not the voxel states of a snapshot: {error}") from error
+
+
+def read_known_states(path: Path) -> KnownVoxels | None:
+    """What `write_states` wrote, None where an older version did. Raises as `read_states`."""
+    return _read_known(path, ("states",), _grid_of_states, "the voxel states of a snapshot")
+
+
+def read_occupancy(path: Path) -> OccupancyGrid:
+    """Read the grid of ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
+    try:
+        arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
+        return _grid_of(arrays, json.loads(str(arrays["header"])))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        raise InputError(f"{path}: not an occupancy grid of ours: {error}") from error
+
+
+def read_known_occupancy(path: Path) -> KnownVoxels | None:
+    """All of ``occupancy.npz``, None where an older version wrote it. Raises as `read_occupancy`."""
+    return _read_known(path, tuple(_GRID), _grid_of, "an occupancy grid of ours")
+
+
+def read_unrepresented(path: Path) -> Balls | None:
+    """The unrepresented voxels of either file, without the rest; None where an older version wrote it.
+
+    Raises InputError for anything else.
+    """
+    try:
+        header = json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+        if "step_stamps_ns" not in header:
+            return None
+        return _balls(read_arrays(path, _EVIDENCE[1:], most=13 * MOST_VOXELS), float(header["voxel"]))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        raise InputError(f"{path}: not a voxel file of ours: {error}") from error
+
+
+def _read_known(
+    path: Path, names: tuple[str, ...], grid_of: Callable[[Arrays, Mapping[str, Any]], OccupancyGrid], what: str
+) -> KnownVoxels | None:
+    try:
+        header = json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+        if "step_stamps_ns" not in header:
+            return None
+        arrays = read_arrays(path, (*names, *_EVIDENCE), most=22 * MOST_VOXELS)
+        grid = grid_of(arrays, header)
+        stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+        last_seen: NDArray[Any] = arrays["last_seen"]
+        if last_seen.dtype == np.uint8:
+            is_unanswered = (last_seen == _SHORT) & (len(stamps_ns) < _SHORT)
+            last_seen = np.where(is_unanswered, np.uint16(UNANSWERED), last_seen.astype(np.uint16))
+        last_seen = _voxels(last_seen, "last_seen", np.uint16, header)
+        latest = last_seen.max(initial=0, where=last_seen != UNANSWERED)
+        if latest > len(stamps_ns):
+            raise ValueError(f"last_seen: expected at most {len(stamps_ns)} time steps, got {latest}")
+        balls = _balls(arrays, grid.voxel)
+        return KnownVoxels(grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        raise InputError(f"{path}: not {what}: {error}") from error
+
+
+def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
+    return OccupancyGrid(
+        origin=np.array(header["origin"], np.float64),
+        voxel=float(header["voxel"]),
+        **{name: _voxels(arrays[name], name, kind, header) for name, kind in _GRID.items()},
+    )
+
+
+def _grid_of_states(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
+    states = _voxels(arrays["states"], "states", np.uint8, header)
+    return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
+
+
+def _balls(arrays: Arrays, voxel: float) -> Balls:
+    """Raises ValueError for other types or shapes."""
+    centers, labels = arrays["unrepresented"], arrays["unrepresented_labels"]
+    if centers.dtype != np.float32 or labels.dtype != np.uint8 or centers.shape != (labels.size, 3):
+        raise ValueError(
+            f"unrepresented: expected float32 (K, 3) and uint8 (K,), got {centers.shape}, {labels.shape}"
+        )
+    if not np.isfinite(centers).all():
+        raise ValueError("unrepresented: expected finite centres")
+    return Balls.of_voxels(centers, voxel, labels)
+
+
+def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Mapping[str, Any]) -> NDArray[Any]:
+    """An array of one value a voxel. Raises ValueError for one of another type or shape than the header's."""
+    wanted = (np.dtype(kind), tuple(header["shape"]))
+    if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
+        raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
+    return values

@@ -1,0 +1,1 @@
+"""Opens any recorded input, and says what a file is."""

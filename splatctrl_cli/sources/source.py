@@ -1,0 +1,60 @@
+"""Opens any recorded input as records in time order."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatctrl_cli.captures.capture import CaptureSource, is_capture
+from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.containers.raw_log import RawLog
+from splatctrl_cli.containers.session_log import SessionLog
+from splatctrl_cli.datasets.layouts import open_layout
+from splatctrl_cli.datasets.rig_folder import open_image_folder
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.shot import ShotSource
+
+__all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
+
+
+def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
+    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder, or image folder's TOML
+    description.
+
+    Raises InputError where there is nothing, or nothing that can be used.
+    """
+    options = options or SourceOptions()
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if path.suffix == ".toml":
+        return open_image_folder(path, options)
+    if is_capture(path):
+        return CaptureSource(path, options)
+    if path.is_dir() and not is_bag_folder(path):
+        return open_layout(path, options)
+    return RosLogSource(open_raw_log(path), options)
+
+
+def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> ShotSource:
+    """The records of one input, or of several logs that were recorded at the same time.
+
+    Raises InputError as `open_source`, and where one of several is no log.
+    """
+    log = open_logs(paths)
+    return open_source(paths[0], options) if log is None else RosLogSource(log, options or SourceOptions())
+
+
+def open_logs(paths: Sequence[Path]) -> RawLog | None:
+    """A log, or several of one session as one; None where there is one path, and it is no log.
+
+    Raises InputError where there is nothing, and where one of several is no log.
+    """
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder", remedy="check the path")
+        if path.suffix == ".toml" or is_capture(path) or (path.is_dir() and not is_bag_folder(path)):
+            if len(paths) == 1:
+                return None
+            raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")
+    logs = tuple(open_raw_log(path) for path in paths)
+    return logs[0] if len(logs) == 1 else SessionLog(logs)

@@ -1,0 +1,1 @@
+"""The files that hold splats, one format a file."""

@@ -1,0 +1,139 @@
+"""Sets of anisotropic Gaussians as 3D-GS PLY files: the reference implementation's 62 properties.
+
+Layout: ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma),
+``rot_*`` a quaternion w x y z, ``opacity`` a logit; ``f_dc_*`` and ``f_rest_*`` are the harmonics' coefficients of
+red, green and blue: f_rest has all of red first, then green, then blue. A ``label`` (uchar) follows only where some
+Gaussian is no object, so that readers of a fixed stride can read every other file.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.ply import PlyFile, check_properties, read_table, write_table
+from splatctrl_cli.records import Float32, GaussianSet, Label, UInt8
+from splatctrl_cli.splat_files.splat_values import (
+    check_finite,
+    logit,
+    refuse,
+    sigma_of_log,
+    sigmoid,
+    unit_quaternions,
+)
+
+REST = tuple(f"f_rest_{index}" for index in range(45))
+NAMES = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *REST, "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz", *REST})
+REST_PER_DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest_* -> degree of the harmonics
+HEADER_COMMENTS = {
+    "frame": "world",
+    "units": "metre",
+    "splat": "anisotropic Gaussian; exp(scale_*) are its sigmas [m]; rot is w x y z; opacity is a logit",
+}
+
+
+def write_gaussian_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
+    """Write `gaussians`; frame, units, what the scales mean and `comments` go in the header. Same input, same bytes.
+
+    Harmonics above the set's degree are zeros; opacities of exactly 0 and 1 read back as that.
+    Raises InputError for a value the format cannot hold, naming its index; UsageError for a comment of several lines.
+    """
+    check_gaussians("Gaussians to write", gaussians)
+    has_labels = bool((gaussians.labels != Label.OBJECT).any())
+    dtype = np.dtype([*((name, "<f4") for name in NAMES), *([("label", "u1")] if has_labels else [])])
+    rows = np.zeros(len(gaussians), dtype=dtype)
+    num_coefficients = gaussians.harmonics.shape[1]
+    for axis, name in enumerate("xyz"):
+        rows[name] = gaussians.centers[:, axis]
+        rows[f"scale_{axis}"] = np.log(gaussians.scales[:, axis].astype(np.float64))
+    for channel in range(3):
+        rows[f"f_dc_{channel}"] = gaussians.harmonics[:, 0, channel]
+        for index in range(1, num_coefficients):
+            rows[f"f_rest_{15 * channel + index - 1}"] = gaussians.harmonics[:, index, channel]
+    rows["opacity"] = logit(gaussians.opacities)
+    for index in range(4):
+        rows[f"rot_{index}"] = gaussians.quats_wxyz[:, index]
+    if has_labels:
+        rows["label"] = gaussians.labels
+    write_table(path, rows, {**HEADER_COMMENTS, **comments})
+
+
+def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
+    """The Gaussians of a 3D-GS PLY file (binary or ASCII, properties in any order) and its ``key: value`` comments.
+
+    Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45 of them), less degrees that are zero throughout.
+    Quaternions are scaled to length one; a missing label is 0 (object); other properties are ignored.
+    Raises InputError for a file that is not whole, lacks a property or holds a value that is no Gaussian's.
+    """
+    ply = read_table(path, "vertex", REQUIRED)
+    return gaussians_of(ply), ply.pairs()
+
+
+def gaussians_of(ply: PlyFile) -> GaussianSet:
+    """The Gaussians that a table of a PLY file holds. Raises InputError as `read_gaussian_ply` does."""
+    path = ply.path
+    check_properties(path, ply.names, REQUIRED)
+    scales = [sigma_of_log(str(path), f"scale_{axis}", ply.column(f"scale_{axis}")) for axis in range(3)]
+    gaussians = GaussianSet(
+        centers=np.column_stack([ply.column(name) for name in "xyz"]).astype(np.float32),
+        scales=np.column_stack(scales),
+        quats_wxyz=unit_quaternions(str(path), np.column_stack([ply.column(f"rot_{index}") for index in range(4)])),
+        opacities=sigmoid(ply.column("opacity")),
+        harmonics=without_zero_degrees(_harmonics(ply)),
+        labels=labels_of(ply),
+    )
+    check_gaussians(str(path), gaussians)
+    return gaussians
+
+
+def labels_of(ply: PlyFile) -> UInt8:
+    """(N,) labels; all 0 (object) where the file has none. Raises InputError for what is no byte."""
+    if "label" not in ply:
+        return np.zeros(len(ply), dtype=np.uint8)
+    values = ply.column("label")
+    is_bad = (values < 0) | (values > 255) | (values != np.floor(values))
+    refuse(str(ply.path), "label", values, is_bad, "a whole number 0 to 255")
+    return values.astype(np.uint8)
+
+
+def without_zero_degrees(harmonics: Float32) -> Float32:
+    """`harmonics` (N, K, 3) up to the last degree that has a coefficient other than zero: the same colours."""
+    degree = 3
+    while degree and not harmonics[:, degree * degree :].any():
+        degree -= 1
+    return np.ascontiguousarray(harmonics[:, : (degree + 1) ** 2])
+
+
+def check_gaussians(where: str, gaussians: GaussianSet) -> None:
+    """Raise InputError at the first Gaussian that has no place in the world, naming its index."""
+    g = gaussians
+    groups: dict[str, NDArray[np.generic]] = {"center": g.centers, "sigma": g.scales, "rotation": g.quats_wxyz}
+    groups |= {"opacity": g.opacities, "harmonics": g.harmonics}
+    check_finite(where, len(g), groups)
+    if g.harmonics.shape[1] not in (1, 4, 9, 16):
+        raise InputError(f"{where}: harmonics: expected 1, 4, 9 or 16 coefficients, got {g.harmonics.shape[1]}")
+    refuse(where, "sigma", g.scales, np.asarray((g.scales <= 0).any(axis=1)), "more than 0 m")
+    refuse(where, "opacity", g.opacities, (g.opacities < 0) | (g.opacities > 1), "0 to 1")
+    lengths = np.linalg.norm(g.quats_wxyz.astype(np.float64), axis=1)
+    refuse(where, "rotation", g.quats_wxyz, np.abs(lengths - 1) > 1e-3, "a unit quaternion w x y z")
+
+
+def _harmonics(ply: PlyFile) -> Float32:
+    """(N, K, 3) coefficients; f_rest has all of a channel's in a row."""
+    num_rest = sum(name.startswith("f_rest_") for name in ply.names)
+    names = [f"f_rest_{index}" for index in range(num_rest)]
+    if num_rest not in REST_PER_DEGREE or not all(name in ply for name in names):
+        expected = ", ".join(map(str, REST_PER_DEGREE))
+        raise InputError(f"{ply.path}: f_rest_*: expected {expected} of them in a row from 0, got {num_rest}")
+    harmonics = np.zeros((len(ply), 1 + num_rest // 3, 3), dtype=np.float32)
+    for channel in range(3):
+        harmonics[:, 0, channel] = ply.column(f"f_dc_{channel}")
+        for index in range(num_rest // 3):
+            harmonics[:, 1 + index, channel] = ply.column(names[channel * (num_rest // 3) + index])
+    return harmonics

@@ -1,0 +1,121 @@
+"""Splat sets as 3D-GS PLY files: what stock viewers open, plus label and density.
+
+Layout: the reference implementation's names and order without ``f_rest_*`` (degree-0 colour): ``x y z nx ny nz
+f_dc_0..2 opacity scale_0..2 rot_0..3``, then ``label`` (uchar) and ``density`` (float). The normals are zeros:
+readers that go by the header skip them, readers that go by the reference's order need them. ``scale_*`` are three
+equal log(radius), ``rot`` is 1 0 0 0, ``opacity`` is a logit and ``f_dc`` is ``(colour - 0.5) / C0``.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.ply import PlyFile, read_table, write_table
+from splatctrl_cli.records import SplatSet
+from splatctrl_cli.splat_files.gaussian_ply import labels_of
+from splatctrl_cli.splat_files.isotropic import MAX_SCALE_SPREAD
+from splatctrl_cli.splat_files.splat_values import SH_C0, check_finite, logit, refuse, sigma_of_log, sigmoid
+
+NAMES = (
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+DTYPE = np.dtype([*((name, "<f4") for name in NAMES), ("label", "u1"), ("density", "<f4")])
+REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz"} and not name.startswith("rot_"))
+METRES = ("m", "metre", "metres", "meter", "meters")
+HEADER_COMMENTS = {
+    "frame": "world",
+    "units": "metre",
+    "splat": "isotropic Gaussian; exp(scale_*) is its sigma [m]; opacity is a logit; f_dc (colour - 0.5) / 0.28209",
+    "label": "0 object, 1 robot, 2 human; density is the kernel row sum, 0 where not computed",
+}
+
+
+def write_ply(path: Path, splats: SplatSet, comments: Mapping[str, str]) -> None:
+    """Write `splats`; frame, units, what the scales mean and `comments` go in the header. Same input, same bytes.
+
+    Opacities of exactly 0 and 1 are written as finite logits that read back as exactly 0 and 1.
+    Raises InputError for a value the format cannot hold, naming its index; UsageError for a comment of several lines.
+    """
+    check_splats("splats to write", splats)
+    rows = np.zeros(len(splats), dtype=DTYPE)
+    coefficients = (splats.colors.astype(np.float64) - 0.5) / SH_C0
+    log_radii = np.log(splats.radii.astype(np.float64))
+    for axis, name in enumerate("xyz"):
+        rows[name] = splats.centers[:, axis]
+        rows[f"f_dc_{axis}"] = coefficients[:, axis]
+        rows[f"scale_{axis}"] = log_radii
+    rows["opacity"] = logit(splats.opacities)
+    rows["rot_0"] = 1.0
+    rows["label"] = splats.labels
+    rows["density"] = splats.density
+    write_table(path, rows, {**HEADER_COMMENTS, **comments})
+
+
+def read_ply(path: Path) -> tuple[SplatSet, dict[str, str]]:
+    """The splat set of a 3D-GS PLY file (binary or ASCII, properties in any order) and its ``key: value`` comments.
+
+    A comment without a colon is a key with an empty value. Other properties (normals, higher harmonics, rotation) are
+    ignored; a missing label is 0 (object), a missing density 0 (not computed).
+    Raises InputError for a file that is not whole, lacks a property, is anisotropic or holds no valid splat.
+    """
+    ply = read_table(path, "vertex", REQUIRED)
+    return splats_of(ply), ply.pairs()
+
+
+def read_world_splats(path: Path) -> SplatSet:
+    """The splats of a PLY file whose distances mean metres in the world. Raises as `read_ply`, and InputError for a
+    file whose comments name other units or another frame; one that names none is taken at its word.
+    """
+    splats, comments = read_ply(path)
+    for key, known in (("units", METRES), ("frame", ("world",))):
+        said = comments.get(key)
+        if said is not None and said.lower() not in known:
+            raise InputError(
+                f"{path}: comment '{key}: {said}': expected {known[0]}",
+                remedy="distances are in metres in the world: transform the splats, and correct the comment",
+            )
+    return splats
+
+
+def splats_of(ply: PlyFile) -> SplatSet:
+    """The splats that a table of a PLY file holds. Raises InputError as `read_ply` does."""
+    path = ply.path
+    if num := num_stretched(ply):
+        raise InputError(
+            f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
+            remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set",
+        )
+    splats = SplatSet(
+        centers=np.column_stack([ply.column(name) for name in "xyz"]).astype(np.float32),
+        radii=sigma_of_log(str(path), "scale_0", ply.column("scale_0")),
+        colors=np.column_stack([0.5 + SH_C0 * ply.column(f"f_dc_{axis}") for axis in range(3)]).astype(np.float32),
+        opacities=sigmoid(ply.column("opacity")),
+        labels=labels_of(ply),
+        density=(ply.column("density") if "density" in ply else np.zeros(len(ply))).astype(np.float32),
+    )
+    check_splats(str(path), splats)
+    return splats
+
+
+def num_stretched(ply: PlyFile) -> int:
+    """How many rows of a table have scales that differ."""
+    scales = np.column_stack([ply.column(f"scale_{axis}") for axis in range(3)])
+    spread = scales.max(axis=1, initial=-np.inf) - scales.min(axis=1, initial=np.inf)
+    return int(np.count_nonzero(spread > MAX_SCALE_SPREAD))
+
+
+def check_splats(where: str, splats: SplatSet) -> None:
+    """Raise InputError at the first splat that has no place in the world: NaN, no radius, opacity outside [0, 1]."""
+    groups = {
+        "center": splats.centers,
+        "radius": splats.radii,
+        "colour": splats.colors,
+        "opacity": splats.opacities,
+        "density": splats.density,
+    }
+    check_finite(where, len(splats), groups)
+    refuse(where, "radius", splats.radii, splats.radii <= 0, "more than 0 m")
+    refuse(where, "opacity", splats.opacities, (splats.opacities < 0) | (splats.opacities > 1), "0 to 1")

@@ -1,0 +1,205 @@
+"""``.spz`` files (Niantic's compressed Gaussians): version 3 is written, 2 and 3 are read.
+
+A gzip stream: a header of 16 bytes, then by attribute the centres (24-bit fixed point), opacities, colours, log
+sigmas and rotations in bytes, and the harmonics above degree 0. The format names its axes right, up, back; centres
+and rotations are written in the axes of world as they are, so that they read back in world: a viewer that takes y for
+up shows a world whose z is up lying on its back.
+"""
+
+import gzip
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float32, Float64, GaussianSet, UInt8
+from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
+from splatctrl_cli.splat_files.splat_differences import Differences
+from splatctrl_cli.splat_files.splat_values import SH_C0
+
+MAGIC = 0x5053474E  # NGSP
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, number, degree, fraction bits, flags, reserved
+HAS_EXTENSIONS = 0x2
+FRACTION_BITS = 12  # steps of 0.24 mm up to 2 km, what other writers use; fewer for what is farther
+COLOR_SCALE = 0.15 * 255.0  # steps per unit of an f_dc coefficient
+LOG_SIGMAS = (-10.0, 255.0 / 16.0 - 10.0)  # of a byte / 16 - 10: 0.045 mm to 377 m
+HARMONICS = (-1.0, 127.0 / 128.0)  # of (byte - 128) / 128
+SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
+
+
+def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
+    """Write `gaussians`, what of them the format can hold; `comments` are left out. Same input, same bytes.
+
+    Raises InputError for a value that is no Gaussian's, naming its index.
+    """
+    check_gaussians("Gaussians to write", gaussians)
+    held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
+    num_coefficients = held.harmonics.shape[1]
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[num_coefficients]
+    fixed = np.rint(np.ldexp(held.centers.astype(np.float64), bits)).astype("<i4")
+    parts = [
+        HEADER.pack(MAGIC, 3, len(held), degree, bits, 0, 0),
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
+        np.rint(255.0 * held.opacities.astype(np.float64)).astype(np.uint8).tobytes(),
+        np.rint(held.harmonics[:, 0] * COLOR_SCALE + 127.5).astype(np.uint8).tobytes(),
+        np.rint(16.0 * (np.log(held.scales.astype(np.float64)) + 10.0)).astype(np.uint8).tobytes(),
+        _packed_quaternions(held.quats_wxyz).tobytes(),
+        np.rint(128.0 * held.harmonics[:, 1:] + 128.0).astype(np.uint8).tobytes(),
+    ]
+    path.write_bytes(gzip.compress(b"".join(parts), compresslevel=6, mtime=0))
+
+
+def read_spz(path: Path) -> tuple[GaussianSet, dict[str, str]]:
+    """The Gaussians of an ``.spz`` file of version 2 or 3, in the file's axes, and no comments.
+
+    Raises InputError for a file that is not whole, of another version, or that holds what no Gaussian is.
+    """
+    try:
+        content = gzip.decompress(path.read_bytes())
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: no whole .spz file: {error}", remedy="copy or write the file again") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    columns = _columns(path, content)
+    gaussians = GaussianSet(
+        centers=_centers(columns.centers, columns.bits),
+        scales=np.exp(columns.sigmas / 16.0 - 10.0).astype(np.float32),
+        quats_wxyz=_quaternions(columns.quats),
+        opacities=(columns.opacities[:, 0] / 255.0).astype(np.float32),
+        harmonics=_harmonics(columns),
+        labels=np.zeros(len(columns.centers), dtype=np.uint8),
+    )
+    check_gaussians(str(path), gaussians)
+    return gaussians, {}
+
+
+def held_by_spz(gaussians: GaussianSet) -> GaussianSet:
+    """`gaussians` inside the ranges of the format's bytes, without labels: what a byte can be rounded from."""
+    harmonics = np.clip(gaussians.harmonics, *HARMONICS)
+    harmonics[:, 0] = np.clip(gaussians.harmonics[:, 0], -127.5 / COLOR_SCALE, 127.5 / COLOR_SCALE)
+    scales = np.clip(gaussians.scales, *np.exp(LOG_SIGMAS)).astype(np.float32)
+    return replace(gaussians, harmonics=harmonics, scales=scales, labels=np.zeros_like(gaussians.labels))
+
+
+def spz_bound(gaussians: GaussianSet) -> Differences:
+    """Half a step of each value, and a little for float32.
+
+    Sigma: exp(1/32). Rotation: three components of half a step of sqrt(1/2) / 511, 1.2e-3 together; the fourth
+    follows and is at least 1/2, which at most doubles it; a rotation turns by twice that angle: 0.28 degrees.
+    """
+    step = 2.0 ** -_fraction_bits(gaussians.centers)
+    return Differences(
+        center=0.5001 * step,
+        sigma=float(np.expm1(1 / 32)) + 1e-5,
+        rotation=0.28,
+        color=0.5001 * SH_C0 / COLOR_SCALE,
+        opacity=0.5001 / 255,
+        harmonics=0.5001 / 128,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Columns:
+    bits: int
+    centers: UInt8
+    opacities: UInt8
+    colors: UInt8
+    sigmas: UInt8
+    quats: UInt8
+    rest: UInt8
+
+
+def _columns(path: Path, content: bytes) -> _Columns:
+    """The bytes of each attribute, a row per Gaussian, of a file that has neither more nor less."""
+    if len(content) < HEADER.size or HEADER.unpack_from(content)[0] != MAGIC:
+        raise InputError(f"{path}: no .spz file: expected it to start with {MAGIC:#x}, got {content[:4].hex()}")
+    _, version, num, degree, bits, flags, _ = HEADER.unpack_from(content)
+    if version not in (2, 3):
+        raise InputError(f"{path}: .spz version: expected 2 or 3, got {version}", remedy="write it as version 3")
+    if degree > 3 or bits > 23:
+        raise InputError(f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}")
+    if flags & HAS_EXTENSIONS:
+        raise InputError(f"{path}: has extensions of some vendor, expected none", remedy="write it without them")
+    widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
+    expected = HEADER.size + num * sum(widths)
+    if len(content) != expected:
+        raise InputError(f"{path}: expected {expected} bytes for {num} splats, got {len(content)}")
+    tables, offset = list[UInt8](), HEADER.size
+    for width in widths:
+        tables.append(np.frombuffer(content, np.uint8, num * width, offset).reshape(num, width))
+        offset += num * width
+    centers, opacities, colors, sigmas, quats, rest = tables
+    return _Columns(
+        bits=bits, centers=centers, opacities=opacities, colors=colors, sigmas=sigmas, quats=quats, rest=rest
+    )
+
+
+def _fraction_bits(centers: Float32) -> int:
+    """The most fraction bits, up to 12, with which every coordinate fits 24 bits."""
+    largest = float(np.abs(centers).max(initial=0.0))
+    bits = FRACTION_BITS
+    while largest * 2.0**bits > 2**23 - 1:
+        bits -= 1
+    if bits < 0:
+        raise InputError(f".spz: expected coordinates up to 8388 km, got {largest:g} m")
+    return bits
+
+
+def _centers(table: UInt8, bits: int) -> Float32:
+    wide = np.zeros((len(table), 3, 4), dtype=np.uint8)
+    wide[:, :, 1:] = table.reshape(-1, 3, 3)  # in the upper bytes: the shift back keeps the sign
+    fixed = wide.view("<i4")[:, :, 0] >> 8
+    return np.ldexp(fixed.astype(np.float64), -bits).astype(np.float32)
+
+
+def _harmonics(columns: _Columns) -> Float32:
+    num, width = columns.rest.shape
+    constant = ((columns.colors / 255.0 - 0.5) / 0.15)[:, None]
+    rest = (columns.rest / 128.0 - 1.0).reshape(num, width // 3, 3)
+    return np.concatenate([constant, rest], axis=1).astype(np.float32)
+
+
+def _packed_quaternions(quats_wxyz: Float32) -> NDArray[np.uint32]:
+    """(N,) little-endian words: 2 bits say which of x y z w is largest, then 10 bits (sign, size) for each other."""
+    quats = np.roll(quats_wxyz.astype(np.float64), -1, axis=1)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    largest = np.abs(quats).argmax(axis=1)
+    quats *= np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    others = quats[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    sizes = np.rint(511.0 * np.minimum(np.abs(others) / SQRT_HALF, 1.0)).astype(np.uint32)
+    words = largest.astype(np.uint32)
+    for index in range(3):
+        sign = (others[:, index] < 0).astype(np.uint32)
+        words = (words << np.uint32(10)) | (sign << np.uint32(9)) | sizes[:, index]
+    return np.asarray(words, dtype="<u4")
+
+
+def _quaternions(table: UInt8) -> Float32:
+    """(N, 4) unit quaternions w x y z of three bytes (version 2) or of four (version 3)."""
+    is_version_2 = table.shape[1] == 3
+    quats = _of_three_bytes(table) if is_version_2 else _of_words(np.ascontiguousarray(table).view("<u4")[:, 0])
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.roll(quats, 1, axis=1).astype(np.float32)
+
+
+def _of_three_bytes(table: UInt8) -> Float64:
+    xyz = table / 127.5 - 1.0
+    w = np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1)))
+    return np.column_stack([xyz, w])
+
+
+def _of_words(words: NDArray[np.uint32]) -> Float64:
+    largest = (words >> np.uint32(30)).astype(np.intp)
+    fields = np.stack([(words >> np.uint32(shift)) & np.uint32(0x3FF) for shift in (20, 10, 0)], axis=1)
+    others = SQRT_HALF * (fields & np.uint32(0x1FF)) / 511.0 * np.where(fields >> np.uint32(9), -1.0, 1.0)
+    quats = np.zeros((len(words), 4))
+    quats[np.arange(4) != largest[:, None]] = others.ravel()
+    np.put_along_axis(
+        quats, largest[:, None], np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))[:, None], axis=1
+    )
+    return quats

@@ -1,0 +1,122 @@
+"""Opens what holds a robot's motion: any recorded input, a log without cameras, libfranka's and other tables."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from splatctrl_cli.captures.capture import CaptureSource, is_capture
+from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.containers.raw_log import RawLog
+from splatctrl_cli.datasets.folder_description import has_table
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.logs.joints import joint_records
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.logs.state_topics import with_prefix
+from splatctrl_cli.logs.state_track import RawTrack, cleaned
+from splatctrl_cli.logs.survey import survey
+from splatctrl_cli.records import LossReport, Record, RecordSource
+from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.states.state_csv import is_libfranka, libfranka_track, read_csv
+from splatctrl_cli.states.state_table import described_track
+
+_FOR_CAMERAS = (
+    *("cameras", "camera_topics", "camera_poses", "camera_pose_topics"),
+    *("human_topics", "depth_scale", "world_frame"),
+)
+_NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
+
+
+class StateSource:
+    """Joint states without any frames: of a log, or of a table of states."""
+
+    cameras: tuple[str, ...] = ()
+    has_clock = True
+
+    def __init__(
+        self, name: str, files: Sequence[Path], names: tuple[str, ...], states: StateColumns, loss: LossReport
+    ) -> None:
+        self.name = name
+        self.joint_names = names
+        self._files = tuple(files)
+        self.states = states
+        self._loss = loss
+
+    @property
+    def loss(self) -> LossReport:
+        """What did not become states."""
+        return replace(self._loss, notes=list(self._loss.notes))
+
+    def records(self) -> Iterator[Record]:
+        """Joint states by stamp."""
+        yield from self.states
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the files."""
+        return {file.name: sha256(file) for file in self._files}
+
+
+def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> RecordSource:
+    """A recorded input with the states of `joints` (a robot's), as far as it has them, and its frames if it has any.
+
+    Raises InputError where there is nothing, or nothing with joint states that can be used.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    if path.suffix == ".csv":
+        options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
+        return _libfranka(path, joints)
+    if path.suffix == ".toml" and has_table(path, "states"):
+        options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
+        raw, file = described_track(path)
+        return _of_table(path, (path, file), raw, LossReport())
+    if is_capture(path):
+        return CaptureSource(path, options, joints)
+    if path.suffix == ".toml" or (path.is_dir() and not is_bag_folder(path)):
+        return open_source(path, options)
+    return _of_log(path, open_raw_log(path), options, joints)
+
+
+def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> RecordSource:
+    """With frames where the log's cameras can be used; else the states alone, with a note that says why."""
+    default = SourceOptions()
+    try:
+        return RosLogSource(log, options, joints)
+    except InputError as error:
+        if any(getattr(options, name) != getattr(default, name) for name in _FOR_CAMERAS):
+            raise  # somebody asked for these cameras
+        reason = error
+    found = survey(log, by_log_time=options.stamps == "log")
+    if not found.num_messages:
+        raise reason
+    loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, f"no camera is used: {reason.message}"])
+    names, states = joint_records(found, options, loss, joints)
+    if not states:
+        topics = ", ".join(f"{name} ({t.topic.type_name})" for name, t in sorted(found.topics.items()) if t.count)
+        raise InputError(
+            f"{path}: expected joint states, got none", remedy=f"the log holds {topics or 'no messages'}"
+        )
+    return StateSource(path.name, log.files, names, states, loss)
+
+
+def _libfranka(path: Path, joints: Sequence[str]) -> StateSource:
+    table = read_csv(path)
+    if not is_libfranka(table):
+        raise InputError(
+            f"{path}: expected libfranka's columns (time, q[0], ...), got {', '.join(table.names[:4])}, ...",
+            remedy="describe the columns in a .toml and give that (docs/replay.md, Logs)",
+        )
+    raw, names = libfranka_track(table), with_prefix(joints)
+    loss = LossReport(notes=["times are those of the robot, in ms since it was switched on"])
+    if names:
+        raw = replace(raw, names=tuple(names[name] for name in raw.names))
+    return _of_table(path, (path,), raw, loss)
+
+
+def _of_table(path: Path, files: Sequence[Path], raw: RawTrack, loss: LossReport) -> StateSource:
+    states = cleaned(raw, loss)
+    if not states:
+        raise InputError(f"{path}: expected joint states, got none that is finite", remedy="check the file")
+    return StateSource(path.name, files, raw.names, states, loss)

@@ -1,0 +1,159 @@
+"""Joint states in a CSV or NPZ file whose columns a TOML file describes (docs/replay.md, Logs)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.datasets.folder_description import read_table
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.npz_columns import NpzFile
+from splatctrl_cli.files.rows import Rows, absent, scaled
+from splatctrl_cli.logs.state_messages import pose_of_columns, pose_of_quat, rigid_or_none
+from splatctrl_cli.logs.state_track import RawTrack
+from splatctrl_cli.logs.state_velocity import Stamps
+from splatctrl_cli.records import Float64
+from splatctrl_cli.states.state_csv import CsvTable, poses_of, read_csv
+
+UNITS = {"rad": 1.0, "deg": float(np.pi / 180.0)}
+TIME_UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+POSE_FRAMES = ("base", "world")
+POSE_ORDERS = ("rows", "columns")
+_SEE = "see docs/replay.md, Logs"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatesTable:
+    """``[states]``: a file and its columns; in an NPZ file, arrays (T, K) give K columns each.
+
+    epoch_ns: the Unix time of time 0; pose: x, y, z, qx, qy, qz, qw, or the 16 numbers of a matrix by pose_order.
+    """
+
+    file: str
+    joints: list[str]
+    time: str
+    position: list[str]
+    velocity: list[str] = field(default_factory=list)
+    commanded_velocity: list[str] = field(default_factory=list)
+    pose: list[str] = field(default_factory=list)
+    unit: str = "rad"
+    time_unit: str = "s"
+    epoch_ns: int = 0
+    pose_frame: str = "base"
+    pose_order: str = "rows"
+
+
+def described_track(path: Path) -> tuple[RawTrack, Path]:
+    """The states that a TOML file describes, and the file that holds them.
+
+    Raises InputError, naming the key or column.
+    """
+    table = read_table(StatesTable, path, "states", beside=("twists",))
+    choices: Mapping[str, tuple[str, ...]] = {
+        "unit": tuple(UNITS),
+        "time_unit": tuple(TIME_UNITS_NS),
+        "pose_frame": POSE_FRAMES,
+        "pose_order": POSE_ORDERS,
+    }
+    for key, allowed in choices.items():
+        if getattr(table, key) not in allowed:
+            raise InputError(
+                f"{path}: states.{key}: expected one of {', '.join(allowed)}, got {getattr(table, key)!r}",
+                remedy=_SEE,
+            )
+    if not table.joints or len(set(table.joints)) < len(table.joints):
+        raise InputError(f"{path}: states.joints: expected names, each once, got {table.joints}", remedy=_SEE)
+    return _track(table, columns_of(path, "states", table.file), path), path.parent / table.file
+
+
+def columns_of(path: Path, table: str, name: str) -> "_Columns":
+    """The columns of a CSV or NPZ file that a table of the TOML file `path` names. Raises InputError."""
+    file = path.parent / name
+    if not file.is_file():
+        raise InputError(f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml")
+    return _NpzColumns(file) if file.suffix == ".npz" else _CsvColumns(read_csv(file))
+
+
+def _track(table: StatesTable, columns: "_Columns", path: Path) -> RawTrack:
+    factor, num = UNITS[table.unit], len(table.joints)
+    wanted = {"position": table.position, "velocity": table.velocity}
+    wanted |= {"commanded_velocity": table.commanded_velocity, "pose": table.pose}
+    stamps, found = columns.read(
+        table.time,
+        TIME_UNITS_NS[table.time_unit],
+        {key: names for key, names in wanted.items() if names or key == "position"},
+        table.epoch_ns,
+    )
+    for key, block in found.items():
+        if key != "pose" and block.shape != (len(stamps), num):
+            raise InputError(
+                f"{path}: states.{key}: expected {num} columns of {len(stamps)} states, got {block.shape[::-1]}",
+                remedy="one column per joint",
+            )
+    position, velocity = scaled(found["position"], factor), found.get("velocity")
+    commanded = found.get("commanded_velocity")
+    poses = _poses(table, found.get("pose"), path, len(stamps))
+    return RawTrack(
+        where=Path(table.file).name,
+        names=tuple(table.joints),
+        stamp_ns=stamps,
+        position=position,
+        velocity=absent(len(stamps), num) if velocity is None else scaled(velocity, factor),
+        commanded_velocity=None if commanded is None else scaled(commanded, factor),
+        T_base_ee=poses if table.pose_frame == "base" else None,
+        T_world_ee=poses if table.pose_frame == "world" else None,
+    )
+
+
+def _poses(table: StatesTable, rows: Rows | None, path: Path, num_states: int) -> Rows | None:
+    if rows is None:
+        return None
+    if rows.shape[1] not in {7, 16} or len(rows) != num_states:
+        raise InputError(
+            f"{path}: states.pose: expected 7 or 16 columns of {num_states} states, got {rows.shape[::-1]}",
+            remedy=_SEE,
+        )
+    if rows.shape[1] == 7:
+        return poses_of(rows, lambda row: pose_of_quat(row[:3], row[3:]))
+    if table.pose_order == "columns":
+        return poses_of(rows, pose_of_columns)
+    return poses_of(rows, lambda row: rigid_or_none(row.reshape(4, 4)))
+
+
+class _CsvColumns:
+    def __init__(self, table: CsvTable) -> None:
+        self._table = table
+
+    def read(
+        self, time: str, unit_ns: int, groups: Mapping[str, list[str]], epoch_ns: int
+    ) -> tuple[Stamps, dict[str, Rows]]:
+        columns = {key: [self._table.index(name) for name in names] for key, names in groups.items()}
+        return self._table.read(self._table.index(time), unit_ns, columns, epoch_ns)
+
+    def stamps(self, name: str, unit_ns: int, epoch_ns: int) -> Stamps:
+        return self._table.read(self._table.index(name), unit_ns, {}, epoch_ns)[0]
+
+    def numbers(self, names: list[str]) -> Float64:
+        return self._table.numbers([self._table.index(name) for name in names])
+
+
+class _NpzColumns:
+    def __init__(self, path: Path) -> None:
+        self._file = NpzFile(path)
+
+    def read(
+        self, time: str, unit_ns: int, groups: Mapping[str, list[str]], epoch_ns: int
+    ) -> tuple[Stamps, dict[str, Rows]]:
+        found = {key: self._file.columns(names) for key, names in groups.items()}
+        return self._file.stamps(time, unit_ns, epoch_ns), found
+
+    def stamps(self, name: str, unit_ns: int, epoch_ns: int) -> Stamps:
+        return self._file.stamps(name, unit_ns, epoch_ns)
+
+    def numbers(self, names: list[str]) -> Float64:
+        rows = self._file.columns(names)
+        return rows[: len(rows)]
+
+
+_Columns = _CsvColumns | _NpzColumns

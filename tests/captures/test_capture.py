@@ -1,0 +1,264 @@
+"""A capture gives back what was put in, to the bit where it can, and notices damage."""
+
+import csv
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.captures.capture import write_capture
+from splatctrl_cli.containers.mcap_records import CHUNK
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import JointState, Record, RgbdFrame
+from splatctrl_cli.sources.source import SourceOptions, open_source
+from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log
+
+
+def captured(tmp_path: Path, recipe: LogRecipe, name: str = "x.capture") -> tuple[list[Record], Path]:
+    source = open_source(make_log(tmp_path / "log.mcap", recipe))
+    folder = tmp_path / name
+    folder.mkdir()
+    write_capture(folder, source)
+    return list(source.records()), folder
+
+
+def frames_of(records: list[Record]) -> list[RgbdFrame]:
+    return [record for record in records if isinstance(record, RgbdFrame)]
+
+
+def assert_same(before: list[Record], after: list[Record]) -> None:
+    assert len(before) == len(after) > 0
+    for a, b in zip(before, after, strict=True):
+        assert a.stamp_ns == b.stamp_ns
+        if isinstance(a, RgbdFrame):
+            assert isinstance(b, RgbdFrame)
+            assert (a.camera, a.intrinsics) == (b.camera, b.intrinsics)
+            assert np.array_equal(a.color, b.color)
+            assert np.array_equal(a.depth, b.depth)
+            assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
+        else:
+            assert isinstance(b, JointState)
+            assert np.array_equal(a.position, b.position)
+            assert np.array_equal(a.velocity, b.velocity)
+
+
+@pytest.mark.parametrize("color_format", ["jpeg", "png", "rgb8", "bgra8", "mono8"])
+def test_a_capture_gives_the_same_records(tmp_path: Path, color_format: str) -> None:
+    before, folder = captured(tmp_path, LogRecipe(color_format=color_format, cameras=("cam0", "cam1")))
+    source = open_source(folder)
+    assert_same(before, list(source.records()))
+    assert source.joint_names == ("joint_a", "joint_b")
+    assert source.has_clock
+    assert source.loss.damaged == 0
+
+
+def test_float_depth_on_a_grid_becomes_png_and_other_depth_stays_float(tmp_path: Path) -> None:
+    on_grid, folder = captured(tmp_path, LogRecipe(depth_encoding="32FC1", depth_m=1.2345), "grid.capture")
+    assert (folder / "depth/cam0/000000.png").is_file()
+    back = [r for r in open_source(folder).records() if isinstance(r, RgbdFrame)]
+    first = next(r for r in on_grid if isinstance(r, RgbdFrame))
+    assert np.abs(back[0].depth - first.depth).max() <= 1e-6
+    off_grid, folder = captured(tmp_path, LogRecipe(depth_encoding="32FC1", depth_m=1.23457), "float.capture")
+    assert (folder / "depth/cam0/000000.npy").is_file()
+    assert_same(off_grid, list(open_source(folder).records()))
+
+
+def test_compressed_color_is_kept_byte_for_byte(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap"))
+    folder = tmp_path / "x.capture"
+    folder.mkdir()
+    write_capture(folder, source)
+    shots = [shot for shot in source.shots() if not isinstance(shot, JointState)]
+    assert [(folder / f"color/cam0/{i:06d}.jpg").read_bytes() for i in range(5)] == [s.color_file for s in shots]
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+    _, first = captured(tmp_path, LogRecipe(), "a.capture")
+    _, second = captured(tmp_path, LogRecipe(), "b.capture")
+    files = sorted(p.relative_to(first) for p in first.rglob("*") if p.is_file())
+    assert files == sorted(p.relative_to(second) for p in second.rglob("*") if p.is_file())
+    assert len(files) == 15
+    assert all((first / name).read_bytes() == (second / name).read_bytes() for name in files)
+
+
+def test_every_file_stands_in_sha256sums(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    sums = dict(reversed(line.split("  ")) for line in (folder / "SHA256SUMS").read_text().splitlines())
+    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} - {"SHA256SUMS"}
+    assert set(sums) == files
+    assert all(hashlib.sha256((folder / name).read_bytes()).hexdigest() == sums[name] for name in files)
+
+
+def test_a_damaged_image_is_left_out_and_counted(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, LogRecipe())
+    image = folder / "depth/cam0/000002.png"
+    image.write_bytes(image.read_bytes()[:-4])
+    (folder / "color/cam0/000004.jpg").unlink()
+    source = open_source(folder)
+    after = list(source.records())
+    assert len(after) == len(before) - 2
+    assert source.loss.damaged == 2
+    assert "depth/cam0/000002.png: its checksum differs" in source.loss.notes[0]
+    assert "color/cam0/000004.jpg: missing" in source.loss.notes[1]
+
+
+@pytest.mark.parametrize("kind", ["color", "depth"])
+def test_an_image_of_another_size_than_its_camera_is_left_out_and_counted(tmp_path: Path, kind: str) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    name = f"{kind}/cam0/000002.{'jpg' if kind == 'color' else 'png'}"
+    pixels = np.full((5, 6), 1250, np.uint16) if kind == "depth" else np.zeros((5, 6, 3), np.uint8)
+    before = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    cv2.imwrite(str(folder / name), pixels)
+    sums = (folder / "SHA256SUMS").read_text()
+    after = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    (folder / "SHA256SUMS").write_text(sums.replace(f"{before}  {name}", f"{after}  {name}"))
+    source = open_source(folder)
+    assert sum(isinstance(record, RgbdFrame) for record in source.records()) == 4
+    assert source.loss.damaged == 1
+    assert "expected images of 32x24 as capture.json says" in source.loss.notes[-1]
+
+
+def test_losses_of_the_log_stay_with_the_capture(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe(tf_frames=3))
+    assert open_source(folder).loss.without_pose == 2
+
+
+def test_a_capture_of_a_newer_version_is_refused(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    header = folder / "capture.json"
+    header.write_text(header.read_text().replace('"version": 1', '"version": 99'))
+    with pytest.raises(InputError, match="expected version 1, got 99"):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("name", ["SHA256SUMS", "frames.csv", "joints.npz"])
+def test_a_capture_without_an_index_is_refused(tmp_path: Path, name: str) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=name):
+        open_source(folder)
+
+
+def test_options_that_a_capture_cannot_honour_are_refused(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    options = SourceOptions()
+    for change in ({"depth_scale": 1e-4}, {"world_frame": "base"}, {"holdout": ("0",)}, {"root": tmp_path}):
+        with pytest.raises(InputError, match="does not apply to a capture"):
+            open_source(folder, replace(options, **change))
+
+
+def test_a_log_without_joints_is_captured_too(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, LogRecipe(has_joints=False))
+    source = open_source(folder)
+    assert source.joint_names == ()
+    assert_same(before, list(source.records()))
+
+
+def test_warped_depth_comes_back_as_the_same_floats(tmp_path: Path) -> None:
+    recipe = LogRecipe(depth_frame="cam0_depth", depth_size=(16, 12), depth_encoding="32FC1", depth_m=1.23457)
+    before, folder = captured(tmp_path, recipe)
+    assert_same(before, list(open_source(folder).records()))
+
+
+@pytest.mark.parametrize(
+    ("example", "folder"),
+    [
+        ("apc_shelf", "apc_shelf/scene-0000"),
+        ("open3d_rgbd", "open3d_rgbd/RGBD"),
+        ("tabletop_views", "tabletop_views"),
+    ],
+)
+def test_real_folders_are_captured_without_loss(real_data: Path, tmp_path: Path, example: str, folder: str) -> None:
+    description = Path(__file__).parents[2] / f"docs/examples/{example}.toml"
+    source = open_source(description, SourceOptions(root=real_data / folder))
+    out = tmp_path / "x.capture"
+    out.mkdir()
+    write_capture(out, source)
+    capture = open_source(out)
+    assert not capture.has_clock
+    assert set(capture.cameras) == set(source.cameras)
+    assert_same(list(source.records()), list(capture.records()))
+
+
+@pytest.mark.parametrize("name", ["capture.json", "frames.csv", "joints.npz"])
+def test_an_index_that_was_changed_is_refused(tmp_path: Path, name: str) -> None:
+    _, folder = captured(tmp_path, LogRecipe())
+    (folder / name).write_bytes((folder / name).read_bytes() + b"\n")
+    with pytest.raises(InputError, match=f"{name}: its checksum differs"):
+        open_source(folder)
+
+
+def test_masks_come_back_and_frames_without_one_stay_without(tmp_path: Path) -> None:
+    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=2)), options)
+    folder = tmp_path / "x.capture"
+    folder.mkdir()
+    write_capture(folder, source)
+    before, after = list(source.records()), list(open_source(folder).records())
+    assert_same(before, after)
+    masks = [(a.human, b.human) for a, b in zip(before, after, strict=True) if isinstance(a, RgbdFrame)
+             and isinstance(b, RgbdFrame)]  # fmt: skip
+    assert [a is not None for a, _ in masks] == [True, False, True, False, True]
+    assert all((a is None and b is None) or np.array_equal(a, b) for a, b in masks)
+
+
+PINCUSHION = LogRecipe(color_format="png", distortion=(0.4, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_what_the_lens_did_not_see_comes_back_and_is_stored_once(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, PINCUSHION)
+    after = list(open_source(folder).records())
+    assert_same(before, after)
+    valid = frames_of(before)[0].valid
+    assert valid is not None and not valid.all()
+    assert all(frame.valid is not None and np.array_equal(frame.valid, valid) for frame in frames_of(after))
+    assert len(list((folder / "valid/cam0").iterdir())) == 1
+    sums = (folder / "SHA256SUMS").read_text().splitlines()
+    assert sum("valid/cam0/" in line for line in sums) == 1 and len(set(sums)) == len(sums)
+
+
+def test_a_frame_whose_valid_pixels_are_not_known_is_left_out(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, PINCUSHION)
+    next((folder / "valid/cam0").iterdir()).write_bytes(b"no image")
+    source = open_source(folder)
+    assert frames_of(list(source.records())) == [] and source.loss.damaged == 5
+
+
+def test_a_damaged_mask_is_counted_and_its_frame_kept(tmp_path: Path) -> None:
+    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+    folder = tmp_path / "x.capture"
+    folder.mkdir()
+    write_capture(folder, open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1)), options))
+    (folder / "human/cam0/000001.png").write_bytes(b"no image")
+    source = open_source(folder)
+    frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
+    assert [frame.human is not None for frame in frames] == [True, False, True, True, True]
+    assert source.loss.damaged == 1
+
+
+def test_provenance_says_where_each_image_lies(tmp_path: Path) -> None:
+    _, folder = captured(tmp_path, LogRecipe(chunk_size=512))
+    with (folder / "provenance.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    log = (tmp_path / "log.mcap").read_bytes()
+    assert [row["color"] for row in rows] == [f"color/cam0/{i:06d}.jpg" for i in range(5)]
+    assert {row["color_file"] for row in rows} | {row["depth_file"] for row in rows} == {"log.mcap"}
+    assert [int(row["color_log_time_ns"]) for row in rows] == [START_NS + i * FRAME_NS for i in range(5)]
+    assert [int(row["depth_log_time_ns"]) for row in rows] == [START_NS + i * FRAME_NS + 3_000_000 for i in range(5)]
+    offsets = [int(row["color_offset"]) for row in rows]
+    assert sorted(set(offsets)) == offsets
+    for row, offset in zip(rows, offsets, strict=True):
+        assert log[offset] == CHUNK
+        first, last = (int.from_bytes(log[offset + at : offset + at + 8], "little") for at in (9, 17))
+        assert first <= int(row["color_log_time_ns"]) <= last
+
+
+def test_a_capture_without_provenance_is_read_as_before(tmp_path: Path) -> None:
+    before, folder = captured(tmp_path, LogRecipe())
+    (folder / "provenance.csv").unlink()
+    sums = (folder / "SHA256SUMS").read_text().splitlines(keepends=True)
+    (folder / "SHA256SUMS").write_text("".join(line for line in sums if "provenance" not in line))
+    assert_same(before, list(open_source(folder).records()))

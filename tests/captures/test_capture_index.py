@@ -1,0 +1,68 @@
+"""Rows and checksums of a capture are found by number and name in files of any order, and odd files are refused."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.captures.capture_index import FileSums, FrameRows
+from splatctrl_cli.captures.capture_writer import COLUMNS
+from splatctrl_cli.errors import InputError
+
+HEAD = ",".join(COLUMNS) + "\n"
+
+
+def line(camera: str, number: int, source: str = "a b") -> str:
+    return f"{camera},{number},color/{camera}/{number}.jpg,depth/{camera}/{number}.png,0,0,0,0,0,0,1,{source}\n"
+
+
+def frames(folder: Path, *lines: str, head: str = HEAD) -> Path:
+    path = folder / "frames.csv"
+    path.write_bytes((head + "".join(lines)).encode())
+    return path
+
+
+def test_rows_are_those_of_the_cameras_by_number(tmp_path: Path) -> None:
+    lines = [line("a", 0), "\n", line("b", 1), line("a", 2, '"two\nlines, é"'), line("a", 3).rstrip("\n")]
+    rows = FrameRows(frames(tmp_path, *lines), ("a",))
+    assert [row["stamp_ns"] for row in rows] == ["0", "2", "3"]
+    assert rows[1]["source"] == "two\nlines, é" and rows[2]["depth"] == "depth/a/3.png"
+    assert rows[0]["camera"] == "a" and rows[-1] == rows[2]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        (line("a", 0), "a,1,b\n"),
+        (line("a", 0).replace("a,0,", "a,x,"),),
+        (line("a", 0).replace(",0,0,0,0", ",0,?,0,0"),),
+        (line("a", 0).replace("color/a", "color/../../a"),),
+        (line("a", 0).replace("depth/a", "/depth/a"),),
+        ("a" * (1 << 17),),
+        ("\xff\x00".encode("latin-1").decode("latin-1") + '"',),
+    ],
+)
+def test_what_is_no_row_is_refused(tmp_path: Path, lines: tuple[str, ...]) -> None:
+    with pytest.raises(InputError, match=r"frames.csv: .*; run `splatctrl ingest` again"):
+        FrameRows(frames(tmp_path, *lines), ("a",))
+
+
+def test_other_columns_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected columns camera, stamp_ns"):
+        FrameRows(frames(tmp_path, head=HEAD.replace("qw", "w")), ("a",))
+    with pytest.raises(InputError, match="expected columns camera, stamp_ns"):
+        FrameRows(frames(tmp_path, head=""), ("a",))
+
+
+def test_sums_are_found_by_name_and_the_last_line_of_a_name_holds(tmp_path: Path) -> None:
+    digests = {f"color/é{i}.jpg": hashlib.sha256(bytes([i])).hexdigest() for i in range(200)}
+    lines = [f"{digest}  {name}\n" for name, digest in reversed(digests.items())]
+    odd = ["no line\n", f"{'0' * 64}  color/é7.jpg\n", "zz" * 32 + "  color/é8.jpg\n", "\n"]
+    (tmp_path / "SHA256SUMS").write_text("".join([*odd[:2], *lines, *odd[2:]]), encoding="utf-8")
+    sums = FileSums(tmp_path)
+    assert {name: sums.get(name) for name in digests} == digests
+    assert sums.get("color/é200.jpg") is None and sums.get("") is None
+    (tmp_path / "SHA256SUMS").write_text("")
+    assert FileSums(tmp_path).get("a") is None
+    with pytest.raises(InputError, match="missing; the capture was not finished"):
+        FileSums(tmp_path / "none")

@@ -1,0 +1,155 @@
+"""What `check` says of the simulated table once a scale, a pose, a clock or a joint of it is wrong."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.checks.check_alignment import alignment_findings
+from splatctrl_cli.checks.check_log import check_log
+from splatctrl_cli.checks.check_report import usable_frames
+from splatctrl_cli.checks.check_robot import motion_findings
+from splatctrl_cli.checks.check_states import log_states
+from splatctrl_cli.checks.check_views import ViewsCheck, check_views
+from splatctrl_cli.checks.finding import Finding, Severity
+from splatctrl_cli.checks.state_motion import ImageMotion
+from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.logs.survey import survey
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.robot.model import RobotModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """The recording as `check` keeps it; few: every second frame of three cameras."""
+
+    frames: Sequence[RgbdFrame]
+    few: Sequence[RgbdFrame]
+    states: StateColumns
+    model: RobotModel
+
+    def views(self, frames: Sequence[RgbdFrame]) -> ViewsCheck:
+        return check_views(frames, dict.fromkeys(sorted({frame.camera for frame in frames}), 1e-3))
+
+    def motion(self, frames: Sequence[RgbdFrame], states: StateColumns) -> list[Finding]:
+        found = motion_findings(frames, ImageMotion(), states, self.model)
+        return [finding for finding in found if finding.severity is not Severity.NOTE]
+
+
+@pytest.fixture(scope="module")
+def table(sample_data: Path) -> Table:
+    folder = sample_data / "tabletop"
+    model = RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
+    log = open_raw_log(folder / "log.mcap")
+    states, _, _ = log_states(survey(log), SourceOptions(), model)
+    assert states is not None
+    frames = check_log(log, SourceOptions()).frames
+    stamps = sorted({frame.stamp_ns for frame in frames})[::2]
+    few = [frame for frame in frames if frame.stamp_ns in stamps and frame.camera != "cam3"]
+    return Table(frames=frames, few=few, states=states, model=model)
+
+
+@pytest.fixture(autouse=True)
+def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatctrl_cli.checks.check_views.NUM_PAIRS", 24)
+    monkeypatch.setattr("splatctrl_cli.checks.check_views.NUM_POINTS", 700)
+    monkeypatch.setattr("splatctrl_cli.checks.check_views.MIN_LANDED", 300)
+
+
+def moved(frames: Sequence[RgbdFrame], camera: str, position: tuple[float, ...], degrees: float) -> list[RgbdFrame]:
+    """With one camera moved [m] and turned about its own x."""
+    T = np.eye(4)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    T[1:3, 1:3], T[:3, 3] = [[c, -s], [s, c]], position
+    return [replace(f, T_world_camera=f.T_world_camera @ T) if f.camera == camera else f for f in frames]
+
+
+@pytest.mark.parametrize(("factor", "remedy"), [(10.0, "0.0001"), (0.8, "0.00125")])
+def test_depths_of_another_scale_are_named_with_the_right_one(table: Table, factor: float, remedy: str) -> None:
+    check = table.views([replace(f, depth=f.depth * np.float32(factor)) for f in table.frames])
+    (finding,) = check.findings
+    assert (finding.code, finding.severity) == ("views-scale", Severity.ERROR)
+    assert finding.value == pytest.approx(1 / factor, rel=0.011)
+    assert finding.remedy.startswith(f"give --depth-scale {remedy}")
+    assert np.median(check.scaled[0].depth) == pytest.approx(np.median(table.frames[0].depth), rel=0.011)
+
+
+def test_one_camera_of_another_scale_is_named(table: Table) -> None:
+    frames = [replace(f, depth=f.depth * np.float32(1.25)) if f.camera == "cam1" else f for f in table.frames]
+    (finding,) = table.views(frames).findings
+    assert (finding.code, finding.where) == ("views-scale", "camera cam1")
+    assert finding.value == pytest.approx(0.8, rel=0.011)
+
+
+@pytest.mark.parametrize(("position", "degrees"), [((0.03, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 2.0)])
+def test_a_camera_that_stands_elsewhere_is_named_with_its_move(
+    table: Table, position: tuple[float, ...], degrees: float
+) -> None:
+    check = table.views(moved(table.frames, "cam1", position, degrees))
+    (finding,) = check.findings
+    assert (finding.code, finding.where, finding.severity) == ("views-pose", "camera cam1", Severity.WARNING)
+    assert finding.value == pytest.approx(1e3 * position[0], abs=5)
+    assert abs(float(finding.what.split(" mm and ")[1].split(" deg")[0]) - degrees) < 0.3
+    original = next(f for f in table.frames if f.camera == "cam1").T_world_camera
+    corrected = next(f for f in check.corrected if f.camera == "cam1").T_world_camera
+    assert np.abs(corrected - original)[:3, 3].max() < 0.005
+
+
+def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
+    walls = []
+    for index in range(4):
+        T = np.eye(4)
+        T[0, 3] = 0.3 * index
+        frame = table.frames[index]
+        walls.append(replace(frame, depth=np.full_like(frame.depth, 1.2), T_world_camera=T, camera=f"cam{index % 2}"))
+    assert table.views(walls).findings == []
+
+
+def test_depth_that_is_not_registered_is_named_with_its_shift(table: Table) -> None:
+    frames = [replace(f, depth=np.roll(f.depth, 12, axis=1)) for f in table.frames if f.camera == "cam0"]
+    (finding,) = alignment_findings(frames)
+    assert (finding.code, finding.severity, finding.value) == ("alignment", Severity.ERROR, 12)
+    assert usable_frames(frames, [finding]) == []
+
+
+def test_depth_of_another_camera_is_named(table: Table) -> None:
+    zero, one = ([f for f in table.frames if f.camera == camera] for camera in ("cam0", "cam1"))
+    frames = [replace(a, depth=b.depth) for a, b in zip(zero, one, strict=True)]
+    frames += [replace(b, depth=a.depth) for a, b in zip(zero, one, strict=True)]
+    found = alignment_findings(frames)
+    assert [finding.where for finding in found] == ["camera cam0", "camera cam1"]
+    assert "meet the depth edges of camera cam1" in found[0].what
+
+
+@pytest.mark.parametrize("late_s", [0.08, -0.08])
+def test_joints_of_another_clock_are_named_with_the_offset(table: Table, late_s: float) -> None:
+    states = replace(table.states, stamp_ns=table.states.stamp_ns + round(late_s * 1e9))
+    (finding,) = table.motion(table.few, states)
+    assert (finding.code, finding.where, finding.severity) == ("robot-clock", "joint states", Severity.WARNING)
+    assert finding.value == pytest.approx(-1e3 * late_s, abs=10)
+
+
+def test_one_camera_of_another_clock_is_named(table: Table) -> None:
+    frames = [replace(f, stamp_ns=f.stamp_ns + 100_000_000) if f.camera == "cam1" else f for f in table.few]
+    (finding,) = table.motion(frames, table.states)
+    assert (finding.code, finding.where) == ("robot-clock", "camera cam1")
+    assert finding.value == pytest.approx(100, abs=10)
+
+
+def test_exchanged_joints_are_named(table: Table) -> None:
+    (finding,) = table.motion(table.few, table.states.of_joints(np.array([0, 2, 1, 3, 4, 5, 6])))
+    assert (finding.code, finding.where) == ("arm", "cameras cam0, cam1, cam2")
+    assert finding.remedy.startswith("exchange joint2 and joint3: ")
+
+
+def test_a_joint_whose_zero_is_off_is_found(table: Table) -> None:
+    position = np.asarray(table.states.position[0 : len(table.states)]).copy()
+    position[:, 1] += np.radians(5)
+    (finding,) = table.motion(table.few, replace(table.states, position=position))
+    assert finding.code == "arm"
+    assert finding.value == pytest.approx(30, abs=8)
+    assert "the joints' zeros" in finding.remedy

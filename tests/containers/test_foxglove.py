@@ -1,0 +1,371 @@
+"""Foxglove's schemas in MCAP: protobuf by the descriptors of the log, and JSON, against the same log in ROS 2."""
+
+import base64
+import json
+import re
+import sqlite3
+import struct
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.foxglove import DEFINITIONS
+from splatctrl_cli.containers.protobuf import MessageTypes
+from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
+from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.sources.source import open_source
+from tests.containers.test_bag_log import assert_same
+from tests.logs.make_log import LogRecipe, make_log
+
+DOUBLE, INT64, INT32, FIXED32, STRING, MESSAGE, BYTES = 1, 3, 5, 7, 9, 11, 12
+TIME = ".google.protobuf.Timestamp"
+Fields = dict[str, tuple[int, int, str]]
+TYPES: dict[str, Fields] = {  # name, number, type (and message) of each field, numbered as Foxglove numbers them
+    "google.protobuf.Timestamp": {"seconds": (1, INT64, ""), "nanos": (2, INT32, "")},
+    "foxglove.Vector3": {"x": (1, DOUBLE, ""), "y": (2, DOUBLE, ""), "z": (3, DOUBLE, "")},
+    "foxglove.Quaternion": {"x": (1, DOUBLE, ""), "y": (2, DOUBLE, ""), "z": (3, DOUBLE, ""), "w": (4, DOUBLE, "")},
+    "foxglove.CompressedImage": {
+        "timestamp": (1, MESSAGE, TIME),
+        "frame_id": (4, STRING, ""),
+        "data": (2, BYTES, ""),
+        "format": (3, STRING, ""),
+    },
+    "foxglove.RawImage": {
+        "timestamp": (1, MESSAGE, TIME),
+        "frame_id": (7, STRING, ""),
+        "width": (2, FIXED32, ""),
+        "height": (3, FIXED32, ""),
+        "encoding": (4, STRING, ""),
+        "step": (5, FIXED32, ""),
+        "data": (6, BYTES, ""),
+    },
+    "foxglove.CameraCalibration": {
+        "timestamp": (1, MESSAGE, TIME),
+        "frame_id": (9, STRING, ""),
+        "width": (2, FIXED32, ""),
+        "height": (3, FIXED32, ""),
+        "distortion_model": (4, STRING, ""),
+        **{name: (number, DOUBLE, "repeated") for name, number in (("D", 5), ("K", 6), ("R", 7), ("P", 8))},
+    },
+    "foxglove.FrameTransform": {
+        "timestamp": (1, MESSAGE, TIME),
+        "parent_frame_id": (2, STRING, ""),
+        "child_frame_id": (3, STRING, ""),
+        "translation": (4, MESSAGE, ".foxglove.Vector3"),
+        "rotation": (5, MESSAGE, ".foxglove.Quaternion"),
+    },
+    "foxglove.FrameTransforms": {"transforms": (1, MESSAGE, ".foxglove.FrameTransform repeated")},
+    "foxglove.JointState": {"name": (1, STRING, ""), "position": (2, DOUBLE, "")},
+    "foxglove.JointStates": {
+        "timestamp": (1, MESSAGE, TIME),
+        "joints": (2, MESSAGE, ".foxglove.JointState repeated"),
+    },
+}
+
+
+def varint(value: int) -> bytes:
+    data = b""
+    while True:
+        value, low = value >> 7, value & 127
+        data += bytes([low | (128 if value else 0)])
+        if not value:
+            return data
+
+
+def delimited(number: int, content: bytes) -> bytes:
+    return varint(number << 3 | 2) + varint(len(content)) + content
+
+
+def descriptor_set() -> bytes:
+    """One file a package."""
+    files = b""
+    for package in ("google.protobuf", "foxglove"):
+        file = delimited(1, f"{package}.proto".encode()) + delimited(2, package.encode())
+        for name, fields in TYPES.items():
+            if name.rpartition(".")[0] == package:
+                message = delimited(1, name.rpartition(".")[2].encode())
+                for field, (number, kind, of) in fields.items():
+                    label = 3 if of.endswith("repeated") else 1
+                    entry = delimited(1, field.encode()) + b"\x18" + varint(number) + b"\x20" + varint(label)
+                    entry += b"\x28" + varint(kind)
+                    entry += delimited(6, of.split()[0].encode()) if kind == MESSAGE else b""
+                    message += delimited(2, entry)
+                file += delimited(4, message)
+        files += delimited(1, file)
+    return files
+
+
+def encoded(type_name: str, message: dict[str, Any]) -> bytes:
+    """A message in the wire format, packed where it repeats numbers."""
+    data = b""
+    for name, value in message.items():
+        number, kind, of = TYPES[type_name][name]
+        if kind == MESSAGE:
+            items = value if of.endswith("repeated") else [value]
+            data += b"".join(delimited(number, encoded(of.split()[0][1:], item)) for item in items)
+        elif of == "repeated":
+            data += delimited(number, struct.pack(f"<{len(value)}d", *value))
+        elif kind == DOUBLE:
+            data += varint(number << 3 | 1) + struct.pack("<d", value)
+        elif kind == FIXED32:
+            data += varint(number << 3 | 5) + struct.pack("<I", value)
+        elif kind in {INT64, INT32}:
+            data += varint(number << 3) + varint(value)
+        else:
+            data += delimited(number, value if kind == BYTES else value.encode())
+    return data
+
+
+def foxglove_of(kind: str, message: Any) -> tuple[str, dict[str, Any]]:
+    """Schema and fields of a decoded ROS message."""
+
+    def times(header: Any) -> dict[str, Any]:
+        return {"timestamp": {"seconds": header.stamp.sec, "nanos": header.stamp.nanosec}}
+
+    if kind == JOINT_STATE:
+        joints = [{"name": n, "position": float(p)} for n, p in zip(message.name, message.position, strict=True)]
+        return "foxglove.JointStates", {**times(message.header), "joints": joints}
+    if kind not in {COMPRESSED_IMAGE, IMAGE, CAMERA_INFO}:
+        return "foxglove.FrameTransforms", {
+            "transforms": [
+                {
+                    **times(item.header),
+                    "parent_frame_id": item.header.frame_id,
+                    "child_frame_id": item.child_frame_id,
+                    "translation": {key: getattr(item.transform.translation, key) for key in "xyz"},
+                    "rotation": {key: getattr(item.transform.rotation, key) for key in "xyzw"},
+                }
+                for item in message.transforms
+            ]
+        }
+    fields = {**times(message.header), "frame_id": message.header.frame_id}
+    if kind == COMPRESSED_IMAGE:
+        return "foxglove.CompressedImage", {**fields, "data": bytes(message.data), "format": message.format}
+    fields |= {"width": message.width, "height": message.height}
+    if kind == CAMERA_INFO:
+        matrices = {name: list(getattr(message, name.lower())) for name in "DKRP"}
+        return "foxglove.CameraCalibration", {**fields, "distortion_model": message.distortion_model, **matrices}
+    data = {"encoding": message.encoding, "step": message.step, "data": bytes(message.data)}
+    return "foxglove.RawImage", {**fields, **data}
+
+
+def as_json(_schema: str, message: Any) -> bytes:
+    def plain(value: Any) -> Any:
+        if isinstance(value, bytes):
+            return base64.b64encode(value).decode()
+        if isinstance(value, dict) and "nanos" in value:
+            return {"sec": value["seconds"], "nsec": value["nanos"]}
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        return [plain(item) for item in value] if isinstance(value, list) else value
+
+    return json.dumps(plain(message)).encode()
+
+
+def convert(
+    log: Path,
+    path: Path,
+    encoding: str,
+    spoil: Callable[[str, bytes], bytes] = lambda name, data: data,
+    *,
+    as_video: bool = False,
+) -> Path:
+    """The images, calibrations and transforms of a ROS 2 log in Foxglove's schemas; as_video: colour by that name."""
+    write: Callable[[str, Any], bytes] = encoded if encoding == "protobuf" else as_json
+    schema_encoding, schema_data = ("protobuf", descriptor_set()) if encoding == "protobuf" else ("jsonschema", b"{}")
+    decoder = MessageDecoder()
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channels: dict[str, int] = {}
+        for message in open_raw_log(log).messages(Damage()):
+            name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
+            topic = message.topic.name
+            if topic not in channels:
+                told = name.replace("CompressedImage", "CompressedVideo") if as_video else name
+                schema = writer.register_schema(name=told, encoding=schema_encoding, data=schema_data)
+                channels[topic] = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=schema)
+            time = message.log_time_ns
+            writer.add_message(
+                channels[topic], log_time=time, publish_time=time, data=spoil(name, write(name, fields))
+            )
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+@pytest.mark.parametrize("recipe", [LogRecipe(has_joints=False), LogRecipe(has_joints=False, color_format="bgra8")])
+def test_foxglove_schemas_give_the_records_of_the_same_ros_log(
+    tmp_path: Path, encoding: str, recipe: LogRecipe
+) -> None:
+    log = make_log(tmp_path / "log.mcap", recipe)
+    converted = convert(log, tmp_path / "foxglove.mcap", encoding)
+    source = open_source(converted)
+    assert_same(list(open_source(log).records()), list(source.records()))
+    assert source.loss.damaged == 0
+    rows = {str(row[0]): row[1:3] for row in describe(converted).grids[0].rows}
+    assert rows["/cam0/depth/image_raw"] == ["foxglove.RawImage", encoding]
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_joint_states_of_foxglove_give_positions_and_their_differences(tmp_path: Path, encoding: str) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    source = open_source(convert(log, tmp_path / "foxglove.mcap", encoding))
+    before = [r for r in open_source(log).records() if isinstance(r, JointState)]
+    after = [r for r in source.records() if isinstance(r, JointState)]
+    assert [(a.stamp_ns, a.position.tolist()) for a in after] == [(b.stamp_ns, b.position.tolist()) for b in before]
+    assert source.loss.differentiated_velocities == len(after) > 0
+
+
+def in_ros_types(log: Path, folder: Path, kind: str, has_definitions: bool = True) -> Path:
+    """The images, calibrations and transforms of a log as foxglove_msgs in a ROS 2 .db3 or a ROS 1 .bag."""
+    store = get_typestore(Stores.ROS2_HUMBLE if kind == "db3" else Stores.ROS1_NOETIC)
+    for name, definition in DEFINITIONS.items():
+        capital = re.sub(r" ([dkrp])\n", lambda m: f" {m[1].upper()}\n", definition)
+        of_ros1 = capital.replace("builtin_interfaces/Time", "time")
+        store.register(get_types_from_msg(of_ros1 if kind == "bag" else definition, name))
+    path = folder / "log.bag" if kind == "bag" else folder / "bag"
+    decoder = MessageDecoder()
+    with Writer2(path, version=8) if kind == "db3" else Writer1(path) as writer:
+        connections: dict[str, Any] = {}
+        for message in open_raw_log(log).messages(Damage()):
+            name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
+            name = name.replace("foxglove.", "foxglove_msgs/msg/")
+            topic = message.topic.name
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            data = built(store, name, fields)
+            write = store.serialize_cdr if kind == "db3" else store.serialize_ros1
+            writer.write(connections[topic], message.log_time_ns, write(data, name))
+    if kind == "db3" and not has_definitions:
+        with closing(sqlite3.connect(path / "bag.db3")) as database:
+            database.execute("DROP TABLE IF EXISTS message_definitions")
+            database.commit()
+    return path
+
+
+def built(store: Any, name: str, fields: dict[str, Any]) -> Any:
+    """A message of a store; fields that are not given are zero."""
+    kinds = dict(store.fielddefs[name][1])
+    values: dict[str, Any] = {}
+    for field, (_, detail) in kinds.items():
+        value = fields.get(field, fields.get(field.upper(), fields.get(field.lower())))
+        if field == "timestamp":
+            value = store.types["builtin_interfaces/msg/Time"](sec=value["seconds"], nanosec=value["nanos"])
+        elif isinstance(value, dict):
+            value = built(store, detail, value)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            value = [built(store, detail[0][1], item) for item in value]
+        elif isinstance(value, list):
+            value = np.array(value, dtype=np.float64)
+        elif isinstance(value, bytes):
+            value = np.frombuffer(value, np.uint8)
+        values[field] = value
+    return store.types[name](**values)
+
+
+@pytest.mark.parametrize(("kind", "has_definitions"), [("db3", True), ("db3", False), ("bag", True)])
+def test_foxglove_msgs_in_a_bag_give_the_records_of_the_same_ros_log(
+    tmp_path: Path, kind: str, has_definitions: bool
+) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_joints=False))
+    bag = in_ros_types(log, tmp_path, kind, has_definitions)
+    source = open_source(bag)
+    assert_same(list(open_source(log).records()), list(source.records()))
+    assert source.loss.damaged == 0
+    rows = {str(row[0]): row[1] for row in describe(bag).grids[0].rows}
+    assert rows["/cam0/depth/image_raw"] == "foxglove_msgs/msg/RawImage"
+
+
+def test_video_is_named_with_what_to_do(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_joints=False))
+    path = convert(log, tmp_path / "video.mcap", "protobuf", as_video=True)
+    with pytest.raises(
+        InputError, match=r"colour is video \(/cam0/.*\), which is not read; decode it to images first"
+    ):
+        open_source(path)
+
+
+def test_a_transform_that_comes_once_holds_always(tmp_path: Path) -> None:
+    """Foxglove has no static transforms; of two samples or more the times count, as in tf."""
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_joints=False, tf_frames=1))
+    assert len(list(open_source(log).records())) == 1
+    frames = list(open_source(convert(log, tmp_path / "foxglove.mcap", "protobuf")).records())
+    assert len(frames) == 5
+    assert all(isinstance(f, RgbdFrame) and f.T_world_camera[0, 3] == 0.0 for f in frames)
+
+
+def test_a_message_that_does_not_decode_is_counted(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_joints=False))
+    number = 0
+
+    def spoil(name: str, data: bytes) -> bytes:
+        nonlocal number
+        number += name == "foxglove.CompressedImage"
+        return data[:-3] if name == "foxglove.CompressedImage" and number == 3 else data
+
+    source = open_source(convert(log, tmp_path / "broken.mcap", "protobuf", spoil))
+    assert len(list(source.records())) == 4
+    assert source.loss.damaged == 1
+    assert "foxglove.CompressedImage that does not decode: protobuf: field 3 of 4 bytes" in source.loss.notes[0]
+
+
+@pytest.mark.parametrize("data", [b"\x0a\xff", b"\xff" * 11, b"\x0b", b"\x0a\x05abc", struct.pack("<B", 9) + b"1234"])
+def test_bytes_that_are_no_message_are_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match="protobuf"):
+        MessageTypes(descriptor_set()).read("foxglove.Vector3", data)
+
+
+def test_fields_that_were_not_written_have_their_defaults_and_unknown_ones_are_passed_over() -> None:
+    types = MessageTypes(descriptor_set())
+    message = types.read("foxglove.FrameTransform", delimited(3, b"cam") + delimited(99, b"new"))
+    assert (message.child_frame_id, message.parent_frame_id, message.timestamp.seconds) == ("cam", "", 0)
+    negative = types.read("google.protobuf.Timestamp", varint(8) + varint((1 << 64) - 5))
+    assert negative.seconds == -5
+    with pytest.raises(ValueError, match=r"does not define foxglove\.Nothing"):
+        types.read("foxglove.Nothing", b"")
+
+
+def test_nested_types_and_numbers_of_every_wire_form_are_read() -> None:
+    """type a.Outer { message Inner { sint64 z = 1; } Inner i = 1; repeated uint32 packed = 2; bool b = 3; }"""
+
+    def field(name: str, number: int, label: int, kind: int, of: str = "") -> bytes:
+        numbers = b"\x18" + varint(number) + b"\x20" + varint(label) + b"\x28" + varint(kind)
+        return delimited(2, delimited(1, name.encode()) + numbers + (delimited(6, of.encode()) if of else b""))
+
+    inner = delimited(3, delimited(1, b"Inner") + field("z", 1, 1, 18))
+    outer = delimited(1, b"Outer") + inner + field("i", 1, 1, MESSAGE, "Inner")
+    outer += field("packed", 2, 3, 13) + field("b", 3, 1, 8)
+    types = MessageTypes(delimited(1, delimited(2, b"a") + delimited(4, outer)))
+    data = delimited(1, b"\x08" + varint(5)) + delimited(2, varint(300) + varint(7)) + b"\x18\x01" + b"\x10\x09"
+    message = types.read("a.Outer", data)
+    assert (message.i.z, message.packed, message.b) == (-3, [300, 7, 9], True)
+
+
+def test_the_descriptors_of_a_real_log_are_read(real_data: Path) -> None:
+    with (real_data / "rosbag2_mcap_sensor_msgs/simple-protobuf.mcap").open("rb") as stream:
+        _, message = next(
+            (schema, message)
+            for schema, channel, message in make_reader(stream).iter_messages()
+            if schema is not None and channel.message_encoding == "protobuf"
+        )
+        stream.seek(0)
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        schema = next(s for s in summary.schemas.values() if s.encoding == "protobuf")
+    pose = MessageTypes(schema.data).read(schema.name, message.data)
+    assert (pose.timestamp.seconds, pose.timestamp.nanos, pose.frame_id) == (39, 427100000, "device")
+    assert (pose.pose.orientation.w, pose.pose.position.x) == (1.0, 0.0)

@@ -1,0 +1,103 @@
+"""The 342 files of the format's own conformance suite, each record with each of its fields."""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from splatctrl_cli.containers.mcap_file import McapFile
+from splatctrl_cli.containers.mcap_log import McapLog
+from splatctrl_cli.containers.mcap_records import ATTACHMENT, Attachment, Chunk, Message, MessageIndex, parse_record
+from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.files.unpacking import unpacked
+
+_HEAD = struct.Struct("<BQ")
+
+
+def records_of(path: Path, damage: Damage) -> Iterator[Any]:
+    """All records of a file, those in its chunks in their place; message indexes are not part of the suite."""
+    data = path.read_bytes()
+    for part in McapFile(path).parts(damage):
+        content = part.content
+        if part.opcode == ATTACHMENT:
+            start = part.offset + _HEAD.size
+            content = data[start : start + _HEAD.unpack_from(data, part.offset)[1]]
+        record = parse_record(part.opcode, content)
+        if isinstance(record, Chunk):
+            yield from records_in(record)
+        elif record is not None and not isinstance(record, MessageIndex):
+            yield record
+
+
+def records_in(chunk: Chunk) -> Iterator[Any]:
+    content = unpacked(chunk.records, chunk.compression, chunk.uncompressed_size)
+    assert chunk.uncompressed_crc in {0, zlib.crc32(content)}
+    at = 0
+    while at < len(content):
+        opcode, length = _HEAD.unpack_from(content, at)
+        at += _HEAD.size + length
+        yield parse_record(opcode, content[at - length : at])
+
+
+def as_json(record: Any) -> dict[str, Any]:
+    """A record in the suite's form: numbers as text, bytes as lists of numbers, fields by name."""
+    fields = record._asdict() if isinstance(record, Message) else asdict(record)
+    if isinstance(record, Attachment):
+        fields.pop("crc")  # the walk has checked it
+    return {"type": type(record).__name__, "fields": [[name, _value(fields[name])] for name in sorted(fields)]}
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return [str(byte) for byte in value]
+    if isinstance(value, dict):
+        return {str(key): _value(item) for key, item in value.items()}
+    return str(value)
+
+
+@pytest.mark.parametrize("group", ["NoData", "OneMessage", "OneAttachment", "OneMetadata", "TenMessages"])
+def test_every_conformance_file_reads_as_its_json_says(real_data: Path, group: str) -> None:
+    files = sorted((real_data / "mcap_conformance" / group).glob("*.mcap"))
+    assert files
+    for file in files:
+        damage = Damage()
+        found = [as_json(record) for record in records_of(file, damage)]
+        expected = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))["records"]
+        assert found == expected, file.name
+        assert damage.notes == [], file.name
+
+
+def test_there_are_342_conformance_files(real_data: Path) -> None:
+    assert len(list((real_data / "mcap_conformance").rglob("*.mcap"))) == 342
+
+
+def test_the_messages_of_every_conformance_file_are_those_of_its_json(real_data: Path) -> None:
+    for file in sorted((real_data / "mcap_conformance").rglob("*.mcap")):
+        damage = Damage()
+        records = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))["records"]
+        expected = [dict(r["fields"]) for r in records if r["type"] == "Message"]
+        found = list(McapLog(file).messages(damage))
+        assert [_value(m.data) for m in found] == [m["data"] for m in expected], file.name
+        assert [str(m.log_time_ns) for m in found] == [m["log_time"] for m in expected], file.name
+        assert damage.count == 0, file.name
+
+
+def test_a_changed_byte_of_any_data_section_is_told(real_data: Path, tmp_path: Path) -> None:
+    """So that the test above cannot pass by not looking."""
+    file = real_data / "mcap_conformance" / "OneAttachment" / "OneAttachment.mcap"
+    data = bytearray(file.read_bytes())
+    at = data.index(b"myFile") + 6 + 4 + len("application/octet-stream") + 8
+    assert data[at : at + 3] == b"\x01\x02\x03"
+    data[at] ^= 0xFF
+    (tmp_path / "changed.mcap").write_bytes(data)
+    damage = Damage()
+    list(McapLog(tmp_path / "changed.mcap").messages(damage))
+    assert [note.split(": ", 1)[1][:26] for note in damage.notes] == [
+        "checksum of the attachment",
+        "checksum of the data secti",
+    ]

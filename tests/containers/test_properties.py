@@ -1,0 +1,257 @@
+"""Properties that hold for any recording: what was written is read, and a cut leaves a beginning."""
+
+import sqlite3
+from contextlib import closing
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag1 import Writer as BagWriter
+
+from splatctrl_cli.containers.bag1_log import Bag1Log
+from splatctrl_cli.containers.db3_log import Db3Log
+from splatctrl_cli.containers.mcap_log import McapLog
+from splatctrl_cli.containers.mcap_records import BadRecordError, parse_record
+from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.datasets.poses import read_tum
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.arrays import npy_of, read_arrays, savez
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.logs.pairing import pair_by_stamp
+from splatctrl_cli.logs.rvl import decode_rvl
+from splatctrl_cli.logs.tf_tree import MAX_GAP_NS, TfTree
+from splatctrl_cli.records import GaussianSet
+from splatctrl_cli.splat_files.splat_differences import differences
+from splatctrl_cli.splat_files.splat_formats import FORMATS
+from tests.logs.test_rvl import encoded_rvl
+from tests.properties import few
+
+TOPICS = ("/a", "/b/c", "/d e")
+STAMPS = st.integers(0, 2**63 - 1)
+MESSAGES = st.lists(st.tuples(st.sampled_from(TOPICS), STAMPS, st.binary(max_size=60)), max_size=20)
+Found = list[tuple[str, int, bytes]]
+
+
+def found_in(log: McapLog | Bag1Log | Db3Log) -> tuple[Found, int]:
+    """Topic, time and bytes of each message; how much was damaged."""
+    damage = Damage()
+    return [(m.topic.name, m.log_time_ns, bytes(m.data)) for m in log.messages(damage)], damage.count
+
+
+def mcap_of(messages: Found, compression: CompressionType, chunk_size: int, is_chunked: bool) -> bytes:
+    stream = BytesIO()
+    writer = Writer(
+        stream, chunk_size=chunk_size, compression=compression, use_chunking=is_chunked, enable_data_crcs=True
+    )
+    writer.start(profile="", library="tests")
+    channels: dict[str, int] = {}
+    for topic, stamp, data in messages:
+        if topic not in channels:
+            channels[topic] = writer.register_channel(topic, "x", 0)
+        writer.add_message(channels[topic], log_time=stamp, publish_time=stamp, data=data)
+    writer.finish()
+    return stream.getvalue()
+
+
+@few(40)
+@given(MESSAGES, st.sampled_from(list(CompressionType)), st.integers(1, 300), st.booleans(), st.floats(0, 1))
+def test_an_mcap_gives_what_was_written_and_cut_anywhere_a_beginning_of_it(
+    tmp_path_factory: pytest.TempPathFactory,
+    messages: Found,
+    compression: CompressionType,
+    chunk_size: int,
+    is_chunked: bool,
+    share: float,
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "x.mcap"
+    data = mcap_of(messages, compression, chunk_size, is_chunked)
+    path.write_bytes(data)
+    assert found_in(McapLog(path)) == (messages, 0)
+    path.write_bytes(data[: int(share * (len(data) - 1))])
+    found, damaged = found_in(McapLog(path))
+    assert found == messages[: len(found)]
+    assert damaged > 0
+
+
+@few(150)
+@given(st.integers(0, 255), st.binary(max_size=80))
+def test_bytes_that_are_no_record_of_an_mcap_are_refused_as_such(opcode: int, content: bytes) -> None:
+    try:
+        parse_record(opcode, content)
+    except BadRecordError as error:
+        assert "record" in str(error)
+
+
+@few(15)
+@given(MESSAGES.filter(bool), st.booleans(), st.floats(0, 1))
+def test_a_bag_gives_what_was_written_and_cut_anywhere_a_beginning_of_it(
+    tmp_path_factory: pytest.TempPathFactory, messages: Found, is_packed: bool, share: float
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "x.bag"
+    path.unlink(missing_ok=True)
+    in_seconds = [(topic, stamp % 2**32 * 10**9, data) for topic, stamp, data in messages]
+    writer = BagWriter(path)
+    if is_packed:
+        writer.set_compression(BagWriter.CompressionFormat.BZ2)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, stamp, data in in_seconds:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic, "std_msgs/msg/String", msgdef="string data", md5sum="0"
+                )
+            writer.write(connections[topic], stamp, data)
+    assert found_in(Bag1Log(path)) == (in_seconds, 0)
+    data = path.read_bytes()
+    path.write_bytes(data[: 13 + int(share * (len(data) - 14))])
+    try:
+        found, _ = found_in(Bag1Log(path))
+    except InputError:  # not one whole record
+        found = []
+    assert found == in_seconds[: len(found)]
+
+
+@few(15)
+@given(MESSAGES, st.floats(0, 1))
+def test_a_sqlite_bag_gives_what_was_written_and_cut_anywhere_no_other(
+    tmp_path_factory: pytest.TempPathFactory, messages: Found, share: float
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "x.db3"
+    path.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
+        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data BLOB)")
+        rows = [(i, name, "std_msgs/msg/String", "cdr") for i, name in enumerate(TOPICS)]
+        database.executemany("INSERT INTO topics VALUES (?, ?, ?, ?)", rows)
+        written = [(TOPICS.index(topic), stamp, data) for topic, stamp, data in messages]
+        database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", written)
+    assert found_in(Db3Log(path)) == (messages, 0)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * (len(data) - 1))])
+    try:
+        found, _ = found_in(Db3Log(path))
+    except InputError:
+        return
+    assert all(message in messages for message in found)
+
+
+@few(60)
+@given(st.lists(st.one_of(st.just(0), st.integers(0, 65535)), min_size=1, max_size=120))
+def test_rvl_gives_back_any_image(pixels: list[int]) -> None:
+    image = np.array(pixels, np.uint16)
+    assert np.array_equal(decode_rvl(encoded_rvl(image), image.size), image)
+
+
+TIMES = st.lists(st.integers(0, 60), max_size=25)
+
+
+@few(150)
+@given(TIMES, TIMES, st.integers(0, 12))
+def test_pairs_are_one_to_one_near_and_none_is_left_that_could_be(
+    color: list[int], depth: list[int], tolerance: int
+) -> None:
+    pairs = pair_by_stamp(color, depth, tolerance)
+    ones, others = [i for i, _ in pairs], [j for _, j in pairs]
+    assert len(set(ones)) == len(ones) and len(set(others)) == len(others)
+    assert all(abs(color[i] - depth[j]) <= tolerance for i, j in pairs)
+    assert [color[i] for i in ones] == sorted(color[i] for i in ones)
+    free = [i for i in range(len(color)) if i not in ones], [j for j in range(len(depth)) if j not in others]
+    assert not any(abs(color[i] - depth[j]) <= tolerance for i in free[0] for j in free[1])
+    mirrored = pair_by_stamp(depth, color, tolerance)
+    gaps = sorted(abs(color[i] - depth[j]) for i, j in pairs)
+    assert gaps[:1] == sorted(abs(depth[i] - color[j]) for i, j in mirrored)[:1], "the closest pair is one both ways"
+
+
+NUMBER = st.floats(-10, 10)
+QUAT = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+SAMPLES = st.lists(
+    st.tuples(st.integers(1, MAX_GAP_NS), st.tuples(NUMBER, NUMBER, NUMBER), QUAT), min_size=2, max_size=6
+)
+
+
+@few(60)
+@given(SAMPLES, st.floats(0, 1), st.randoms(use_true_random=False))
+def test_a_moving_frame_is_rigid_at_all_times_and_where_it_was_seen(samples: Any, share: float, order: Any) -> None:
+    tree, stamps = TfTree(), np.cumsum([gap for gap, _, _ in samples]).tolist()
+    shuffled = list(zip(stamps, samples, strict=True))
+    order.shuffle(shuffled)
+    for stamp, (_, position, quat) in shuffled:
+        unit = np.array(quat) / np.linalg.norm(quat)
+        tree.add("world", "camera", stamp, np.array(position), unit, static=False)
+    for stamp, (_, position, _) in zip(stamps, samples, strict=True):
+        T = tree.lookup("world", "camera", stamp)
+        assert T is not None and T[:3, 3] == pytest.approx(position, abs=1e-12)
+    between = stamps[0] + int(share * (stamps[-1] - stamps[0]))
+    T, back = tree.lookup("world", "camera", between), tree.lookup("camera", "world", between)
+    assert T is not None and back is not None
+    assert T[:3, :3].T @ T[:3, :3] == pytest.approx(np.eye(3), abs=1e-9)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-9)
+    assert back == pytest.approx(invert_transform(T), abs=1e-9)
+    corners = np.array([position for _, position, _ in samples])
+    assert (corners.min(axis=0) - 1e-9 <= T[:3, 3]).all() and (T[:3, 3] <= corners.max(axis=0) + 1e-9).all()
+    assert tree.lookup("world", "camera", stamps[0] - 1) is None
+    assert tree.lookup("world", "camera", stamps[-1] + 1) is None
+
+
+@few(80)
+@given(st.lists(st.one_of(st.floats(), st.floats(-1, 1)), min_size=8, max_size=8))
+@example([0.0] * 4 + [2e-160, 1e-160, 0.0, 1.3e-160])  # squares that underflow
+@example([0.0] * 4 + [5e-324, 0.0, 0.0, 0.0])
+def test_a_line_of_poses_is_rigid_or_refused(tmp_path_factory: pytest.TempPathFactory, numbers: list[float]) -> None:
+    path = tmp_path_factory.getbasetemp() / "poses.txt"
+    path.write_text(" ".join(map(repr, numbers)) + "\n")
+    try:
+        (T,) = read_tum(path).values()
+    except InputError:
+        return
+    assert np.isfinite(T).all()
+    assert T[:3, :3].T @ T[:3, :3] == pytest.approx(np.eye(3), abs=1e-6)
+
+
+KINDS = st.sampled_from(["<f4", "<f8", ">f4", "|u1", "<u2", "<i8", "<U3"])
+
+
+@few(40)
+@given(st.lists(st.tuples(KINDS, st.lists(st.integers(0, 4), max_size=3), st.booleans()), max_size=4))
+def test_arrays_come_back_from_a_file(tmp_path_factory: pytest.TempPathFactory, kinds: Any) -> None:
+    arrays = {}
+    for number, (kind, shape, is_by_columns) in enumerate(kinds):
+        values = np.arange(int(np.prod(shape))).reshape(shape).astype(kind)
+        arrays[f"a {number}"] = np.asfortranarray(values) if is_by_columns else values
+    path = tmp_path_factory.getbasetemp() / "x.npz"
+    savez(path, arrays)
+    found = read_arrays(path, most=sum(array.nbytes for array in arrays.values()))
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        assert found[name].dtype == array.dtype and found[name].shape == array.shape
+        assert np.array_equal(found[name], array)
+        stream = BytesIO()
+        np.save(stream, array)
+        assert np.array_equal(npy_of(stream.getvalue()), array)
+
+
+@few(10)
+@given(st.integers(1, 12), st.sampled_from([0, 3]), st.integers(0, 2**31))
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".spz", ".splat"])
+def test_splats_come_back_within_the_bounds_of_their_format(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, num: int, degree: int, seed: int
+) -> None:
+    rng, kind = np.random.default_rng(seed), FORMATS[suffix]
+    quats = rng.normal(size=(num, 4))
+    gaussians = GaussianSet(
+        centers=rng.normal(0, 3, (num, 3)).astype(np.float32),
+        scales=np.exp(rng.uniform(-6, 0, (num, 3))).astype(np.float32),
+        quats_wxyz=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        harmonics=rng.normal(0, 0.3, (num, (degree + 1) ** 2, 3)).astype(np.float32),
+        opacities=rng.uniform(0.01, 0.99, num).astype(np.float32),
+        labels=np.zeros(num, np.uint8),
+    )
+    path = tmp_path_factory.getbasetemp() / f"x{suffix}"
+    kind.write(path, gaussians, {})
+    back, held = kind.read(path)[0], kind.held(gaussians)
+    assert len(back) == num
+    assert not differences(held, back).beyond(kind.bound(gaussians))

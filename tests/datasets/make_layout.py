@@ -1,0 +1,222 @@
+"""Small trees laid out as public datasets are, with known poses and depth."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.datasets.poses import OPENGL_FROM_OPTICAL
+from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.sources.source import open_source
+
+WIDTH, HEIGHT = 8, 6
+POSES = [look_at([0.5 + 0.1 * index, 0.2, 1.0], [0.0, 0.0, 0.0]) for index in range(3)]
+K = (10.0, 11.0, 3.5, 2.5)
+
+
+def color_of(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """RGB of a frame: red says which."""
+    image = np.full((HEIGHT, WIDTH, 3), 20, np.uint8)
+    image[..., 0] = 50 + 10 * index
+    return image
+
+
+def counts_of(index: int, unit: float = 1e-3) -> np.ndarray[Any, np.dtype[np.uint16]]:
+    """Depth counts of a frame: its number and each pixel tell in the value; the first pixel has none."""
+    metres = 1.0 + 0.1 * index + 0.01 * np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
+    counts = np.round(metres / unit).astype(np.uint16)
+    counts[0, 0] = 0
+    return counts
+
+
+def write_pair(color: Path, depth: Path, index: int, unit: float = 1e-3, invalid: int = 0) -> None:
+    for path in (color, depth):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(color), color_of(index)[..., ::-1])
+    counts = counts_of(index, unit)
+    counts[0, 0] = invalid
+    cv2.imwrite(str(depth), counts)
+
+
+def matrix_text(T: Float64) -> str:
+    return "\n".join(" ".join(repr(float(v)) for v in row) for row in T) + "\n"
+
+
+def frames_of(folder: Path, options: SourceOptions | None = None) -> list[RgbdFrame]:
+    return [record for record in open_source(folder, options).records() if isinstance(record, RgbdFrame)]
+
+
+def check(frames: list[RgbdFrame], unit: float = 1e-3, k: tuple[float, ...] = K) -> None:
+    """Every value of three frames in order."""
+    assert len(frames) == 3
+    for index, frame in enumerate(frames):
+        assert np.array_equal(frame.color, color_of(index))
+        assert np.array_equal(frame.depth, counts_of(index, unit).astype(np.float32) * np.float32(unit))
+        assert frame.depth[0, 0] == 0
+        assert frame.T_world_camera == pytest.approx(POSES[index], abs=1e-12)
+        i = frame.intrinsics
+        assert (i.fx, i.fy, i.cx, i.cy, i.width, i.height) == (*k, WIDTH, HEIGHT)
+
+
+def make_tum(folder: Path) -> Path:
+    """Depth 5 ms after colour, poses half a period before and after, so that colour lies in their middle."""
+    start = 1305031102.0
+    listed: dict[str, list[str]] = {"rgb": ["# timestamp filename"], "depth": []}
+    poses = []
+    for index, T in enumerate(POSES):
+        color, depth = f"{start + index * 0.1:.6f}", f"{start + index * 0.1 + 0.005:.6f}"
+        write_pair(folder / f"rgb/{color}.png", folder / f"depth/{depth}.png", index, 1 / 5000)
+        listed["rgb"].append(f"{color} rgb/{color}.png")
+        listed["depth"].append(f"{depth} depth/{depth}.png")
+        quat = quat_from_rotation(T[:3, :3])
+        for step in (-0.05, 0.05):
+            position = T[:3, 3] + step * np.array([1.0, 2.0, 0.0])
+            poses.append([start + index * 0.1 + step * 0.5, *position, *quat])
+    for name, lines in listed.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    rows = [f"{row[0]:.6f} " + " ".join(repr(float(v)) for v in row[1:]) for row in poses]
+    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
+    return folder
+
+
+def make_redwood(folder: Path) -> Path:
+    lines = []
+    for index, T in enumerate(POSES):
+        write_pair(folder / f"color/{index + 9}.png", folder / f"depth/{index + 9}.png", index)
+        lines.append(f"{index} {index} {index + 1}\n{matrix_text(T)}")
+    (folder / "trajectory.log").write_text("".join(lines))
+    by_columns = [K[0], 0, 0, 0, K[1], 0, K[2], K[3], 1]
+    text = json.dumps({"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": by_columns})
+    (folder / "camera_intrinsic.json").write_text(text)
+    return folder
+
+
+def make_frames(folder: Path, sequence: str = "seq-01") -> Path:
+    for index, T in enumerate(POSES):
+        stem = folder / sequence / f"frame-{index:06d}"
+        write_pair(Path(f"{stem}.color.png"), Path(f"{stem}.depth.png"), index, invalid=65535)
+        Path(f"{stem}.pose.txt").write_text(matrix_text(T))
+    return folder
+
+
+def make_scannet(folder: Path, depth_size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    for index, T in enumerate(POSES):
+        name = 8 + index  # 8, 9, 10: by number, not by letter
+        write_pair(folder / f"color/{name}.png", folder / f"depth/{name}.png", index)
+        if depth_size != (WIDTH, HEIGHT):
+            cv2.imwrite(str(folder / f"depth/{name}.png"), np.full(depth_size[::-1], 1500, np.uint16))
+        (folder / "pose").mkdir(exist_ok=True)
+        (folder / f"pose/{name}.txt").write_text(matrix_text(T))
+    (folder / "intrinsic").mkdir()
+    for name, scale in (("color", 1.0), ("depth", depth_size[0] / WIDTH)):
+        matrix = np.eye(4)
+        matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2] = (scale * value for value in K)
+        (folder / f"intrinsic/intrinsic_{name}.txt").write_text(matrix_text(matrix))
+        (folder / f"intrinsic/extrinsic_{name}.txt").write_text(matrix_text(np.eye(4)))
+    return folder
+
+
+def make_bop(folder: Path, with_poses: bool = True) -> Path:
+    cameras = {}
+    for index, T in enumerate(POSES):
+        write_pair(folder / f"rgb/{index:06d}.png", folder / f"depth/{index:06d}.png", index, 1e-4)
+        entry: dict[str, Any] = {"cam_K": [K[0], 0, K[2], 0, K[1], K[3], 0, 0, 1], "depth_scale": 0.1}
+        if with_poses:
+            inverse = invert_transform(T)
+            entry |= {"cam_R_w2c": inverse[:3, :3].ravel().tolist(), "cam_t_w2c": (1e3 * inverse[:3, 3]).tolist()}
+        cameras[str(index)] = entry
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    return folder
+
+
+def make_nerfstudio(folder: Path, **of_second: float) -> Path:
+    frames: list[dict[str, Any]] = []
+    for index, T in enumerate(POSES):
+        write_pair(folder / f"images/frame_{index}.png", folder / f"depths/d_{index}.png", index)
+        frames.append(
+            {
+                "file_path": f"./images/frame_{index}.png",
+                "depth_file_path": f"depths/d_{index}.png",
+                "transform_matrix": (T @ OPENGL_FROM_OPTICAL).tolist(),
+            }
+        )
+    frames[1] |= of_second
+    lens = {"fl_x": K[0], "fl_y": K[1], "cx": K[2] + 0.5, "cy": K[3] + 0.5, "w": WIDTH, "h": HEIGHT}
+    content = {"camera_model": "OPENCV", **lens, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def make_icl(folder: Path) -> Path:
+    """Left-handed: y up in the camera and in the world; image 0 has no pose."""
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    lines = []
+    for index, T in enumerate(POSES):
+        write_pair(folder / f"rgb/{index + 9}.png", folder / f"depth/{index + 9}.png", index, 1 / 5000)
+        left = mirror @ T @ mirror
+        row = [*left[:3, 3], *quat_from_rotation(left[:3, :3])]
+        lines.append(f"{index + 9} " + " ".join(repr(float(v)) for v in row) + "\n")
+    write_pair(folder / "rgb/0.png", folder / "depth/0.png", 0, 1 / 5000)
+    (folder / "livingRoom2.gt.freiburg").write_text("".join(lines))
+    (folder / "associations.txt").write_text("0 depth/0.png 0 rgb/0.png\n")
+    return folder
+
+
+def make_replica(folder: Path) -> Path:
+    for index in range(3):
+        stems = (f"frame{index + 9:06d}.png", f"depth{index + 9:06d}.png")
+        write_pair(folder / "results" / stems[0], folder / "results" / stems[1], index, 1 / 6553.5)
+    matrices = [np.eye(4)] * 9 + POSES
+    (folder / "traj.txt").write_text("".join(matrix_text(T).replace("\n", " ") + "\n" for T in matrices))
+    lens = dict(zip(("fx", "fy", "cx", "cy"), K, strict=True))
+    text = json.dumps({"camera": {"w": WIDTH, "h": HEIGHT, **lens, "scale": 6553.5}})
+    (folder / "cam_params.json").write_text(text)
+    return folder
+
+
+def make_sun3d(folder: Path) -> Path:
+    """Depth 2 ms after colour, its bits rotated; an older trajectory beside the one that counts."""
+    rows = []
+    for index, T in enumerate(POSES):
+        time = 33_000 * index
+        color, depth = (
+            folder / f"image/{index + 1:07d}-{time:012d}.png",
+            folder / f"depth/{index:07d}-{time + 2000:012d}.png",
+        )
+        write_pair(color, depth, index)
+        counts = counts_of(index)
+        cv2.imwrite(str(depth), (counts << 3) | (counts >> 13))
+        rows += [" ".join(repr(float(v)) for v in row) for row in T[:3]]
+    (folder / "extrinsics").mkdir()
+    (folder / "extrinsics/20140101000000.txt").write_text("\n".join(rows[3:] + rows[:3]))
+    (folder / "extrinsics/20150101000000.txt").write_text("\n".join(rows))
+    lens = f"{K[0]} 0 {K[2] + 1}\n0 {K[1]} {K[3] + 1}\n0 0 1\n"
+    (folder / "intrinsics.txt").write_text(lens)
+    return folder
+
+
+def make_arkit(folder: Path) -> Path:
+    """Depth of half the size; the lens' file is named a millisecond off, poses lie half a period to either side."""
+    root = folder / "41069021_frames"
+    (root / "lowres_wide_intrinsics").mkdir(parents=True)
+    lines = []
+    for index, T in enumerate(POSES):
+        stamp = 305.367 + 0.1 * index
+        name = f"41069021_{stamp:.3f}.png"
+        write_pair(root / "lowres_wide" / name, root / "lowres_depth" / name, index)
+        cv2.imwrite(str(root / "lowres_depth" / name), counts_of(index)[::2, ::2])
+        lens = f"{WIDTH} {HEIGHT} {K[0]} {K[1]} {K[2]} {K[3]}"
+        (root / f"lowres_wide_intrinsics/41069021_{stamp + 0.001:.3f}.pincam").write_text(lens)
+        for step in (-0.05, 0.05):
+            moved = T.copy()
+            moved[:3, 3] += step * np.array([1.0, 2.0, 0.0])
+            inverse = invert_transform(moved)
+            row = [*cv2.Rodrigues(inverse[:3, :3])[0].ravel(), *inverse[:3, 3]]
+            lines.append(f"{stamp + step * 0.5:.6f} " + " ".join(repr(float(v)) for v in row) + "\n")
+    (root / "lowres_wide.traj").write_text("".join(lines))
+    return folder

@@ -1,0 +1,89 @@
+"""Published splits: the numbers of their views, and scans that do not have them."""
+
+import pytest
+
+from splatctrl_cli.datasets.protocols import score_protocol
+from splatctrl_cli.errors import InputError, UsageError
+
+DTU = range(49)
+
+
+@pytest.mark.parametrize(("name", "num"), [("regnerf-3", 3), ("regnerf-6", 6), ("regnerf-9", 9)])
+def test_regnerf_trains_on_its_first_views_and_scores_25(name: str, num: int) -> None:
+    split = score_protocol(name).split(DTU, "scan")
+    assert split.training == (25, 22, 28, 40, 44, 48, 0, 8, 13)[:num]
+    assert split.scored == (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, 29, 30, 31, 32, 33, 34, 35, 41, 42, 43, 45,
+                            46, 47)  # fmt: skip
+    assert {3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 36, 37, 38, 39} <= set(split.left_out)
+    assert len(split.training) + len(split.scored) + len(split.left_out) == 49
+
+
+def test_regnerf_leaves_out_what_a_scan_of_64_views_has_more() -> None:
+    split = score_protocol("regnerf-3").split(range(64), "scan")
+    assert set(range(49, 64)) <= set(split.left_out)
+
+
+def test_mvsnerf_scores_four_views_where_there_is_depth() -> None:
+    protocol = score_protocol("mvsnerf")
+    split = protocol.split(DTU, "scan")
+    assert split.scored == (32, 24, 23, 44)
+    assert len(split.training) == 16
+    assert not set(split.training) & set(split.scored)
+    assert protocol.mask == "depth"
+
+
+def test_every_eighth_view_is_scored_and_all_of_dtu_train() -> None:
+    assert score_protocol("dtu-holdout8").split(DTU, "scan").scored == (0, 8, 16, 24, 32, 40, 48)
+    split = score_protocol("dtu-train").split(DTU, "scan")
+    assert split.training == split.scored == tuple(DTU)
+
+
+def test_published_means_are_over_so_many_scans() -> None:
+    names = ("regnerf-3", "mvsnerf", "dtu-train", "dtu-holdout8")
+    assert [len(score_protocol(name).scans) for name in names] == [15, 5, 15, 0]
+    assert score_protocol("regnerf-9").scans == (8, 21, 30, 31, 34, 38, 40, 41, 45, 55, 63, 82, 103, 110, 114)
+    assert score_protocol("dtu-train").scans[:6] == (24, 37, 40, 55, 63, 65)
+
+
+def test_every_eighth_counts_the_views_that_are_there() -> None:
+    assert score_protocol("dtu-holdout8").split([1, 3, *range(5, 15)], "scan").scored == (1, 11)
+
+
+def test_a_rule_by_hand() -> None:
+    assert score_protocol("holdout:every4+1").split(range(10), "scan").scored == (1, 5, 9)
+    split = score_protocol("holdout:7,2").split(range(9), "scan")
+    assert split.scored == (2, 7)
+    assert split.words() == "train 0-1, 3-6, 8; score 2, 7"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("regnerf3", r"unknown; did you mean regnerf-3\?"),
+        ("x", "unknown; use one of: dtu-train, dtu-holdout8, regnerf-3"),
+        ("holdout:", "expected holdout:everyN, holdout:everyN"),
+        ("holdout:every1", "expected every N of at least 2 and FIRST below N, got 1 and 0"),
+        ("holdout:every4+4", "got 4 and 4"),
+    ],
+)
+def test_a_name_that_is_none_is_refused_with_the_choices(name: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        score_protocol(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "num", "message"),
+    [
+        (
+            "regnerf-3",
+            8,
+            "scan1: protocol regnerf-3: expected views .*got no view 9-12, 14-15.*the scan has views 0-7",
+        ),
+        ("holdout:2,9", 8, "got no view 9"),
+        ("dtu-holdout8", 1, "expected views to train and views to score, got 0 and 1 of 1 views"),
+        ("holdout:every8+7", 5, "got 5 and 0 of 5 views"),
+    ],
+)
+def test_a_scan_without_the_views_is_refused(name: str, num: int, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        score_protocol(name).split(range(num), "scan1")

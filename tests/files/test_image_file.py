@@ -1,0 +1,79 @@
+"""Heads of JPEG and PNG files against what OpenCV decodes, and files that are not whole or not plain."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.files.image_file import ImageHead, image_head
+from splatctrl_cli.logs.messages import decode_file
+
+RNG = np.random.default_rng(3)
+COLOR = RNG.integers(0, 256, (7, 11, 3), dtype=np.uint8)
+GREY, DEPTH = COLOR[..., 0], RNG.integers(0, 65536, (7, 11), dtype=np.uint16)
+
+
+def encoded(suffix: str, pixels: np.ndarray, *options: int) -> bytes:
+    return bytes(cv2.imencode(suffix, pixels, list(options))[1])
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+@pytest.mark.parametrize(
+    ("data", "channels", "bits"),
+    [
+        (encoded(".jpg", COLOR), 3, 8),
+        (encoded(".jpg", COLOR, cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 1), 3, 8),
+        (encoded(".jpg", GREY), 1, 8),
+        (encoded(".jpg", COLOR) + bytes(8), 3, 8),
+        (encoded(".png", COLOR), 3, 8),
+        (encoded(".png", GREY), 1, 8),
+        (encoded(".png", DEPTH), 1, 16),
+    ],
+)
+def test_the_head_of_a_plain_file_is_that_of_its_pixels(data: bytes, channels: int, bits: int) -> None:
+    assert image_head(data) == ImageHead(width=11, height=7, channels=channels, bits=bits)
+    pixels = decode_file(data, color=channels == 3)
+    assert pixels is not None and pixels.shape == ((7, 11, 3) if channels == 3 else (7, 11))
+    assert pixels.itemsize * 8 == bits
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_file_cut_anywhere_is_not_whole(suffix: str) -> None:
+    data = encoded(suffix, COLOR)
+    end = 2 if suffix == ".jpg" else 4  # a PNG's last checksum is that of an empty chunk
+    assert all(image_head(data[:length]) is None for length in range(len(data) - end + 1))
+
+
+def test_a_png_with_any_byte_changed_is_not_whole() -> None:
+    data = encoded(".png", DEPTH)
+    for at in range(len(data)):
+        assert image_head(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]) is None, at
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xd8\xff",
+        encoded(".webp", COLOR),
+        encoded(".png", np.dstack([COLOR, GREY])),
+        encoded(".png", COLOR).replace(b"IEND", b"iEND"),
+        encoded(".jpg", COLOR).replace(b"\xff\xc0\x00\x11\x08", b"\xff\xc0\x00\x11\x0c"),
+        encoded(".jpg", COLOR).replace(b"\xff\xc0", b"\xff\xc9"),
+    ],
+    ids=["nothing", "a mark", "WebP", "alpha", "no end", "12 bits", "arithmetic"],
+)
+def test_what_is_not_plain_is_left_to_the_decoder(data: bytes) -> None:
+    assert image_head(data) is None
+
+
+def test_a_png_of_no_or_of_absurd_size_is_left_to_the_decoder() -> None:
+    pixels = chunk(b"IDAT", zlib.compress(bytes(8)))
+    for width, height in ((0, 4), (1 << 20, 1 << 20)):
+        head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+        assert image_head(b"\x89PNG\r\n\x1a\n" + head + pixels + chunk(b"IEND", b"")) is None

@@ -1,0 +1,366 @@
+"""Outputs appear whole or not at all."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.errors import InputError, UsageError, WriteError
+from splatctrl_cli.files import output, output_lock
+from splatctrl_cli.files.output import check_can_be_written, output_path, partial_path, write_durably
+
+
+def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
+    with output_path(tmp_path / "out", force=False, is_folder=True) as partial:
+        (partial / "a").write_text("1")
+        assert not (tmp_path / "out").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    assert (tmp_path / "out" / "a").read_text() == "1"
+
+
+def test_an_existing_output_is_refused_untouched_without_force(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("old")
+    with pytest.raises(UsageError, match="--force"), output_path(tmp_path / "out", force=False, is_folder=False):
+        pytest.fail("must not get here")
+    assert (tmp_path / "out").read_text() == "old"
+
+
+def test_force_replaces_a_folder_whole(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "old").write_text("x")
+    (tmp_path / "out" / "run.json").write_text("{}")
+    with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
+        (partial / "new").write_text("y")
+        assert (tmp_path / "out" / "old").exists()
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("name", ["run.json", "capture.json", None])
+def test_force_replaces_a_folder_that_a_command_wrote_or_that_is_empty(tmp_path: Path, name: str | None) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out.old").mkdir()
+    if name:
+        (tmp_path / "out" / name).write_text("{}")
+    with output_path(tmp_path / "out", force=True, is_folder=True) as partial:
+        (partial / "new").write_text("y")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["new"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.old"]
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_folder_that_no_command_wrote_is_refused_untouched(tmp_path: Path, force: bool) -> None:
+    precious = tmp_path / "out" / "scan1" / "run.json"
+    precious.parent.mkdir(parents=True)
+    precious.write_text("mine")
+    with (
+        pytest.raises(UsageError, match=r"not written by splatctrl \(no run.json\); give another --out"),
+        output_path(tmp_path / "out", force=force, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    assert [p for p in tmp_path.rglob("*") if p.is_file()] == [precious]
+
+
+def test_a_file_where_a_folder_is_to_be_written_is_refused_untouched(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    with (
+        pytest.raises(UsageError, match="out: is a file, expected a folder to write; give another --out"),
+        output_path(tmp_path / "out", force=True, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_folder_where_a_file_is_to_be_written_is_refused_untouched(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.json").write_text("{}")
+    with (
+        pytest.raises(UsageError, match="out: is a folder, expected a file to write; give another --out"),
+        output_path(tmp_path / "out", force=True, is_folder=False),
+    ):
+        pytest.fail("must not get here")
+    assert (tmp_path / "out" / "run.json").is_file()
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("name", ["", ".", "..", "/", "sub/.."])
+def test_an_output_without_a_name_of_its_own_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, force: bool
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with (
+        pytest.raises(UsageError, match="has no name of its own"),
+        output_path(Path(name), force=force, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    assert [p.name for p in tmp_path.rglob("*")] == ["here"]
+
+
+def test_refused_input_leaves_nothing(tmp_path: Path) -> None:
+    with (
+        pytest.raises(InputError),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        (partial / "a").write_text("1")
+        raise InputError("bad")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_leaves_only_a_partial(tmp_path: Path) -> None:
+    with (
+        pytest.raises(KeyboardInterrupt),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        (partial / "a").write_text("1")
+        raise KeyboardInterrupt
+    assert [p.name for p in tmp_path.iterdir()] == ["out.partial"]
+
+
+def test_a_parent_that_is_a_file_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with (
+        pytest.raises(UsageError, match="cannot be written"),
+        output_path(tmp_path / "file" / "out", force=False, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+
+
+def test_a_full_disk_is_a_write_error_and_leaves_nothing(tmp_path: Path) -> None:
+    with (
+        pytest.raises(WriteError, match="No space left"),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        raise OSError(28, "No space left on device", str(partial / "a"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_of_the_output_that_cannot_be_written_is_a_write_error(tmp_path: Path) -> None:
+    with (
+        pytest.raises(WriteError, match=r"Is a directory.*another --out"),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        partial.write_text("a folder")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_input_that_cannot_be_read_is_no_write_error_and_leaves_nothing(tmp_path: Path) -> None:
+    with (
+        pytest.raises(FileNotFoundError),
+        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
+    ):
+        (partial / "a").write_text("1")
+        (tmp_path / "input").read_text()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fault_of_our_own_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), output_path(tmp_path / "out", force=False, is_folder=False) as partial:
+        partial.write_text("1")
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
+
+
+FULL = OSError(28, "No space left on device", "a")
+
+
+@pytest.mark.parametrize(
+    ("resume", "error", "is_kept"),
+    [
+        (False, FULL, True),
+        (False, InputError("bad"), False),
+        (False, ZeroDivisionError(), False),
+        (True, FULL, True),
+        (True, InputError("another log"), True),
+        (True, ZeroDivisionError(), True),
+    ],
+)
+def test_a_failure_leaves_what_a_run_can_go_on_from(
+    tmp_path: Path, resume: bool, error: Exception, is_kept: bool
+) -> None:
+    out, partial = tmp_path / "out", tmp_path / "out.partial"
+    if resume:
+        partial.mkdir()
+        (partial / "state").write_text("1")
+    with (
+        pytest.raises(WriteError if error is FULL else type(error)),
+        output_path(out, force=False, is_folder=True, checkpoint="state", resume=resume) as folder,
+    ):
+        assert (folder / "state").exists() == resume
+        (folder / "state").write_text("1")
+        raise error
+    assert partial.exists() == is_kept
+
+
+def test_a_partial_without_a_checkpoint_is_begun_again(tmp_path: Path) -> None:
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "rest").write_text("1")
+    with output_path(tmp_path / "out", force=False, is_folder=True, checkpoint="state", resume=True) as folder:
+        assert not list(folder.iterdir())
+    assert (tmp_path / "out").is_dir()
+
+
+def test_what_a_killed_replacement_left_of_the_old_output_goes_with_the_next(tmp_path: Path) -> None:
+    (tmp_path / "out.partial.old").mkdir()
+    with output_path(tmp_path / "out", force=False, is_folder=True):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    write_durably(path, lambda p: p.write_text("old"))
+
+    def half(p: Path) -> None:
+        p.write_text("ne")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        write_durably(path, half)
+    assert path.read_text() == "old"
+    write_durably(path, lambda p: p.write_text("new"))
+    assert path.read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["state"]
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from splatctrl_cli.files.output import output_path
+with output_path(Path(sys.argv[1]), force=False, is_folder=sys.argv[2] == "folder", checkpoint="state") as partial:
+    if partial.is_dir():
+        (partial / "state").write_text("half")
+    print("writing", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@contextmanager
+def another_writer(out: Path, kind: str) -> Iterator["subprocess.Popen[str]"]:
+    """A process that is in the middle of writing an output until a line is sent to it."""
+    command = [sys.executable, "-c", HOLDER, str(out), kind]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "writing\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+@pytest.mark.parametrize("resume", [False, True])
+def test_the_second_of_two_writers_is_refused_and_the_first_ends_well(
+    tmp_path: Path, kind: str, resume: bool
+) -> None:
+    out = tmp_path / "out"
+    with another_writer(out, kind) as first:
+        with (
+            pytest.raises(UsageError, match=rf"out.partial: another run \(process {first.pid}\) writes it; wait"),
+            output_path(out, force=True, is_folder=kind == "folder", checkpoint="state", resume=resume),
+        ):
+            pytest.fail("must not get here")
+        first.communicate("\n")
+        assert first.returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert kind == "file" or (out / "state").read_text() == "half"
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_a_killed_writer_leaves_no_lock_behind(tmp_path: Path, kind: str) -> None:
+    out = tmp_path / "out"
+    with another_writer(out, kind) as first:
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
+    with output_path(out, force=False, is_folder=kind == "folder") as partial:
+        assert not (partial / "state").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_killed_writer_can_be_gone_on_from(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with another_writer(out, "folder") as first:
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+    with output_path(out, force=False, is_folder=True, checkpoint="state", resume=True) as partial:
+        assert (partial / "state").read_text() == "half"
+    assert (out / "state").read_text() == "half"
+
+
+def test_an_output_within_an_output_is_written(tmp_path: Path) -> None:
+    with (
+        output_path(tmp_path / "out", force=False, is_folder=True) as outer,
+        output_path(outer / "in", force=False, is_folder=True) as inner,
+    ):
+        (inner / "a").write_text("1")
+    assert (tmp_path / "out" / "in" / "a").read_text() == "1"
+
+
+def test_an_output_that_appeared_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+
+    @contextmanager
+    def held_late(partial: Path, *, is_folder: bool) -> Iterator[None]:
+        out.mkdir()  # the other run ended between the look at the output and the lock
+        with output_lock.held(partial, is_folder=is_folder):
+            yield
+
+    monkeypatch.setattr(output, "held", held_late)
+    with pytest.raises(UsageError, match="already exists"), output_path(out, force=False, is_folder=True):
+        pytest.fail("must not get here")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("is_folder", [True, False])
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path, is_folder: bool) -> None:
+    (tmp_path / "disk").mkdir()
+    target, link = tmp_path / "disk" / "real", tmp_path / "link"
+    if is_folder:
+        target.mkdir()
+        (target / "run.json").write_text("{}")
+    else:
+        target.write_text("old")
+    link.symlink_to(target)
+    with output_path(link, force=True, is_folder=is_folder) as partial:
+        assert partial == tmp_path / "disk" / "real.partial" == partial_path(link)
+        (partial / "new" if is_folder else partial).write_text("new")
+    assert link.is_symlink() and link.readlink() == target
+    assert (target / "new" if is_folder else target).read_text() == "new"
+    assert sorted(path.name for path in tmp_path.rglob("re*")) == ["real"]
+
+
+def test_a_link_to_nothing_yet_leads_to_the_output(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "real")
+    with output_path(tmp_path / "link", force=False, is_folder=True) as partial:
+        (partial / "a").write_text("1")
+    assert (tmp_path / "disk" / "real" / "a").read_text() == "1" and (tmp_path / "link").is_symlink()
+
+
+def test_a_link_to_itself_and_a_place_of_a_disk_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with (
+        pytest.raises(UsageError, match="is a link to itself"),
+        output_path(tmp_path / "loop", force=True, is_folder=True),
+    ):
+        pytest.fail("must not get here")
+    with pytest.raises(UsageError, match=r"/proc: .*"), output_path(Path("/proc"), force=True, is_folder=True):
+        pytest.fail("must not get here")
+
+
+def test_whether_an_output_can_be_written_is_known_without_trying(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("x")
+    check_can_be_written(tmp_path / "a" / "b" / "c")
+    with pytest.raises(UsageError, match="file is no folder"):
+        check_can_be_written(tmp_path / "file" / "a" / "b")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(UsageError, match="is read-only"):
+        check_can_be_written(tmp_path / "a" / "b" / "c")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

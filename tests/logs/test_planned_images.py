@@ -1,0 +1,94 @@
+"""Images that wait for others: in memory, and beyond a bound in a file; and the plan that says which are needed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+
+from splatctrl_cli.containers.mcap_log import McapLog
+from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.logs import planned_images
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.planned_images import HeldMessages, PlannedImages
+from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.sources.source import open_source
+from tests.logs.make_log import LogRecipe, make_log
+
+TOPIC = Topic(name="/a", type_name="t", encoding="cdr")
+
+
+def topic_by_topic(log: Path, path: Path) -> Path:
+    """The log with all messages of a topic before those of the next."""
+    messages = sorted(McapLog(log).messages(Damage()), key=lambda m: m.topic.name)
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros2")
+        channels: dict[str, int] = {}
+        for message in messages:
+            topic = message.topic
+            if topic.name not in channels:
+                schema = writer.register_schema(topic.type_name, "ros2msg", topic.definition.encode())
+                channels[topic.name] = writer.register_channel(topic.name, "cdr", schema)
+            writer.add_message(channels[topic.name], message.log_time_ns, message.data, message.log_time_ns)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("held_bytes", [0, 1000, 1 << 20])
+def test_a_log_that_keeps_its_topics_apart_gives_the_same_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held_bytes: int
+) -> None:
+    monkeypatch.setattr(planned_images, "HELD_BYTES", held_bytes)
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    apart = topic_by_topic(log, tmp_path / "apart.mcap")
+    good, other = ([r for r in open_source(p).records() if isinstance(r, RgbdFrame)] for p in (log, apart))
+    assert len(good) == len(other) == 10
+    for a, b in zip(good, other, strict=True):
+        assert (a.stamp_ns, a.camera) == (b.stamp_ns, b.camera)
+        assert np.array_equal(a.color, b.color) and np.array_equal(a.depth, b.depth)
+        assert np.array_equal(a.T_world_camera, b.T_world_camera)
+
+
+def test_held_messages_come_back_and_memory_holds_few_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planned_images, "HELD_BYTES", 100)
+    held = HeldMessages()
+    data = [bytes([i]) * 40 for i in range(10)]
+    for i, content in enumerate(data):
+        held.add(("/a", i), RawMessage(topic=TOPIC, log_time_ns=i, data=content))
+    assert sum(len(message.data) for message in held._messages.values()) == 80
+    for i in (9, 0, 5, 5, 1, 2, 3):
+        assert held.get(("/a", i)) == RawMessage(topic=TOPIC, log_time_ns=i, data=data[i])
+    for i in range(10):
+        assert held.pop(("/a", i)).data == data[i] and ("/a", i) not in held
+    held.add(("/a", 10), RawMessage(topic=TOPIC, log_time_ns=0, data=bytes(100)))
+    assert not held._places  # what went has made room
+
+
+def test_the_plan_takes_few_bytes_a_frame(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"), mask_every=2)))
+    assert isinstance(source, RosLogSource)
+    plan = source._plan
+    assert plan._columns.nbytes == 48 * len(plan) == 48 * 10
+    assert [planned.stamp_ns for planned in plan] == sorted(planned.stamp_ns for planned in plan)
+    assert [planned.camera.name for planned in plan][:4] == ["cam0", "cam1"] * 2
+    uses = plan.uses()
+    assert {topic: int(counts.sum()) for topic, counts in uses.items()} == {
+        f"/cam{i}/{name}": 5 for i in range(2) for name in ("color/image_raw/compressed", "depth/image_raw")
+    }
+
+
+def test_frames_come_by_stamp_then_camera_in_whatever_order_these_are_named(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    named = [SourceOptions(cameras=names) for names in (("cam0", "cam1"), ("cam1", "cam0"))]
+    orders = [[(s, c) for s, c, _ in open_source(log, options).poses()] for options in named]
+    assert orders[0] == orders[1] == sorted(orders[0])
+
+
+def test_images_that_no_frame_needs_any_more_are_let_go(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"))))
+    assert isinstance(source, RosLogSource)
+    images = PlannedImages(source._log, source._plan)
+    most = [len(images._held._messages) for _ in images.of_frames(Damage(), lambda _: True)]
+    assert len(most) == 10 and max(most) <= 4 and most[-1] == 0

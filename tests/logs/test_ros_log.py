@@ -1,0 +1,392 @@
+"""Logs as records: what a good log gives, and what each kind of bad log says."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import JointState, Record, RgbdFrame
+from splatctrl_cli.sources.source import CameraTopics, SourceOptions, open_source
+from tests.containers.test_bag_log import as_ros1_bag, assert_same
+from tests.logs.make_log import (
+    FRAME_NS,
+    HEIGHT,
+    START_NS,
+    WIDTH,
+    LogRecipe,
+    camera_x,
+    color_pixels,
+    make_log,
+    mask_pixels,
+)
+
+
+def records_of(path: Path, options: SourceOptions | None = None) -> list[Record]:
+    return list(open_source(path, options).records())
+
+
+def frames_of(path: Path, options: SourceOptions | None = None) -> list[RgbdFrame]:
+    return [record for record in records_of(path, options) if isinstance(record, RgbdFrame)]
+
+
+def refusal(path: Path, options: SourceOptions | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        records_of(path, options)
+    assert caught.value.exit_code == 4
+    assert caught.value.remedy
+    return str(caught.value)
+
+
+def test_a_good_log_gives_every_frame_with_color_depth_pose_and_intrinsics(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "good.mcap", LogRecipe(color_format="png")))
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    assert source.cameras == ("cam0",)
+    assert source.has_clock
+    assert [f.stamp_ns for f in frames] == [START_NS + i * FRAME_NS for i in range(5)]
+    for index, frame in enumerate(frames):
+        assert np.array_equal(frame.color, color_pixels(index))
+        assert frame.depth[0, 0] == 0
+        assert frame.depth[5, 7] == np.float32(1.25)
+        assert frame.T_world_camera[:3, 3] == pytest.approx([camera_x(index), 0, 0.5])
+        assert (frame.intrinsics.width, frame.intrinsics.height) == (WIDTH, HEIGHT)
+        assert (frame.intrinsics.fx, frame.intrinsics.cx) == (30.0, 15.5)
+    assert vars(source.loss) == vars(type(source.loss)())
+
+
+def test_joint_states_come_before_frames_of_the_same_stamp(tmp_path: Path) -> None:
+    records = records_of(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"))))
+    kinds = [type(record).__name__ for record in records[:3]]
+    assert kinds == ["JointState", "RgbdFrame", "RgbdFrame"]
+    stamps = [record.stamp_ns for record in records]
+    assert stamps == sorted(stamps)
+
+
+def test_joints_keep_names_positions_and_velocities(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap"))
+    joints = [record for record in source.records() if isinstance(record, JointState)]
+    assert source.joint_names == ("joint_a", "joint_b")
+    assert joints[3].position == pytest.approx([0.3, -0.3])
+    assert joints[3].velocity == pytest.approx([1.0, -1.0])
+
+
+def test_velocities_that_were_not_recorded_are_differences_and_said_so(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(with_velocity=False)))
+    joints = [record for record in source.records() if isinstance(record, JointState)]
+    assert joints[2].velocity == pytest.approx([1.0, -1.0])
+    assert "no velocities recorded" in source.loss.notes[0]
+
+
+def test_transforms_recorded_after_the_images_still_place_them(tmp_path: Path) -> None:
+    early = frames_of(make_log(tmp_path / "early.mcap"))
+    late = frames_of(make_log(tmp_path / "late.mcap", LogRecipe(tf_last=True)))
+    assert [f.T_world_camera.tolist() for f in early] == [f.T_world_camera.tolist() for f in late]
+
+
+def test_reading_twice_gives_the_same_records(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap"))
+    first, second = ([r for r in source.records() if isinstance(r, RgbdFrame)] for _ in range(2))
+    assert len(first) == len(second) == 5
+    assert all(np.array_equal(a.color, b.color) for a, b in zip(first, second, strict=True))
+
+
+def test_a_world_frame_inside_the_tree_is_honoured(tmp_path: Path) -> None:
+    frame = frames_of(make_log(tmp_path / "log.mcap"), SourceOptions(world_frame="cam0_link"))[3]
+    assert frame.T_world_camera[:3, 3] == pytest.approx([0, 0, 0.5])
+
+
+def test_images_without_partner_are_counted(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(depth_delay_ns=50_000_000 + 30_000_000))
+    source = open_source(log)  # 80 ms late: 20 ms before the next colour image
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    assert len(frames) == 4
+    assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.damaged) == (1, 1, 0)
+
+
+def test_images_outside_the_time_of_tf_are_counted(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(tf_frames=3)))
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    assert len(frames) == 3
+    assert source.loss.without_pose == 2
+
+
+def test_float_depth_in_metres_is_read(tmp_path: Path) -> None:
+    frame = frames_of(make_log(tmp_path / "log.mcap", LogRecipe(depth_encoding="32FC1", depth_m=0.7)))[0]
+    assert frame.depth[0, 0] == 0
+    assert frame.depth[3, 3] == np.float32(0.7)
+
+
+def test_byte_order_and_row_step_do_not_change_the_images(tmp_path: Path) -> None:
+    plain = frames_of(make_log(tmp_path / "a.mcap", LogRecipe(color_format="rgb8")))
+    odd = frames_of(make_log(tmp_path / "b.mcap", LogRecipe(color_format="rgb8", is_bigendian=True, step_padding=6)))
+    for a, b in zip(plain, odd, strict=True):
+        assert np.array_equal(a.color, b.color)
+        assert np.array_equal(a.depth, b.depth)
+
+
+def test_unregistered_depth_is_warped_through_tf_and_both_lenses(tmp_path: Path) -> None:
+    recipe = LogRecipe(depth_frame="cam0_depth", depth_size=(WIDTH // 2, HEIGHT // 2))
+    frame = frames_of(make_log(tmp_path / "log.mcap", recipe))[0]
+    assert frame.depth.shape == (HEIGHT, WIDTH)
+    covered = frame.depth[4:-4, 6:-4]
+    assert covered == pytest.approx(1.25, abs=1e-6)
+
+
+def test_a_distorted_lens_is_undone_on_colour_and_depth(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(color_format="png", distortion=(0.4, 0.0, 0.0, 0.0, 0.0)))
+    frame = frames_of(log)[0]
+    k = frame.intrinsics
+    assert (k.fx, k.fy, k.cx, k.cy) == (30.0, 30.0, 15.5, 11.5)  # the lens's own
+    assert frame.valid is not None
+    x, y = (np.arange(WIDTH) - k.cx) / k.fx, (np.arange(HEIGHT)[:, None] - k.cy) / k.fy
+    column, row = (30.0 * value * (1 + 0.4 * (x**2 + y**2)) + centre for value, centre in ((x, 15.5), (y, 11.5)))
+    seen = (column >= 0) & (column <= WIDTH - 1) & (row >= 0) & (row <= HEIGHT - 1)
+    assert np.array_equal(frame.valid, seen) and not seen[0, 0]
+    green = np.interp(column, np.arange(WIDTH), color_pixels(0)[0, :, 1])
+    assert frame.color[seen, 1] == pytest.approx(green[seen], abs=1.0)
+    assert (frame.color[seen, 0] == 40).all() and not frame.color[~seen].any()
+    assert (frame.depth[seen] > 0).mean() > 0.99  # all but what the first pixel without depth covers
+    assert not frame.depth[~seen].any()
+    assert frame.depth[12, 16] == np.float32(1.25)
+    assert next(s for s in open_source(log).shots() if not isinstance(s, JointState)).color_file is None
+
+
+def test_rectified_images_take_the_projection_and_keep_their_pixels(tmp_path: Path) -> None:
+    recipe = LogRecipe(
+        color_name="image_rect_color", color_format="rgb8", distortion=(0.4, 0, 0, 0, 0), projection_focal=28.0
+    )
+    frame = frames_of(make_log(tmp_path / "log.mcap", recipe))[0]
+    assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (28.0, 16.0, 12.0)
+    assert np.array_equal(frame.color, color_pixels(0))
+
+
+def test_a_fixed_pose_stands_in_for_tf(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False))
+    frames = frames_of(log, SourceOptions(camera_poses={"cam0": (1, 2, 3, 0, 0, 0, 1)}))
+    assert len(frames) == 5
+    assert frames[4].T_world_camera[:3, 3] == pytest.approx([1, 2, 3])
+
+
+def test_one_camera_of_several_can_be_chosen(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    assert {f.camera for f in frames_of(log, SourceOptions(cameras=("cam1",)))} == {"cam1"}
+    assert "no camera 'cam7'; use one of: cam0, cam1" in refusal(log, SourceOptions(cameras=("cam7",)))
+
+
+def test_topics_can_be_named(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    topics = CameraTopics(name="eye", color="/cam0/color/image_raw/compressed", depth="/cam0/depth/image_raw")
+    assert frames_of(log, SourceOptions(camera_topics=(topics,)))[0].camera == "eye"
+    wrong = CameraTopics(name="eye", color="/nope", depth="/cam0/depth/image_raw")
+    assert "no colour images on topic /nope" in refusal(log, SourceOptions(camera_topics=(wrong,)))
+
+
+def test_a_truncated_log_gives_what_precedes_the_cut(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=20))
+    whole = frames_of(log)
+    log.write_bytes(log.read_bytes()[: log.stat().st_size * 6 // 10])
+    source = open_source(log)
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    assert 5 < len(frames) < 20
+    assert source.loss.damaged == 1
+    assert "cut or damaged after byte" in source.loss.notes[0]
+    for a, b in zip(frames, whole, strict=False):
+        assert np.array_equal(a.color, b.color)
+        assert np.array_equal(a.depth, b.depth)
+
+
+def test_a_flipped_byte_costs_its_chunk_only_and_is_counted(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=20))
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    log.write_bytes(bytes(data))
+    source = open_source(log)
+    frames = [r for r in source.records() if isinstance(r, RgbdFrame)]
+    assert 10 < len(frames) < 20
+    assert frames[-1].stamp_ns == START_NS + 19 * FRAME_NS
+    assert source.loss.damaged >= 1
+
+
+def test_an_image_that_does_not_decode_is_left_out_and_counted(tmp_path: Path) -> None:
+    from tests.logs import make_log as maker
+
+    class Breaking(maker._LogWriter):
+        def _color(self, topic: str, stamp: int, frame: str, index: int) -> tuple[str, str, Any]:
+            name, kind, message = super()._color(topic, stamp, frame, index)
+            if index == 2:
+                message.data[:] = 0
+            return name, kind, message
+
+    source = open_source(Breaking(tmp_path / "log.mcap", LogRecipe()).write())
+    assert len([r for r in source.records() if isinstance(r, RgbdFrame)]) == 4
+    assert source.loss.damaged == 1
+    assert "/cam0/color/image_raw/compressed" in source.loss.notes[0] or "cam0" in source.loss.notes[0]
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    assert "nothing.mcap: no such file" in refusal(tmp_path / "nothing.mcap")
+
+
+def test_an_empty_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "zero.mcap").touch()
+    assert "0 bytes" in refusal(tmp_path / "zero.mcap")
+
+
+def test_a_log_without_messages_is_refused(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=0, has_tf=False))
+    assert "holds no messages" in refusal(log)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    assert "unknown kind of file" in refusal(tmp_path / "notes.txt")
+    (tmp_path / "fake.mcap").write_text("hello")
+    assert "does not begin like a .mcap file" in refusal(tmp_path / "fake.mcap")
+
+
+def test_a_folder_of_unknown_content_is_refused(tmp_path: Path) -> None:
+    assert "neither a capture nor a ROS 2 bag" in refusal(tmp_path)
+
+
+def test_a_file_cut_before_its_first_message_is_refused(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(chunk_size=1 << 20))
+    log.write_bytes(log.read_bytes()[:200])
+    assert "nothing usable before the damage" in refusal(log)
+
+
+def test_a_log_without_depth_names_its_color_topics(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(has_depth=False)))
+    assert "no depth topic; colour topics there: /cam0/color/image_raw/compressed" in said
+
+
+def test_a_log_without_camera_info_names_camera_and_topic(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(has_info=False)))
+    assert "camera cam0: topic /cam0/color/image_raw/compressed has no usable CameraInfo" in said
+
+
+def test_a_log_without_tf_names_camera_and_frame_and_the_option(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False)))
+    assert "camera cam0: no tf for frame 'cam0_optical'" in said
+    assert "--camera-pose cam0=" in said
+
+
+def test_a_world_frame_that_tf_lacks_is_refused_with_the_frames_it_has(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap"), SourceOptions(world_frame="mars"))
+    assert "tf has no frame 'mars'" in said
+    assert "cam0_link, cam0_optical, world" in said
+
+
+def test_tf_at_another_time_than_every_image_is_refused(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(tf_delay_ns=60_000_000_000)))
+    assert "tf has no pose of frame 'cam0_optical' in 'world' at the time of any image" in said
+    assert "images 1700000000.000 to 1700000000.400 s, tf 1700000060.000 to 1700000060.400 s" in said
+
+
+def test_depth_in_counts_called_metres_is_implausible_and_the_scale_is_suggested(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(depth_encoding="32FC1", depth_m=1250.0)))
+    assert "topic /cam0/depth/image_raw: median depth 1250 m is implausible" in said
+    assert "--depth-scale 0.001" in said
+
+
+def test_depth_in_tenths_of_a_millimetre_is_implausible_until_the_scale_is_given(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(depth_counts=60000))
+    assert "--depth-scale 0.0001" in refusal(log)
+    assert frames_of(log, SourceOptions(depth_scale=1e-4))[0].depth[3, 3] == pytest.approx(6.0)
+
+
+def test_colour_and_depth_that_never_meet_name_the_gap(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(num_frames=1, depth_delay_ns=35_000_000)))
+    assert "no colour and depth image within 20 ms" in said
+    assert "35 ms apart" in said
+
+
+def test_depth_of_another_lens_without_calibration_names_what_is_missing(tmp_path: Path) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(depth_size=(16, 12))))
+    assert "depth 16UC1 16x12 of /cam0/depth/image_raw is not registered to colour" in said
+    assert "/cam0/depth/image_raw has no CameraInfo" in said
+
+
+MASKED = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+
+
+def test_masks_come_with_the_image_of_their_stamp(tmp_path: Path) -> None:
+    path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1))
+    frames = frames_of(path, MASKED)
+    assert len(frames) == 5
+    for index, frame in enumerate(frames):
+        assert frame.human is not None
+        assert frame.human.dtype == np.uint8
+        assert np.array_equal(frame.human, mask_pixels(index) > 0)
+    assert all(frame.human is None for frame in frames_of(path))  # nobody asked for them
+
+
+def test_images_without_a_mask_are_kept_and_noted(tmp_path: Path) -> None:
+    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=2)), MASKED)
+    frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
+    assert [frame.human is not None for frame in frames] == [True, False, True, False, True]
+    assert source.loss.notes == ["camera cam0: 2 of 5 images have no mask on /cam0/people/mask within 20 ms"]
+
+
+def test_a_mask_is_not_taken_for_the_colour_of_a_grey_camera(tmp_path: Path) -> None:
+    recipe = LogRecipe(mask_every=1, color_format="mono8", color_name="zz_image")
+    path = make_log(tmp_path / "log.mcap", recipe)
+    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+    assert frames_of(path, options)[0].color[0].tolist() == [[g, g, g] for g in color_pixels(0)[0, :, 1].tolist()]
+
+
+@pytest.mark.parametrize(
+    ("topics", "message"),
+    [
+        ({"cam7": "/cam0/people/mask"}, "--human-topic cam7=/cam0/people/mask: no camera 'cam7'"),
+        ({"cam0": "/cam0/nothing"}, "--human-topic cam0=/cam0/nothing: no mono8 or 8UC1 images on that topic"),
+        ({"cam0": "/cam0/depth/image_raw"}, "no mono8 or 8UC1 images on that topic"),
+    ],
+)
+def test_a_mask_topic_that_cannot_be_one_is_named(tmp_path: Path, topics: dict[str, str], message: str) -> None:
+    path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1))
+    assert message in refusal(path, SourceOptions(human_topics=topics))
+
+
+def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) -> None:
+    path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1, distortion=(0.3, 0.0, 0.0, 0.0, 0.0)))
+    human = frames_of(path, MASKED)[0].human
+    assert human is not None
+    assert set(np.unique(human)) == {0, 1}
+    assert not np.array_equal(human, mask_pixels(0) > 0)
+
+
+def test_ros1_messages_in_an_mcap_give_the_same_records(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap")
+    bag = as_ros1_bag(log, tmp_path / "log.bag")
+    converted = tmp_path / "ros1.mcap"
+    with converted.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros1")
+        channels: dict[str, int] = {}
+        for message in open_raw_log(bag).messages(Damage()):
+            topic = message.topic
+            if topic.name not in channels:
+                name = topic.type_name.replace("/msg/", "/")
+                schema = writer.register_schema(name=name, encoding="ros1msg", data=topic.definition.encode())
+                channels[topic.name] = writer.register_channel(
+                    topic=topic.name, message_encoding="ros1", schema_id=schema
+                )
+            time = message.log_time_ns
+            writer.add_message(channels[topic.name], log_time=time, publish_time=time, data=message.data)
+        writer.finish()
+    assert_same(records_of(log), records_of(converted))
+
+
+def test_a_lens_that_a_person_gives_stands_in_for_camera_info(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_info=False))
+    frame = frames_of(log, SourceOptions(intrinsics={"cam0": (31.0, 32.0, 15.0, 11.0)}))[0]
+    k = frame.intrinsics
+    assert (k.fx, k.fy, k.cx, k.cy, k.width, k.height) == (31.0, 32.0, 15.0, 11.0, WIDTH, HEIGHT)
+    assert "give --intrinsics cam0=FX,FY,CX,CY" in refusal(log)
+    assert "no camera 'cam7'" in refusal(log, SourceOptions(intrinsics={"cam7": (31.0, 32.0, 15.0, 11.0)}))
+    recorded = make_log(tmp_path / "whole.mcap")
+    assert frames_of(recorded, SourceOptions(intrinsics={"cam0": (31.0, 32.0, 15.0, 11.0)}))[0].intrinsics == k

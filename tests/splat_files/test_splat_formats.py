@@ -1,0 +1,164 @@
+"""Every format of splat files: what is written reads back within its bound, what is no such file is refused."""
+
+from dataclasses import asdict, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.records import GaussianSet, SplatSet
+from splatctrl_cli.splat_files import usd
+from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
+from splatctrl_cli.splat_files.isotropic import as_gaussians, as_splats, nearest_splats
+from splatctrl_cli.splat_files.splat_differences import differences
+from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, format_of, read_splats
+from splatctrl_cli.splat_files.splats import write_ply
+from tests.splat_files.test_gaussian_ply import gaussian_set
+from tests.splat_files.test_splats import splat_set
+
+NEEDS_USD = pytest.mark.skipif(find_spec("pxr") is None, reason="usd-core is not installed: USD was not written")
+SUFFIXES = [pytest.param(suffix, marks=NEEDS_USD if suffix.startswith(".usd") else ()) for suffix in FORMATS]
+KEEP_LABELS = {".ply", ".glb", ".usda", ".usdc"}
+
+
+def labelled(num: int, degree: int) -> GaussianSet:
+    return replace(gaussian_set(num, degree=degree), labels=(np.arange(num) % 3).astype(np.uint8))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_written_reads_back_within_the_bound(tmp_path: Path, suffix: str, degree: int) -> None:
+    found, gaussians, path = format_of(Path(f"a{suffix}")), labelled(3000, degree), tmp_path / f"a{suffix}"
+    found.write(path, gaussians, {"scene": "made up"})
+    back, comments = found.read(path)
+    held = found.held(gaussians)
+    assert not differences(held, back).beyond(found.bound(gaussians))
+    assert np.array_equal(back.labels, held.labels)
+    assert held.labels.any() == (suffix in KEEP_LABELS)
+    if not found.is_rounded:
+        assert comments["scene"] == "made up"
+        assert back.harmonics.shape[1] == (degree + 1) ** 2
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_the_bound_is_not_loose(tmp_path: Path, suffix: str) -> None:
+    found, gaussians, path = format_of(Path(f"a{suffix}")), gaussian_set(3000), tmp_path / f"a{suffix}"
+    found.write(path, gaussians, {})
+    measured, bound = asdict(differences(found.held(gaussians), found.read(path)[0])), asdict(found.bound(gaussians))
+    if found.is_rounded:
+        assert all(measured[name] >= 0.7 * bound[name] for name in bound), measured
+    else:
+        assert max(bound.values()) <= 1e-4
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_the_same_set_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
+    for name in ("a", "b"):
+        FORMATS[suffix].write(tmp_path / f"{name}{suffix}", gaussian_set(), {"k": "v"})
+    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"a{suffix}", f"b{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_isotropic_splats_are_read_as_that_from_every_format(tmp_path: Path, suffix: str) -> None:
+    splats, path = replace(splat_set(200), colors=np.full((200, 3), 0.25, np.float32)), tmp_path / f"a{suffix}"
+    FORMATS[suffix].write(path, as_gaussians(splats), {})
+    back, _ = read_splats(path)
+    assert isinstance(back, SplatSet)
+    np.testing.assert_allclose(back.radii, splats.radii, rtol=0.033)
+    np.testing.assert_allclose(back.colors, splats.colors, atol=0.004)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_anisotropic_gaussians_are_read_as_that_from_every_format(tmp_path: Path, suffix: str) -> None:
+    FORMATS[suffix].write(tmp_path / f"a{suffix}", gaussian_set(), {})
+    assert isinstance(read_splats(tmp_path / f"a{suffix}")[0], GaussianSet)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_value_that_is_no_gaussians_is_refused_with_its_index(tmp_path: Path, suffix: str) -> None:
+    gaussians = gaussian_set(5)
+    gaussians.centers[3, 1] = np.nan
+    with pytest.raises(InputError, match="splat 3: center: expected finite, got"):
+        FORMATS[suffix].write(tmp_path / f"a{suffix}", gaussians, {})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_file_that_is_cut_or_missing_is_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    with pytest.raises(InputError, match="cannot be read"):
+        read_splats(path)
+    FORMATS[suffix].write(path, gaussian_set(), {})
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 - 3])
+    with pytest.raises(InputError, match=rf"a\{suffix}: "):
+        read_splats(path)
+
+
+def test_the_reference_layout_has_62_properties_whatever_the_labels(tmp_path: Path) -> None:
+    REFERENCE_PLY.write(tmp_path / "a.ply", labelled(10, 1), {})
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
+    assert header.count("property float") == header.count("property") == 62
+
+
+def test_what_lies_outside_a_formats_range_is_held_at_its_edge(tmp_path: Path) -> None:
+    gaussians = gaussian_set(2)
+    gaussians.scales[0, 1] = 1e-6
+    gaussians.harmonics[1, 0, 2] = 50.0
+    gaussians.harmonics[1, 5, 0] = -3.0
+    for suffix in (".splat", ".spz"):
+        found = FORMATS[suffix]
+        found.write(tmp_path / f"a{suffix}", gaussians, {})
+        held, back = found.held(gaussians), found.read(tmp_path / f"a{suffix}")[0]
+        assert not differences(held, back).beyond(found.bound(gaussians))
+        assert differences(held, gaussians).color > 5
+    assert back.scales[0, 1] == pytest.approx(np.exp(-10), rel=1e-5)
+    assert back.harmonics[1, 5, 0] == -1.0
+
+
+def test_a_difference_beyond_the_bound_is_named() -> None:
+    gaussians, bound = gaussian_set(4), FORMATS[".splat"].bound(gaussian_set(4))
+    turned = replace(gaussians, quats_wxyz=np.roll(gaussians.quats_wxyz, 1, axis=0))
+    assert [line.split()[0] for line in differences(gaussians, turned).beyond(bound)] == ["rotation"]
+    assert not differences(gaussians, replace(gaussians, quats_wxyz=-gaussians.quats_wxyz)).beyond(bound)
+    broken = replace(gaussians, opacities=np.full(4, np.nan, np.float32))
+    assert [line.split()[0] for line in differences(gaussians, broken).beyond(bound)] == ["opacity"]
+
+
+def test_the_nearest_isotropic_set_keeps_volume_mean_colour_and_opacity() -> None:
+    gaussians = replace(
+        gaussian_set(1), scales=np.array([[0.01, 0.02, 0.04]], np.float32), opacities=np.array([0.3], np.float32)
+    )
+    splats = nearest_splats(gaussians)
+    assert splats.radii[0] == pytest.approx(0.02, rel=1e-6)
+    np.testing.assert_allclose(splats.colors, 0.5 + 0.28209479 * gaussians.harmonics[:, 0], rtol=1e-6)
+    assert splats.opacities[0] == np.float32(0.3)
+    with pytest.raises(InputError, match="got 1 of 1 whose scales differ and 1 whose colour depends on the side; "):
+        as_splats(gaussians, "a.ply")
+
+
+def test_a_ply_without_rotation_is_read_where_it_is_round_and_refused_where_not(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", splat_set(3), {})
+    without = (tmp_path / "a.ply").read_bytes().replace(b"float rot_", b"float was_")
+    (tmp_path / "a.ply").write_bytes(without)
+    assert isinstance(read_splats(tmp_path / "a.ply")[0], SplatSet)
+    write_gaussian_ply(tmp_path / "b.ply", gaussian_set(3), {})
+    (tmp_path / "b.ply").write_bytes((tmp_path / "b.ply").read_bytes().replace(b"float rot_", b"float was_"))
+    with pytest.raises(InputError, match="missing properties rot_0 rot_1 rot_2 rot_3"):
+        read_splats(tmp_path / "b.ply")
+
+
+def test_an_unknown_suffix_names_the_known() -> None:
+    with pytest.raises(UsageError, match=r"a\.stl: expected a suffix of \.ply, \.splat, \.spz, .*, got \.stl"):
+        format_of(Path("a.stl"))
+    with pytest.raises(InputError, match=r"a\.txt: expected a suffix of \.ply, .*, got \.txt"):
+        read_splats(Path("a.txt"))
+    assert format_of(Path("a")) is FORMATS[".ply"]
+
+
+def test_without_the_usd_library_the_remedy_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+    with pytest.raises(UsageError, match=r"usd-core is not installed; pip install 'splatctrl-cli\[usd\]'"):
+        usd.write_usd(tmp_path / "a.usdc", gaussian_set(1), {}, suffix=".usdc")
