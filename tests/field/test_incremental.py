@@ -89,11 +89,12 @@ def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distanc
 
 def test_an_edit_is_baked_as_far_as_its_kernel_reaches() -> None:
     """One of two splats goes, ten length scales apart: beyond the reach of their weights, not of their field."""
-    length, extent = 0.2, np.array([2.2, 0.07, 0.07])
-    layout = GridLayout.over(Box(lower=np.zeros(3), upper=extent), 0.01)
-    before = splat_set(np.array([[0.1, 0.03, 0.03], [0.1 + 10 * length, 0.03, 0.03]]), np.full(2, 0.01))
+    length, voxel, extent = 0.2, 0.005, np.array([2.2, 0.035, 0.035])
+    layout = GridLayout.over(Box(lower=np.zeros(3), upper=extent), voxel)
+    before = splat_set(np.array([[0.1, 0.015, 0.015], [0.1 + 10 * length, 0.015, 0.015]]), np.full(2, 0.01))
     after = before.select(np.array([False, True]))
-    config, channels = replace(CONFIG, voxel=0.01, distance="se", length_scale=length), ("sdf", "se")
+    config = replace(CONFIG, voxel=voxel, distance="se", length_scale=length, truncation=1e-8)
+    channels = ("sdf", "se")
     old, new, full = (Baker(splats, layout, config, channels=channels) for splats in (before, after, after))
     arrays, expected = old.allocate(layout.shape[0]), full.allocate(layout.shape[0])
     old.bake(0, layout.shape[0], arrays)
