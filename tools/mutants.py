@@ -98,7 +98,7 @@ def tested(copy: Path, files: Sequence[Path], limit_s: float, *, plain: bool = F
 
 
 def build(copy: Path) -> str:
-    """Compile the plain kernels of the copy; empty, or what the compiler says."""
+    """Compile the plain kernels of the copy; empty, or the first error."""
     folder = copy / "build"
     steps = [["cmake", "-S", str(copy), "-B", str(folder), "-G", "Ninja", f"-DPython_EXECUTABLE={sys.executable}"]]
     steps = [] if folder.is_dir() else steps
@@ -106,7 +106,8 @@ def build(copy: Path) -> str:
     for step in [*steps, ["cmake", "--build", str(folder), "--target", "_native_base"]]:
         done = subprocess.run(step, env=os.environ | {"PATH": path}, capture_output=True, text=True, check=False)
         if done.returncode:
-            return done.stdout + done.stderr
+            said = (done.stdout + done.stderr).splitlines()
+            return next((line for line in said if "error" in line), "\n".join(said))
     for library in folder.glob("_native_base*.so"):
         shutil.copy(library, copy / "splatctrl_cli" / "kernels")
     return ""

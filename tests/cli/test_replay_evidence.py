@@ -45,6 +45,14 @@ class FilmedSource(FakeSource):
         yield from both
 
 
+def test_what_is_within_reach_of_a_sphere_anywhere_in_its_cell_is_near() -> None:
+    swept = replay_evidence.Swept(np.zeros((1, 3)), np.array([0.05]), reach=0.1)
+    corners = replay_evidence.CELL * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 1]])
+    reached = corners + 0.149 * np.array([[-1.0, 0, 0], [1, 0, 0], [3**-0.5] * 3])
+    assert len(swept.near(reached)) == 3
+    assert len(swept.near(np.array([[0.22, 0.0, 0.0]]))) == 0
+
+
 def view(stamp_ns: int, depth: float | Float64, eye: Float64 = FROM, camera: str = "cam9") -> RgbdFrame:
     """A narrow view straight down."""
     return RgbdFrame(

@@ -87,23 +87,23 @@ def test_an_update_equals_the_full_bake_to_the_bit(kind: str, seed: int, distanc
         assert (changes.num_baked > 0) == (kind != "order")
 
 
-@pytest.mark.parametrize("length", [0.03, 0.05])
-def test_an_edit_is_baked_as_far_as_its_kernel_reaches(length: float) -> None:
-    before = splat_set(*cloud(400))
-    is_kept = np.ones(len(before), bool)
-    is_kept[np.argsort(before.centers[:, 0])[-3:]] = False
-    after, config, channels = (
-        before.select(is_kept),
-        replace(CONFIG, distance="se", length_scale=length),
-        ("sdf", "se"),
-    )
-    old, new = (Baker(splats, LAYOUT, config, channels=channels) for splats in (before, after))
-    arrays = whole(old)
+def test_an_edit_is_baked_as_far_as_its_kernel_reaches() -> None:
+    """One of two splats goes, ten length scales apart: beyond the reach of their weights, not of their field."""
+    length, voxel, extent = 0.2, 0.005, np.array([2.2, 0.035, 0.035])
+    layout = GridLayout.over(Box(lower=np.zeros(3), upper=extent), voxel)
+    before = splat_set(np.array([[0.1, 0.015, 0.015], [0.1 + 10 * length, 0.015, 0.015]]), np.full(2, 0.01))
+    after = before.select(np.array([False, True]))
+    config = replace(CONFIG, voxel=voxel, distance="se", length_scale=length, truncation=1e-8)
+    channels = ("sdf", "se")
+    old, new, full = (Baker(splats, layout, config, channels=channels) for splats in (before, after, after))
+    arrays, expected = old.allocate(layout.shape[0]), full.allocate(layout.shape[0])
+    old.bake(0, layout.shape[0], arrays)
+    full.bake(0, layout.shape[0], expected)
     changes = changed_blocks(before, old, after, new)
     assert changes.mask is not None
     assert 0.5 < changes.num_baked / changes.num_blocks < 1.0
-    new.bake(0, LAYOUT.shape[0], arrays, changes.mask)
-    for name, values in whole(Baker(after, LAYOUT, config, channels=channels)).items():
+    new.bake(0, layout.shape[0], arrays, changes.mask)
+    for name, values in expected.items():
         assert arrays[name].tobytes() == values.tobytes(), name
 
 

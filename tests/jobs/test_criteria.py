@@ -12,7 +12,7 @@ from splatctrl_cli.control.explain import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs import evidence_criteria as evidence
-from splatctrl_cli.jobs.motion_criteria import controller
+from splatctrl_cli.jobs.motion_criteria import controller, surface_clearance
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)
@@ -72,6 +72,33 @@ def test_a_step_of_any_kind_that_is_not_solved_fails_the_controller(what: str) -
     (reason,) = controller(run)
     assert reason.outcome is Outcome.FAILED
     assert f"at 2 {what.replace('_', ' ')} of 5 steps" in reason.sentence
+
+
+def bodied(deficit: tuple[float, float], surface: float) -> Any:
+    """A run whose spheres keep 30 mm and whose surface keeps less, by two spheres of which each leaves something."""
+    model = SimpleNamespace(
+        moving_spheres=np.array([True, True]),
+        sphere_deficit=np.array(deficit),
+        coverage=None,
+        coverage_unknown="no meshes",
+    )
+    between = {"surface": np.full(NUM, surface), "lower": np.full(NUM - 1, surface)}
+    run = judged(model=model, margin=0.02, between=between)
+    run.replay.audit.clearance = {"exact": SimpleNamespace(distance=np.full(NUM, 0.03))}
+    run.threshold = 0.019
+    return run
+
+
+@pytest.mark.parametrize(("surface", "outcome"), [(0.015, Outcome.NOT_EVALUABLE), (0.025, Outcome.PASSED)])
+def test_what_the_spheres_leave_uncovered_must_keep_the_margin_too(surface: float, outcome: Outcome) -> None:
+    (reason,) = surface_clearance(bodied((0.0, 0.005), surface))
+    assert (reason.criterion, reason.outcome) == ("surface clearance", outcome)
+
+
+def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
+    (reason,) = surface_clearance(bodied((0.0, np.nan), 0.025))
+    assert reason.outcome is Outcome.NOT_EVALUABLE
+    assert "is not known: no meshes" in reason.sentence
 
 
 def test_one_state_judged_by_an_old_map_is_enough() -> None:

@@ -82,7 +82,10 @@ def test_a_scene_that_belongs_to_its_log_is_safe(stage: Stage) -> None:
 
 NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
     "other digests": (lambda s: of_run(s, inputs={"fake.mcap": "1" * 64}), "was made from another recording"),
-    "another robot": (lambda s: of_run(s, metrics={"robot_joints": ["a", "b"]}), "another robot, with joints a, b"),
+    "another robot": (
+        lambda s: of_run(s, metrics={"robot_joints": list("abcdefg")}),
+        "another robot, with joints a, b",
+    ),
     "no digests": (without_digests, "is of an earlier version"),
     "millimetres": (lambda s: splats_changed(s, lambda splats: moved(splats, 1e3)), "splats and occupancy disagree"),
     "moved by 3 m": (
@@ -95,6 +98,16 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "no snapshot left": (lambda s: (emptied(s), of_run(s, parts=part_digests(s)))[1], "has no snapshot"),
 }
+
+
+@pytest.mark.parametrize(("late_s", "outcome"), [(1, []), (4, ["not evaluable"])])
+def test_states_seconds_after_the_last_map_are_of_another_recording(
+    stage: Stage, late_s: int, outcome: list[str]
+) -> None:
+    stage.states = states_on(np.tile(START, (11, 1)), start_ns=late_s * SECOND)
+    _, verdict = stage.judged("--max-map-age", "99")
+    assert [of for criterion, of in decisive(verdict).items() if criterion == "evidence"] == outcome
+    assert not outcome or "are of different times" in str(verdict["reasons"])
 
 
 @pytest.mark.parametrize("name", NOT_ITS_OWN)

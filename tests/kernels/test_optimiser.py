@@ -123,3 +123,13 @@ def test_the_regulariser_lowers_opacity() -> None:
     before = p.copy()
     stepped(p, moments(len(p)), settings(regulariser=0.01), np.zeros((5, 32, 48), np.float32))
     assert (p[:, 7] < before[:, 7]).all()
+
+
+def test_colours_stay_in_their_range() -> None:
+    for sign, end in ((-1.0, 1.0), (1.0, 0.0)):
+        p = splats()
+        p[:15, 4:7], p[15:, 4:7] = end, 0.5
+        for _ in range(3):
+            stepped(p, moments(len(p)), settings(), np.full((5, 32, 48), sign, np.float32))
+        assert (p[:15, 4:7] == end).all()
+        assert (sign * (p[15:, 4:7] - 0.5) < 0.0).all()
