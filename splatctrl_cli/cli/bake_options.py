@@ -4,16 +4,15 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import add_config, add_gates, add_output
 from splatctrl_cli.cli.numbers import MAX_SECONDS, real, setting, words
-from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.records import Box, Label, SplatSet
+from splatctrl_cli.field.layout import bounding_box, check_loss
+from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.records import Box, Label, SplatSet
+from splatctrl_cli.robot.model import RobotModel
 
 # As the rooms have them, which --help does not wait for; a test holds these to those.
 CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label", "hard", "se", "gpdf")
@@ -129,8 +128,6 @@ def names_of(text: str, choices: Sequence[str], option: str) -> tuple[str, ...]:
 
 def labels_of(text: str) -> "frozenset[Label]":
     """The labels in the field: objects, and those that --include names."""
-    from splatctrl_cli.records import Label
-
     if text.strip() == "none":
         return frozenset({Label.OBJECT})
     names = names_of(text, ("robot", "human"), "--include")
@@ -155,8 +152,6 @@ def channels_of(args: argparse.Namespace, default: Sequence[str], unknown: str) 
 
 def with_options(config: "Config", args: argparse.Namespace) -> "Config":
     """The configuration with what the options say of the field. Raises UsageError for cells that are too coarse."""
-    from splatctrl_cli.field.layout import check_loss
-
     names = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")
     given = {name: getattr(args, name) for name in names}
     field: FieldConfig = replace(config.field, **{name: value for name, value in given.items() if value is not None})
@@ -166,15 +161,9 @@ def with_options(config: "Config", args: argparse.Namespace) -> "Config":
 
 def box_of(args: argparse.Namespace, splats: "SplatSet", labels: "frozenset[Label]", padding: float) -> "Box":
     """What the grid covers: --box, the reach of the robot, or the splats and `padding` [m] around them."""
-    from splatctrl_cli.field.layout import bounding_box
-    from splatctrl_cli.field.selection import field_splats
-    from splatctrl_cli.records import Box
-
     if args.box is not None:
         return Box.from_text(args.box)
     if args.urdf is not None:
-        from splatctrl_cli.robot.model import RobotModel
-
         robot = RobotModel.from_urdf(args.urdf, args.spheres)
         return Box(lower=robot.base_position - robot.reach(), upper=robot.base_position + robot.reach())
     return bounding_box(field_splats(splats, labels), padding)

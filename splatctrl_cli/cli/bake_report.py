@@ -3,17 +3,20 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatctrl_cli.cli.common import table
-
-if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy
-    from splatctrl_cli.evaluate.verdict import Verdict
-    from splatctrl_cli.field.incremental import Changes
-    from splatctrl_cli.field.report import GridStatistics
-    from splatctrl_cli.records import DistanceGrid
-    from splatctrl_cli.report.reliability import Reliability
+from splatctrl_cli.cli.field_truth import FIELDS
+from splatctrl_cli.evaluate import field_accuracy
+from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy, band_name
+from splatctrl_cli.evaluate.gates import gate_reasons
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.field.incremental import Changes
+from splatctrl_cli.field.layout import LOSS
+from splatctrl_cli.field.report import GridStatistics
+from splatctrl_cli.records import DistanceGrid
+from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
+from splatctrl_cli.report.reliability import Reliability, reliability_picture
 
 SUMMARY_METRICS = (
     *("num_splats", "num_splats_left_out", "num_cells", "voxel", "length_scale", "median_radius", "median_spacing"),
@@ -107,10 +110,6 @@ def bake_verdict(
 
     has_occupancy: whether it is known what cameras saw.
     """
-    from splatctrl_cli.evaluate.gates import gate_reasons
-    from splatctrl_cli.evaluate.verdict import Outcome, Reason, noted, verdict_of
-    from splatctrl_cli.field.layout import LOSS
-
     summary = report.summary()
     num_cells, unseen, loss = summary["num_cells"], summary["never_seen_share"], LOSS * summary["voxel"]
     reasons = [
@@ -147,10 +146,7 @@ def bake_verdict(
 
 def metric_names(*, with_truth: bool) -> tuple[str, ...]:
     """The names of `metrics`, known before anything is baked."""
-    from splatctrl_cli.cli.field_truth import FIELDS
-    from splatctrl_cli.evaluate.field_accuracy import metric_names
-
-    return (*SUMMARY_METRICS, *(metric_names(FIELDS) if with_truth else ()))
+    return (*SUMMARY_METRICS, *(field_accuracy.metric_names(FIELDS) if with_truth else ()))
 
 
 def metrics(summary: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> dict[str, float | None]:
@@ -158,8 +154,6 @@ def metrics(summary: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> d
 
     accuracy: of the comparison with the truth, None without one.
     """
-    from splatctrl_cli.evaluate.field_accuracy import band_name
-
     figures: dict[str, float | None] = {name: summary[name] for name in SUMMARY_METRICS}
     if accuracy is None:
         return figures
@@ -196,8 +190,6 @@ def reference_lines(accuracy: "FieldAccuracy", what: str) -> list[str]:
 
 def write_pictures(folder: Path, report: FieldReport, point: Sequence[float]) -> None:
     """Slices through `point` [m], the gradient, and what else the grid has, into ``folder/report``."""
-    from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
-
     pictures = folder / "report"
     pictures.mkdir()
     grid = report.grid
@@ -208,8 +200,6 @@ def write_pictures(folder: Path, report: FieldReport, point: Sequence[float]) ->
     if "probability" in grid.channels:
         probability_picture(pictures / "probability.png", grid, point)
     if report.reliability:
-        from splatctrl_cli.report.reliability import reliability_picture
-
         reliability_picture(pictures / "reliability.png", report.reliability, "Probability against the truth")
 
 

@@ -5,16 +5,17 @@ import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from tqdm import tqdm
 
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.field.baker import Baker
-    from splatctrl_cli.field.layout import GridLayout
-    from splatctrl_cli.field.slabs import Kept, UnknownSpace
-    from splatctrl_cli.grid_files.grid_slabs import GridSlabs
+from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.layout import GridLayout, available_memory
+from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.files.output import write_durably, write_json
+from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
@@ -43,11 +44,6 @@ def bake_to_disk(task: BakeTask, partial: Path, console: Console, *, resume: boo
     With `resume` it goes on after the last slab that an interrupted bake of the same settings left. Raises UsageError
     for one of other settings, and where the disk or the memory has no room.
     """
-    from tqdm import tqdm
-
-    from splatctrl_cli.field.slabs import baked_planes, check_slab_memory, slabs
-    from splatctrl_cli.grid_files.grid_slabs import SlabPlan, resume_slabs, start_slabs
-
     baker, folder = task.baker, partial / FOLDER
     layout = baker.layout
     check_slab_memory(layout, baker.channels)
@@ -88,8 +84,6 @@ def clear_leftovers(partial: Path) -> None:
 
 def check_disk(folder: Path, layout: "GridLayout", channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where the channels and the files made of them do not fit the disk."""
-    from splatctrl_cli.field.slabs import bytes_per_cell
-
     per_cell = bytes_per_cell(channels)
     copies = per_cell * sum(name in WHOLE_FORMATS for name in formats) + 4 * ("curobo" in formats)
     needed = (per_cell + copies) * layout.num_cells + SPARE
@@ -105,9 +99,6 @@ def check_disk(folder: Path, layout: "GridLayout", channels: Collection[str], fo
 
 def check_vdb(layout: "GridLayout", channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where OpenVDB is asked for and cannot hold the grid in memory, as its library does."""
-    from splatctrl_cli.field.layout import available_memory
-    from splatctrl_cli.field.slabs import bytes_per_cell
-
     needed, free = VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, available_memory()
     if "vdb" in formats and needed > free:
         raise UsageError(
@@ -137,6 +128,4 @@ def _counts(folder: Path) -> dict[str, dict[str, int]]:
 
 
 def _write_counts(folder: Path, counts: Mapping[str, Mapping[str, int]]) -> None:
-    from splatctrl_cli.files.output import write_durably, write_json
-
     write_durably(folder / COUNTS, lambda path: write_json(path, counts))

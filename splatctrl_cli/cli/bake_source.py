@@ -3,8 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.files.output import sha256
 from splatctrl_cli.records import Balls, Box, OccupancyGrid, SplatSet
+from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.splat_files.splats import read_world_splats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +35,6 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
     Raises InputError for what is not there or not a scene, UsageError for a time in a bare file, NotEvaluableError
     for a time before the first snapshot.
     """
-    from splatctrl_cli.files.output import sha256
-    from splatctrl_cli.splat_files.splats import read_world_splats
-
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="give what reconstruct wrote, or a splats.ply")
     if path.is_dir():
@@ -51,9 +53,6 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
 
 
 def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
-    from splatctrl_cli.files.output import sha256
-    from splatctrl_cli.scene_files.scene_folder import open_scene
-
     scene = open_scene(path)
     final = scene.occupancy()
     occupancy: OccupancyGrid | None
@@ -82,8 +81,6 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
 
 def _workspace(occupancy: OccupancyGrid) -> Box:
     """The box of the occupancy grid, less a voxel at every border (a surface there may have splats beyond it)."""
-    import numpy as np
-
     num_voxels = np.array(occupancy.log_odds.shape)
     lower = occupancy.origin + 0.5 * occupancy.voxel
     return Box(lower=lower, upper=lower + occupancy.voxel * (num_voxels - 2))

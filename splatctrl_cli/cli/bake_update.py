@@ -3,15 +3,20 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from splatctrl_cli import __version__
+from splatctrl_cli.cli.bake_source import BakeSource, read_bake_source
+from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.cli.bake_source import BakeSource
-    from splatctrl_cli.config import FieldConfig
-    from splatctrl_cli.field.layout import GridLayout
-    from splatctrl_cli.records import Box, DistanceGrid
+from splatctrl_cli.field.layout import GridLayout, available_memory
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.parts import Parts
+from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.records import Box, DistanceGrid
+from splatctrl_cli.scene_files.scene_folder import open_scene
 
 NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell
 
@@ -29,8 +34,6 @@ class Previous:
     @property
     def box(self) -> "Box":
         """The box of the cell centres: a grid over it, with the same voxel, has the same cells."""
-        from splatctrl_cli.records import Box
-
         shape = self.grid.channels["sdf"].shape
         upper = [o + self.grid.voxel * (n - 1) for o, n in zip(self.grid.origin.tolist(), shape, strict=True)]
         return Box(lower=self.grid.origin, upper=self.grid.origin * 0 + upper)
@@ -42,11 +45,6 @@ def read_previous(path: Path, scene: Path) -> Previous:
     Raises InputError for a field that is not there, damaged or foreign, UsageError where the scene is not its own or
     another version baked it.
     """
-    from splatctrl_cli import __version__
-    from splatctrl_cli.files.output import sha256
-    from splatctrl_cli.files.parts import Parts
-    from splatctrl_cli.grid_files.grid import read_npz
-
     if not path.is_dir():
         raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
     file = path / "field.npz"
@@ -70,8 +68,6 @@ def check_same(
     previous: Previous, layout: "GridLayout", config: "FieldConfig", channels: tuple[str, ...], labels: list[str]
 ) -> None:
     """Raise UsageError naming what differs between the bake before and this one."""
-    import numpy as np
-
     grid = previous.grid
     before: dict[str, object] = {"field.voxel": grid.voxel, "cells": " x ".join(map(str, grid.channels["sdf"].shape))}
     now: dict[str, object] = {"field.voxel": layout.voxel, "cells": " x ".join(map(str, layout.shape))}
@@ -103,8 +99,6 @@ def _run_of(folder: Path) -> dict[str, Any]:
 
 
 def _check_memory(file: Path) -> None:
-    from splatctrl_cli.field.layout import available_memory
-
     needed, free = file.stat().st_size, available_memory()
     if needed > free:
         raise UsageError(
@@ -115,9 +109,6 @@ def _check_memory(file: Path) -> None:
 
 def _its_source(path: Path, grid: "DistanceGrid", scene: Path) -> "BakeSource":
     """The splats of `scene` at the field's time. Raises UsageError where they are not those it was baked from."""
-    from splatctrl_cli.cli.bake_source import read_bake_source
-    from splatctrl_cli.scene_files.scene_folder import open_scene
-
     digests, stamp_ns = grid.header.get("digests"), grid.header.get("stamp_ns")
     wanted = next(iter(digests.values()), None) if isinstance(digests, dict) else None
     source = read_bake_source(scene, None)

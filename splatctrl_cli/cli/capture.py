@@ -3,16 +3,15 @@
 import argparse
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output
+from splatctrl_cli.captures.capture_pack import pack_capture, unpack_capture
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_named, add_output
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import output_path
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand and its actions to the parser."""
-    summary = "pack a capture into one MCAP that viewers open, and unpack it"
-    parser = subparsers.add_parser(
-        "capture", help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False
-    )
+    parser = add_named(subparsers, "capture")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     pack = add_command(actions, "pack", run_pack, summary="write a capture as one MCAP")
     pack.add_argument("capture", type=Path, help="capture folder")
@@ -24,9 +23,6 @@ def register(subparsers: Subparsers) -> None:
 
 def run_pack(args: argparse.Namespace) -> int:
     """Run the action and return its exit code."""
-    from splatctrl_cli.captures.capture_pack import pack_capture
-    from splatctrl_cli.files.output import output_path
-
     console = Console(args)
     if not args.capture.is_dir():
         raise InputError(f"{args.capture}: no such folder", remedy="expected what `splatctrl ingest` writes")
@@ -45,9 +41,6 @@ def run_pack(args: argparse.Namespace) -> int:
 
 def run_unpack(args: argparse.Namespace) -> int:
     """Run the action and return its exit code."""
-    from splatctrl_cli.captures.capture_pack import unpack_capture
-    from splatctrl_cli.files.output import output_path
-
     if not args.packed.is_file():
         raise InputError(f"{args.packed}: no such file", remedy="expected what `splatctrl capture pack` writes")
     out = args.out or Path(args.packed.stem + ".capture")

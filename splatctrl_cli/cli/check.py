@@ -6,20 +6,22 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from splatctrl_cli.checks.check_log import check_log
+from splatctrl_cli.checks.check_report import CheckReport
+from splatctrl_cli.checks.check_source import check_source
+from splatctrl_cli.checks.check_times import Rate
+from splatctrl_cli.checks.finding import Finding, Severity, error, note
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
 from splatctrl_cli.cli.numbers import several
 from splatctrl_cli.cli.robot_options import add_lock, locked_joints
 from splatctrl_cli.cli.source_options import add_source, source_options
 from splatctrl_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.checks.check_report import CheckReport
-    from splatctrl_cli.checks.check_times import Rate
-    from splatctrl_cli.checks.finding import Finding
-    from splatctrl_cli.evaluate.verdict import Verdict
-    from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.consistency import CAUSES, agreements
+from splatctrl_cli.sources.source import open_logs
 
 QUICK = 30  # images of a topic
 WIDTH = 118  # columns of text
@@ -28,7 +30,7 @@ RANGE = (0.2, 6.0)  # [m] of depth that is compared between views
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "check", run, summary="say what is wrong with a log, capture or image folder")
+    parser = add_command(subparsers, "check", run)
     parser.add_argument(
         "source",
         type=Path,
@@ -69,10 +71,6 @@ def _num_images(text: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.checks.check_log import check_log
-    from splatctrl_cli.checks.check_source import check_source
-    from splatctrl_cli.sources.source import open_logs
-
     if args.quick is not None and args.quick < 1:
         raise UsageError(f"--quick {args.quick}: expected 1 or more")
     options, model = source_options(args), _robot(args)
@@ -90,9 +88,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _verdict(report: "CheckReport", *, fail_on: str) -> "Verdict":
     """Of the findings: errors, and warnings where asked for, fail; the other warnings are notes."""
-    from splatctrl_cli.checks.finding import Severity
-    from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
-
     fatal = {Severity.ERROR, *([Severity.WARNING] if fail_on == "warning" else [])}
     read = Reason(
         criterion="messages",
@@ -128,9 +123,6 @@ def _robot(args: argparse.Namespace) -> "RobotModel | None":
         if given or args.lock:
             raise UsageError(f"--{(given or ['lock'])[0]}: expected --urdf beside it")
         return None
-    from splatctrl_cli.geometry import transform_from
-    from splatctrl_cli.robot.model import RobotModel
-
     base = None if args.base is None else _seven(args.base)
     T_world_base = None if base is None else transform_from(base[:3], base[3:])
     return RobotModel.from_urdf(args.urdf, args.spheres, T_world_base=T_world_base, locked=locked_joints(args.lock))
@@ -145,9 +137,6 @@ def _seven(text: str) -> tuple[float, ...]:
 
 def _agreement(report: "CheckReport") -> list["Finding"]:
     """Whether views agree on where the surfaces are that both see."""
-    from splatctrl_cli.checks.finding import Finding, error, note
-    from splatctrl_cli.scene.consistency import CAUSES, agreements
-
     findings: list[Finding] = []
     good: list[float] = []
     for pair in agreements(list(report.frames), *RANGE):

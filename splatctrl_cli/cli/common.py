@@ -6,26 +6,32 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatctrl_cli.cli.numbers import MAX_SEED, whole
+from splatctrl_cli.cli.parser import COMMANDS
+from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.evaluate.gates import gate
-
-if TYPE_CHECKING:
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.verdict import Verdict
 
 MAX_REASONS = 10  # printed; --json and summary.json have all
 Subparsers = Any  # argparse keeps its subparser type private
 
 
-def add_command(
-    subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int], *, summary: str
-) -> argparse.ArgumentParser:
-    """A subcommand's parser with the options every command has: --json, -v, -q."""
+def add_named(subparsers: Subparsers, name: str, summary: str = "") -> argparse.ArgumentParser:
+    """The parser of a subcommand, or of an action of one with a summary of its own."""
+    summary = summary or COMMANDS[name]
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name, help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False
     )
+    return parser
+
+
+def add_command(
+    subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int], *, summary: str = ""
+) -> argparse.ArgumentParser:
+    """The same, with what runs it and the options that every command has: --json, -v, -q."""
+    parser = add_named(subparsers, name, summary)
     parser.set_defaults(run=run)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; show tracebacks")
@@ -73,8 +79,6 @@ def add_gates(parser: argparse.ArgumentParser) -> None:
 
 def configured(args: argparse.Namespace) -> "Config":
     """The configuration that --config and --set give."""
-    from splatctrl_cli.config import load_config
-
     return load_config(args.config, args.set)
 
 

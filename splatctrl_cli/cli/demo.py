@@ -9,15 +9,22 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, add_threads
+from splatctrl_cli.cli.main import build_parser
 from splatctrl_cli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.verdict import Reason
-    from splatctrl_cli.records import RgbdFrame, SplatSet
-    from splatctrl_cli.report.pictures import ComparisonRow
+from splatctrl_cli.evaluate.images import psnr
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
+from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.records import JointState, RgbdFrame, SplatSet
+from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.render import render
+from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.sources.source import open_source
 
 TRAINING, SCORING = "cam0,cam1,cam2", "cam3"
 CLOSED_LOOP_START = "1.6"  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
@@ -34,7 +41,7 @@ SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "demo", run, summary="run the main job on a sample recording, with pictures")
+    parser = add_command(subparsers, "demo", run)
     parser.add_argument(
         "--data",
         type=Path,
@@ -48,9 +55,6 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.evaluate.verdict import verdict_of
-    from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
-
     console, stopwatch, start = Console(args), Stopwatch(), time.perf_counter()
     out = args.out or Path("demo_output")
     missing = [name for name in INPUTS if not (args.data / name).is_file()]
@@ -108,9 +112,6 @@ def _commands(data: Path, out: Path, threads: int) -> list[list[str]]:
 
 def _run(command: Sequence[str], console: Console, folder: Path, out: Path) -> "Reason":
     """One subcommand as a person would type it; whether it ends as expected."""
-    from splatctrl_cli.cli.main import build_parser
-    from splatctrl_cli.evaluate.verdict import Outcome, Reason
-
     shown = [part.replace(str(folder), str(out)) for part in command]
     console.log(f"\n$ splatctrl {shlex.join(shown)}")
     is_silent = console.is_quiet or console.is_json
@@ -141,15 +142,6 @@ def _run(command: Sequence[str], console: Console, folder: Path, out: Path) -> "
 
 def _pictures(data: Path, out: Path, threads: int) -> dict[str, str]:
     """Draw what the demo shows; file names under `out`, with a description each."""
-    import numpy as np
-
-    from splatctrl_cli.grid_files.grid import read_npz
-    from splatctrl_cli.records import JointState, RgbdFrame
-    from splatctrl_cli.report.pictures import comparison_picture, field_slice_picture
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.scene_files.scene_folder import open_scene
-    from splatctrl_cli.sources.source import open_source
-
     newest: dict[str, RgbdFrame] = {}
     joints: JointState | None = None
     source = open_source(out / "tabletop.capture")
@@ -182,10 +174,6 @@ def _pictures(data: Path, out: Path, threads: int) -> dict[str, str]:
 
 
 def _comparison(frame: "RgbdFrame", splats: "SplatSet", threads: int) -> "ComparisonRow":
-    from splatctrl_cli.evaluate.images import psnr
-    from splatctrl_cli.report.pictures import ComparisonRow
-    from splatctrl_cli.scene.render import render
-
     view = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
     is_mapped = view.opacity >= 0.5
     figure = psnr(view.color, frame.color / 255.0, is_mapped)

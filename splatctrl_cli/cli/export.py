@@ -4,15 +4,18 @@ import argparse
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output
 from splatctrl_cli.cli.export_check import check, check_colors, compare, difference_table
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.records import GaussianSet, SplatSet
-    from splatctrl_cli.splat_files.splat_formats import SplatFormat
+from splatctrl_cli.files.output import output_path, sha256
+from splatctrl_cli.records import GaussianSet, Label, SplatSet
+from splatctrl_cli.splat_files.isotropic import as_gaussians, as_splats, nearest_splats
+from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, SplatFormat, format_of, read_splats
+from splatctrl_cli.splat_files.splats import read_ply, write_ply
 
 LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
 SUFFIXES = ".ply, .splat, .spz, .glb, .usda, .usdc"
@@ -20,9 +23,7 @@ SUFFIXES = ".ply, .splat, .spz, .glb, .usda, .usdc"
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(
-        subparsers, "export", run, summary="write splats as PLY, .splat, .spz, glTF or USD, and check what reads back"
-    )
+    parser = add_command(subparsers, "export", run)
     parser.add_argument("scene", type=Path, metavar="SCENE", help=f"a scene folder, or a splat file: {SUFFIXES}")
     parser.add_argument(
         "--labels",
@@ -47,9 +48,6 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.files.output import output_path, sha256
-    from splatctrl_cli.splat_files.splat_formats import read_splats
-
     source = _splat_file(args.scene)
     out = args.out or _beside(args.scene)
     kind = _format(out, args.layout)
@@ -124,8 +122,6 @@ def _splat_file(scene: Path) -> Path:
 
 
 def _format(out: Path, layout: str | None) -> "SplatFormat":
-    from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, format_of
-
     kind = format_of(out)
     if layout is not None and kind is not FORMATS[".ply"]:
         raise UsageError(f"--layout {layout}: {out} is no PLY", remedy="leave it out")
@@ -133,8 +129,6 @@ def _format(out: Path, layout: str | None) -> "SplatFormat":
 
 
 def _check_layout(layout: str | None, chosen: "SplatSet | GaussianSet", source: Path) -> None:
-    from splatctrl_cli.records import GaussianSet
-
     if layout == "short" and isinstance(chosen, GaussianSet):
         raise UsageError(
             f"--layout short: expected isotropic splats, {source} has {len(chosen)} Gaussians that are not all so",
@@ -144,17 +138,10 @@ def _check_layout(layout: str | None, chosen: "SplatSet | GaussianSet", source: 
 
 def _round(splats: "SplatSet | GaussianSet") -> "SplatSet | GaussianSet":
     """The nearest isotropic set; splats that are isotropic as they are."""
-    from splatctrl_cli.records import GaussianSet
-    from splatctrl_cli.splat_files.isotropic import nearest_splats
-
     return nearest_splats(splats) if isinstance(splats, GaussianSet) else splats
 
 
 def _select(splats: "SplatSet | GaussianSet", names: str | None) -> "SplatSet | GaussianSet":
-    import numpy as np
-
-    from splatctrl_cli.records import Label
-
     if names is None:
         return splats
     known = {label.name.lower(): label for label in Label}
@@ -169,11 +156,6 @@ def _write(
     partial: Path, kind: "SplatFormat", splats: "SplatSet | GaussianSet", comments: Mapping[str, str]
 ) -> "SplatSet | GaussianSet":
     """Write the splats and return what reads back; isotropic ones in a PLY keep their density."""
-    from splatctrl_cli.records import GaussianSet
-    from splatctrl_cli.splat_files.isotropic import as_gaussians, as_splats
-    from splatctrl_cli.splat_files.splat_formats import FORMATS
-    from splatctrl_cli.splat_files.splats import read_ply, write_ply
-
     if isinstance(splats, GaussianSet):
         kind.write(partial, splats, comments)
         return kind.read(partial)[0]

@@ -1,19 +1,23 @@
 """Whether a written file of splats is its source: every value within the format's bound, and how both look."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import WriteError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, SplatSet
-    from splatctrl_cli.scene.render import Rendering
-    from splatctrl_cli.splat_files.splat_differences import Differences
-    from splatctrl_cli.splat_files.splat_formats import SplatFormat
+from splatctrl_cli.geometry import look_at
+from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, SplatSet
+from splatctrl_cli.scene.gaussians import render_gaussians
+from splatctrl_cli.scene.render import Rendering, render
+from splatctrl_cli.splat_files.isotropic import as_gaussians
+from splatctrl_cli.splat_files.splat_differences import Differences, differences
+from splatctrl_cli.splat_files.splat_formats import SplatFormat
+from splatctrl_cli.splat_files.splat_values import refuse
 
 MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measured: 107 and more, or the same
 MAX_PIXEL_DIFFERENCE = 3 / 255  # there; the last bit can take a splat across the renderer's cut-off of 1/255
@@ -74,28 +78,16 @@ def check(
 
 def check_colors(source: "Path", splats: "SplatSet | GaussianSet") -> None:
     """Raise InputError naming the first splat whose colour no picture has: beside it float32 loses the others."""
-    import numpy as np
-
-    from splatctrl_cli.records import SplatSet
-    from splatctrl_cli.splat_files.splat_values import refuse
-
     colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
     largest = np.abs(colors).max(axis=1, initial=0.0)
     refuse(str(source), "colour", largest, largest > MAX_COLOR, f"at most {MAX_COLOR:g}")
 
 
 def _gaussians(splats: "SplatSet | GaussianSet") -> "GaussianSet":
-    from splatctrl_cli.records import SplatSet
-    from splatctrl_cli.splat_files.isotropic import as_gaussians
-
     return as_gaussians(splats) if isinstance(splats, SplatSet) else splats
 
 
 def _differences(out: "Path", held: "GaussianSet", back: "GaussianSet", bound: "Differences") -> "Differences":
-    import numpy as np
-
-    from splatctrl_cli.splat_files.splat_differences import differences
-
     if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
         raise WriteError(f"{out}: is not its source: {len(back)} of {len(held)} splats, or other labels")
     found = differences(held, back)
@@ -107,8 +99,6 @@ def _differences(out: "Path", held: "GaussianSet", back: "GaussianSet", bound: "
 
 def _not_kept(source: "SplatSet | GaussianSet", back: "SplatSet | GaussianSet", held: "GaussianSet") -> list[str]:
     """What the source has and the format has no place for."""
-    from splatctrl_cli.records import GaussianSet, SplatSet
-
     lost = []
     if (source.labels != back.labels).any():
         lost.append("labels")
@@ -121,8 +111,6 @@ def _not_kept(source: "SplatSet | GaussianSet", back: "SplatSet | GaussianSet", 
 
 def _num_outside(source: "GaussianSet", held: "GaussianSet") -> int:
     """How many Gaussians have a sigma or colour beyond what the format can hold, and were put at its edge."""
-    import numpy as np
-
     harmonics = source.harmonics[:, : held.harmonics.shape[1]]
     is_outside = (held.harmonics != harmonics).any(axis=(1, 2)) | (held.scales != source.scales).any(axis=1)
     return int(np.count_nonzero(is_outside))
@@ -136,10 +124,6 @@ def difference_table(found: Mapping[str, float], allowed: Mapping[str, float]) -
 
 def compare(a: "SplatSet | GaussianSet", b: "SplatSet | GaussianSet") -> Comparison:
     """Renders of both sets, seen from around `a`."""
-    import math
-
-    import numpy as np
-
     intrinsics, poses, size = _views(a.centers)
     largest, covered, squared = 0.0, 0.0, 0.0
     for T_world_camera in poses:
@@ -152,10 +136,6 @@ def compare(a: "SplatSet | GaussianSet", b: "SplatSet | GaussianSet") -> Compari
 
 
 def _render(splats: "SplatSet | GaussianSet", intrinsics: "Intrinsics", T_world_camera: "Float64") -> "Rendering":
-    from splatctrl_cli.records import SplatSet
-    from splatctrl_cli.scene.gaussians import render_gaussians
-    from splatctrl_cli.scene.render import render
-
     if isinstance(splats, SplatSet):
         return render(splats, intrinsics, T_world_camera)
     return render_gaussians(splats, intrinsics, T_world_camera)
@@ -163,11 +143,6 @@ def _render(splats: "SplatSet | GaussianSet", intrinsics: "Intrinsics", T_world_
 
 def _views(centers: "Float32") -> tuple["Intrinsics", "Sequence[Float64]", float]:
     """Cameras evenly around the box that holds most of the splats, from above, and that box's diagonal [m]."""
-    import numpy as np
-
-    from splatctrl_cli.geometry import look_at
-    from splatctrl_cli.records import Intrinsics
-
     lower, upper = np.percentile(centers.astype(np.float64), [2, 98], axis=0)
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
     width, height = IMAGE_SIZE

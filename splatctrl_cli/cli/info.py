@@ -3,26 +3,22 @@
 import argparse
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
 from splatctrl_cli.cli.source_options import add_source, source_options
-
-if TYPE_CHECKING:
-    from splatctrl_cli.files.summary import Summary
+from splatctrl_cli.files.summary import Summary
+from splatctrl_cli.sources.describe import describe
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "info", run, summary="describe a log, capture, scene, grid, robot or other file")
+    parser = add_command(subparsers, "info", run)
     parser.add_argument("path", type=Path, help="file or folder")
     add_source(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.sources.describe import describe
-
     summary = describe(args.path, source_options(args))
     Console(args).result(summary.as_dict(), list(_lines(summary)))
     return 3 if summary.damaged else 0

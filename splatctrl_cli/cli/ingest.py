@@ -7,21 +7,26 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatctrl_cli import __version__
+from splatctrl_cli.captures.capture import CaptureSource, write_capture
+from splatctrl_cli.captures.capture_journal import JOURNAL, read_identity
+from splatctrl_cli.captures.capture_writer import CaptureSummary
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
 from splatctrl_cli.cli.source_options import add_source, source_options
+from splatctrl_cli.datasets.image_folder import HOLDOUT
 from splatctrl_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.captures.capture_writer import CaptureSummary
-    from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
+from splatctrl_cli.jobs.resume import check_same_run
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.sources.source import open_session
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "ingest", run, summary="turn a log or image folder into a capture folder")
+    parser = add_command(subparsers, "ingest", run)
     parser.add_argument(
         "source",
         type=Path,
@@ -38,14 +43,6 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.captures.capture import CaptureSource, write_capture
-    from splatctrl_cli.captures.capture_journal import JOURNAL, read_identity
-    from splatctrl_cli.datasets.image_folder import HOLDOUT
-    from splatctrl_cli.files.output import Stopwatch, output_path, write_run
-    from splatctrl_cli.jobs.resume import check_same_run
-    from splatctrl_cli.logs.ros_log import RosLogSource
-    from splatctrl_cli.sources.source import open_session
-
     console, stopwatch = Console(args), Stopwatch()
     options = source_options(args)
     out = args.out or Path(args.source[0].stem + ".capture")
@@ -110,9 +107,6 @@ def _identity(options: "SourceOptions", inputs: Mapping[str, str]) -> dict[str, 
 @contextmanager
 def _told_how_to_go_on(out: Path) -> Iterator[None]:
     """Says after Ctrl-C what was kept."""
-    from splatctrl_cli.captures.capture_journal import JOURNAL
-    from splatctrl_cli.files.output import partial_path
-
     try:
         yield
     except KeyboardInterrupt:

@@ -1,6 +1,6 @@
 """``splatctrl``: builds the parser, runs one subcommand, turns errors into one line and an exit code.
 
-Nothing heavy is imported here or at the top of a subcommand's file: ``splatctrl --help`` answers at once.
+A subcommand's file is imported when it is named, so ``splatctrl --help`` answers at once.
 """
 
 import argparse
@@ -14,13 +14,8 @@ from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.cli.inputs import refuse_endless_files
-from splatctrl_cli.cli.parser import Parser
+from splatctrl_cli.cli.parser import COMMANDS, Parser
 from splatctrl_cli.errors import SplatCtrlError, UsageError
-
-COMMANDS = (
-    *("simulate", "ingest", "info", "check", "reconstruct", "export", "sdf-bake", "score", "replay", "robot"),
-    *("demo", "capture"),
-)
 
 MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 
@@ -29,10 +24,9 @@ exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 
 damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug; 130 interrupted"""
 
 
-def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
-    """The parser with the one subcommand that `words` begin with, where they begin with one, else with all.
-
-    So a run neither waits for the files of the other subcommands nor fails with them.
+def build_parser(words: Sequence[str] | None = None) -> argparse.ArgumentParser:
+    """The parser with all subcommands and their options, or with those of the one that `words` begin with alone: a
+    run neither waits for the files of the other subcommands nor fails with them.
     """
     parser = Parser(
         prog="splatctrl",
@@ -43,10 +37,12 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"splatctrl {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    named = [command for command in COMMANDS if [command] == list(words[:1])]
-    for command in named or COMMANDS:
-        module = importlib.import_module(f"splatctrl_cli.cli.{command.replace('-', '_')}")
-        module.register(subparsers)
+    for command, summary in COMMANDS.items():
+        if words is None or [command] == list(words[:1]):
+            module = importlib.import_module(f"splatctrl_cli.cli.{command.replace('-', '_')}")
+            module.register(subparsers)
+        else:
+            subparsers.add_parser(command, help=summary, add_help=False)
     return parser
 
 

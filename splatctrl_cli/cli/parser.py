@@ -9,6 +9,22 @@ from typing import Any, NoReturn
 
 from splatctrl_cli.errors import UsageError
 
+COMMANDS = {
+    "simulate": "write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
+    "ingest": "turn a log or image folder into a capture folder",
+    "info": "describe a log, capture, scene, grid, robot or other file",
+    "check": "say what is wrong with a log, capture or image folder",
+    "reconstruct": "fit splats to a log, a capture or a DTU scan",
+    "export": "write splats as PLY, .splat, .spz, glTF or USD, and check what reads back",
+    "sdf-bake": "bake a scene's splats into a distance grid with gradient",
+    "score": "compare renders of a scene with recorded views (by default of the cameras that did not train it): "
+    "PSNR, SSIM, depth error, by a named protocol; or fit scans first (--fit)",
+    "replay": "audit logged joint states, ask the controller at each, or drive the arm in closed loop",
+    "robot": "fit and measure a robot's collision spheres, list its self-collision pairs and limits",
+    "demo": "run the main job on a sample recording, with pictures",
+    "capture": "pack a capture into one MCAP that viewers open, and unpack it",
+}
+
 
 class Parser(argparse.ArgumentParser):
     """Raises UsageError where argparse prints its usage and leaves; the parsers of subcommands are of this class."""

@@ -1,8 +1,8 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import (
     Console,
@@ -15,15 +15,14 @@ from splatctrl_cli.cli.common import (
     table,
 )
 from splatctrl_cli.cli.numbers import MAX_LENGTH, real, setting
+from splatctrl_cli.cli.reconstruct_gaussians import run as run_gaussians
 from splatctrl_cli.cli.score_reference import add_scan, open_dtu, open_held_out, refuse_scan_options
 from splatctrl_cli.cli.source_options import add_source, source_options
-from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config import Config, SceneConfig
 from splatctrl_cli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.jobs.reconstruct import ReconstructResult
-    from splatctrl_cli.records import Box, RecordSource
+from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, check_pose_jumps, reconstruct
+from splatctrl_cli.records import Box, RecordSource
+from splatctrl_cli.sources.source import open_source
 
 DEFAULT_POSE_JUMP = 1.0  # [m]
 DECIDING_OPTIONS = (
@@ -46,7 +45,7 @@ PASSED_ON = (
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "reconstruct", run, summary="fit splats to a log, a capture or a DTU scan")
+    parser = add_command(subparsers, "reconstruct", run)
     parser.add_argument("source", type=Path, nargs="?", help="log, capture folder, or an image folder's .toml")
     parser.add_argument(
         "--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, or in IDR's and NeuS's, instead"
@@ -111,13 +110,9 @@ def add_disagreement(parser: argparse._ActionsContainer) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.jobs.reconstruct import ReconstructRequest, reconstruct
-
     if args.device == "cuda":
         raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
     if args.method == "3dgs":
-        from splatctrl_cli.cli.reconstruct_gaussians import run as run_gaussians
-
         return run_gaussians(args, _config(args), _open(args), _box(args))
     request = ReconstructRequest(
         config=_config(args),  # refused before the source is opened
@@ -151,14 +146,10 @@ def _lines(result: "ReconstructResult") -> list[str]:
 
 
 def _box(args: argparse.Namespace) -> "Box | None":
-    from splatctrl_cli.records import Box
-
     return None if args.box is None else Box.from_text(args.box)
 
 
 def _config(args: argparse.Namespace) -> "Config":
-    from dataclasses import replace
-
     config = configured(args)
     if args.max_splats is None:
         return config
@@ -166,8 +157,6 @@ def _config(args: argparse.Namespace) -> "Config":
 
 
 def _open(args: argparse.Namespace) -> "RecordSource":
-    from splatctrl_cli.sources.source import open_source
-
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
     if args.dtu is not None:
@@ -181,8 +170,6 @@ def _open(args: argparse.Namespace) -> "RecordSource":
     refuse_scan_options(args)
     if args.protocol is not None:
         return open_held_out(args, args.source)[0]
-    from splatctrl_cli.jobs.reconstruct import check_pose_jumps
-
     source = open_source(args.source, source_options(args))
     check_pose_jumps(source, args.max_pose_jump)
     return source

@@ -5,19 +5,21 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.recording import first_frame
 from splatctrl_cli.evaluate.verdict import verdict_of
+from splatctrl_cli.files.output import Stopwatch, output_path, write_run
 from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
 from splatctrl_cli.jobs.reconstruction import training_cameras
-
-if TYPE_CHECKING:
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.records import Box, RecordSource, RgbdFrame
-    from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow
+from splatctrl_cli.records import Box, RecordSource, RgbdFrame
+from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow, GaussianFitter
+from splatctrl_cli.scene.time_steps import depth_box
+from splatctrl_cli.scene_files.scene_folder import FORMAT
+from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
 
 GATED = ("iterations", "splats", "cloned", "split", "pruned", "unmet", "loss", "psnr")  # what --require can name
 ROUTES = "leave out --method, or give a folder of views (a TOML file or --dtu)"
@@ -25,11 +27,6 @@ ROUTES = "leave out --method, or give a folder of views (a TOML file or --dtu)"
 
 def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box: "Box | None") -> int:
     """Fit, write the scene folder and return the exit code."""
-    from splatctrl_cli.files.output import Stopwatch, output_path, write_run
-    from splatctrl_cli.scene.gaussian_fitter import GaussianFitter
-    from splatctrl_cli.scene_files.scene_folder import FORMAT
-    from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
-
     check_gate_names(args.require, GATED)
     _refuse_what_needs_time(args, source)
     console, stopwatch = Console(args), Stopwatch()
@@ -86,8 +83,6 @@ def _refuse_what_needs_time(args: argparse.Namespace, source: "RecordSource") ->
 
 
 def _frames(source: "RecordSource") -> "list[RgbdFrame]":
-    from splatctrl_cli.records import RgbdFrame
-
     cameras = training_cameras(source)
     frames = [r for r in source.records() if isinstance(r, RgbdFrame) and r.camera in cameras]
     if not frames:
@@ -99,8 +94,6 @@ def _frames(source: "RecordSource") -> "list[RgbdFrame]":
 
 
 def _workspace(frames: "list[RgbdFrame]", box: "Box | None", config: "Config") -> "Box":
-    from splatctrl_cli.scene.time_steps import depth_box
-
     return depth_box(frames, config.occupancy.max_range) if box is None else box
 
 
@@ -120,8 +113,6 @@ def _audit(path: Path, rows: "list[GaussianAuditRow]", console: Console) -> "Cal
 
 def _metrics(rows: "list[GaussianAuditRow]", frames: "list[RgbdFrame]") -> dict[str, object]:
     """For ``run.json`` and gates."""
-    from splatctrl_cli.evaluate.recording import first_frame
-
     last = rows[-1]
     first = {frame.camera: frame for frame in reversed(frames)}
     return {

@@ -19,17 +19,14 @@ from splatctrl_cli.cli.replay_options import (
     pose,
     replay_request,
 )
+from splatctrl_cli.cli.replay_report import lines_of
 from splatctrl_cli.cli.source_options import add_source
+from splatctrl_cli.jobs.replay import replay
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(
-        subparsers,
-        "replay",
-        run,
-        summary="audit logged joint states, ask the controller at each, or drive the arm in closed loop",
-    )
+    parser = add_command(subparsers, "replay", run)
     parser.add_argument("log", type=Path, metavar="LOG", help="a log or capture with joint states")
     scene = parser.add_mutually_exclusive_group(required=True)
     scene.add_argument("--field", type=Path, metavar="FIELD", help="a baked field (folder or field.npz)")
@@ -84,9 +81,6 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.cli.replay_report import lines_of
-    from splatctrl_cli.jobs.replay import replay
-
     console, request = Console(args), replay_request(args)
     result = replay(request, console)
     code = result.exit_code(report_only=args.report_only)

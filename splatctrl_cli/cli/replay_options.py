@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import configured
 from splatctrl_cli.cli.numbers import MAX_SECONDS, real, several, whole
@@ -10,9 +9,9 @@ from splatctrl_cli.cli.reconstruct import add_disagreement
 from splatctrl_cli.cli.robot_options import locked_joints
 from splatctrl_cli.cli.source_options import source_options
 from splatctrl_cli.config.declared import shown
-
-if TYPE_CHECKING:
-    from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.control.presets import with_preset
+from splatctrl_cli.jobs.replay_goal import checked_pose
+from splatctrl_cli.jobs.replay_request import ReplayRequest
 
 MODES = ("audit", "open-loop", "closed-loop")
 BASELINES = ("standstill", "birrt", "birrt-ik")
@@ -22,9 +21,6 @@ GOLDEN_TOLERANCE = 1e-6  # [rad/s]: steps.csv keeps nine digits; another machine
 
 def replay_request(args: argparse.Namespace) -> "ReplayRequest":
     """The request that parsed options make. Raises UsageError for values of the wrong form."""
-    from splatctrl_cli.control.presets import with_preset
-    from splatctrl_cli.jobs.replay_request import ReplayRequest
-
     same = (
         *("log", "urdf", "scene", "field", "lockstep", "latency", "allow_disagreement", "max_pose_jump", "spheres"),
         *(
@@ -226,8 +222,6 @@ def _start(text: str) -> float | str:
 
 def pose(text: str) -> tuple[float, ...]:
     """A pose as `POSE`, for argparse."""
-    from splatctrl_cli.jobs.replay_goal import checked_pose
-
     try:
         return checked_pose(numbers(text))
     except ValueError as error:

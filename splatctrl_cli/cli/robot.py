@@ -2,29 +2,44 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_gates, add_output
+import numpy as np
+
+from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_gates, add_named, add_output
 from splatctrl_cli.cli.numbers import MAX_SEED, real, whole
 from splatctrl_cli.cli.robot_options import add_lock, add_robot, locked_joints
+from splatctrl_cli.cli.robot_report import (
+    METRICS,
+    coverage_json,
+    coverage_lines,
+    coverage_verdict,
+    info_json,
+    info_lines,
+    pairs_json,
+    pairs_lines,
+)
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
-
-if TYPE_CHECKING:
-    from splatctrl_cli.records import SphereSet
-    from splatctrl_cli.robot.coverage import CoverageReport
-    from splatctrl_cli.robot.solids import Solid
-    from splatctrl_cli.robot.urdf import UrdfFile
+from splatctrl_cli.files.output import output_path
+from splatctrl_cli.geometry import transform_points
+from splatctrl_cli.records import SphereSet
+from splatctrl_cli.report.robot_picture import robot_picture
+from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import self_collision_pairs
+from splatctrl_cli.robot.solids import Solid, mesh_path, read_solids
+from splatctrl_cli.robot.sphere_files import read_sphere_file, read_spheres, spheres_yaml
+from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
+from splatctrl_cli.robot.spheres import RENAMED, are_links_renamed, matched_links
+from splatctrl_cli.robot.srdf import read_srdf
+from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 DEFAULT_SPHERES = 64  # as many as the public sets for the Panda have
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand and its actions to the parser."""
-    summary = "fit and measure a robot's collision spheres, list its self-collision pairs and limits"
-    parser = subparsers.add_parser(
-        "robot", help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False
-    )
+    parser = add_named(subparsers, "robot")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     _register_spheres(actions)
     _register_check(actions)
@@ -100,14 +115,6 @@ def _register_info(actions: Subparsers) -> None:
 
 def run_spheres(args: argparse.Namespace) -> int:
     """Fit, write, measure what was written, and return the exit code."""
-    from splatctrl_cli.cli.robot_report import METRICS, coverage_json, coverage_lines, coverage_verdict
-    from splatctrl_cli.files.output import output_path
-    from splatctrl_cli.robot.coverage import coverage_of_solids
-    from splatctrl_cli.robot.solids import read_solids
-    from splatctrl_cli.robot.sphere_files import read_spheres, spheres_yaml
-    from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
-    from splatctrl_cli.robot.urdf import read_urdf
-
     console = Console(args)
     check_gate_names(args.require, METRICS)
     num_spheres = DEFAULT_SPHERES if args.max_spheres is None and args.max_protrusion is None else args.max_spheres
@@ -138,13 +145,6 @@ def run_spheres(args: argparse.Namespace) -> int:
 
 def run_check(args: argparse.Namespace) -> int:
     """Measure a set of spheres and return the exit code."""
-    from splatctrl_cli.cli.robot_report import METRICS, coverage_json, coverage_lines, coverage_verdict
-    from splatctrl_cli.robot.coverage import coverage_of_solids
-    from splatctrl_cli.robot.solids import read_solids
-    from splatctrl_cli.robot.sphere_files import read_sphere_file
-    from splatctrl_cli.robot.spheres import RENAMED, are_links_renamed, matched_links
-    from splatctrl_cli.robot.urdf import read_urdf
-
     console = Console(args)
     check_gate_names(args.require, METRICS)
     urdf = read_urdf(args.urdf)
@@ -172,11 +172,6 @@ def run_check(args: argparse.Namespace) -> int:
 
 def run_pairs(args: argparse.Namespace) -> int:
     """List the pairs of links and return the exit code."""
-    from splatctrl_cli.cli.robot_report import pairs_json, pairs_lines
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.robot.self_collision import self_collision_pairs
-    from splatctrl_cli.robot.srdf import read_srdf
-
     console = Console(args)
     model = RobotModel.from_urdf(args.urdf, args.spheres, locked=locked_joints(args.lock))
     disabled, foreign = ((), ()) if args.srdf is None else read_srdf(args.srdf, model.urdf)
@@ -193,10 +188,6 @@ def run_pairs(args: argparse.Namespace) -> int:
 
 def run_info(args: argparse.Namespace) -> int:
     """Show the robot and return the exit code."""
-    from splatctrl_cli.cli.robot_report import info_json, info_lines
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.robot.urdf import read_urdf
-
     console = Console(args)
     urdf = read_urdf(args.urdf)
     has_own = bool(urdf.shapes) and all(shape.kind == "sphere" for shape in urdf.shapes) and not urdf.meshes
@@ -213,8 +204,6 @@ def run_info(args: argparse.Namespace) -> int:
 
 def _lost_meshes(urdf: "UrdfFile", packages: list[Path]) -> list[str]:
     """What is wrong with each mesh of a URDF that is not there."""
-    from splatctrl_cli.robot.solids import mesh_path
-
     lost = []
     for mesh in urdf.meshes:
         try:
@@ -225,10 +214,6 @@ def _lost_meshes(urdf: "UrdfFile", packages: list[Path]) -> list[str]:
 
 
 def _no_spheres() -> "SphereSet":
-    import numpy as np
-
-    from splatctrl_cli.records import SphereSet
-
     return SphereSet(links=(), centers=np.zeros((0, 3)), radii=np.zeros(0))
 
 
@@ -243,10 +228,6 @@ def _comments(urdf: Path, report: "CoverageReport") -> list[str]:
 
 
 def _draw(path: Path, urdf: "UrdfFile", solids: "dict[str, tuple[Solid, ...]]", spheres: "SphereSet") -> None:
-    from splatctrl_cli.geometry import transform_points
-    from splatctrl_cli.report.robot_picture import robot_picture
-    from splatctrl_cli.robot.model import RobotModel
-
     model = RobotModel.from_urdf(urdf.path, spheres)
     poses = {link: model.frame_pose(model.middle, link) for link in {*solids, *spheres.links}}
     triangles = [

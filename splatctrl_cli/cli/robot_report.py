@@ -2,15 +2,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatctrl_cli.cli.common import table
-
-if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.verdict import Verdict
-    from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.robot.self_collision import LinkPair, SelfCollisionPairs
+from splatctrl_cli.evaluate.gates import gate_reasons
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import LinkPair, SelfCollisionPairs
 
 METRICS = (
     "max_deficit",
@@ -38,9 +37,6 @@ def metrics_of(report: "CoverageReport") -> dict[str, float | None]:
 
 def coverage_verdict(report: "CoverageReport", command: str, require: Sequence[str]) -> "Verdict":
     """The verdict on a set of spheres: what they leave uncovered, links without any, and each ``--require``."""
-    from splatctrl_cli.evaluate.gates import gate_reasons
-    from splatctrl_cli.evaluate.verdict import Outcome, Reason, noted, verdict_of
-
     num, bare = len(report.links), ", ".join(report.bare_links)
     counts = dict.fromkeys(METRICS, num) | dict.fromkeys(("max_protrusion", "num_stray_spheres"), report.num_spheres)
     covered = Reason(

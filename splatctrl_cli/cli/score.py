@@ -3,7 +3,7 @@
 import argparse
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
 from splatctrl_cli.cli.score_baseline import add_baseline, changes, read_baseline
@@ -18,23 +18,20 @@ from splatctrl_cli.cli.score_reference import (
 )
 from splatctrl_cli.cli.score_report import gated_names, lines_of, result_of, score_verdict, write_scores
 from splatctrl_cli.cli.score_scans import lines_of_scans, scenes_of_scans, score_scans
+from splatctrl_cli.cli.score_views import Scorer, view_drawer
 from splatctrl_cli.cli.source_options import add_source
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
-
-if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.perceptual import Lpips
+from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.files.output import Stopwatch, output_path
+from splatctrl_cli.scene_files.scene_folder import open_scene
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(
-        subparsers,
-        "score",
-        run,
-        summary="compare renders of a scene with recorded views (by default of the cameras that did not train it): "
-        "PSNR, SSIM, depth error, by a named protocol; or fit scans first (--fit)",
-    )
+    parser = add_command(subparsers, "score", run)
     parser.add_argument(
         "scene",
         type=Path,
@@ -99,8 +96,6 @@ def run(args: argparse.Namespace) -> int:
         read_baseline(args.baseline)  # better refused now than after the views
     check_gate_names(args.require, names if args.baseline is None else changed, {"--baseline": changed})
     console = Console(args)
-    from splatctrl_cli.files.output import output_path
-
     scenes = scenes_of_scans(args)
     output = output_path(args.out, force=args.force, is_folder=True) if args.out else nullcontext()
     with output as folder:
@@ -117,12 +112,6 @@ def score_scene(args: argparse.Namespace, console: Console, folder: Path | None)
     """Score one scene, write what `-o` asks for into `folder`, and return everything that --json prints, and the
     verdict.
     """
-    from splatctrl_cli.cli.score_views import Scorer, view_drawer
-    from splatctrl_cli.evaluate.perceptual import Lpips
-    from splatctrl_cli.field.selection import field_splats
-    from splatctrl_cli.files.output import Stopwatch
-    from splatctrl_cli.scene_files.scene_folder import open_scene
-
     stopwatch = Stopwatch()
     cloud = cloud_settings(args)
     lpips = None if args.lpips is None else Lpips(args.lpips)

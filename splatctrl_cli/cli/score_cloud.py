@@ -4,16 +4,20 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from splatctrl_cli.cli.numbers import real
 from splatctrl_cli.cli.score_views import rendered
+from splatctrl_cli.datasets.dtu_observed import ObservedSpace, cloud_of_scan, read_observed
 from splatctrl_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.datasets.dtu_observed import ObservedSpace
-    from splatctrl_cli.records import Float64, GaussianSet, RgbdFrame, SplatSet
-    from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.evaluate.cloud import cloud_score, points_on, spaced, thinned
+from splatctrl_cli.evaluate.visibility import seen_by, surface_points
+from splatctrl_cli.mesh_distance import load_mesh
+from splatctrl_cli.records import Float64, GaussianSet, Label, RgbdFrame, SplatSet
+from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.splat_files.points import is_mesh, read_positions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +36,6 @@ class CloudSettings:
 
         Raises InputError naming the files looked for.
         """
-        from splatctrl_cli.datasets.dtu_observed import cloud_of_scan, read_observed
-
         path = cloud_of_scan(self.path, scan or "") if self.path.is_dir() else self.path
         return replace(self, path=path, space=None if self.masks is None else read_observed(self.masks, scan or ""))
 
@@ -104,9 +106,6 @@ def cloud_figures(
     settings: CloudSettings, scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int
 ) -> dict[str, Any]:
     """The figures by flat name. `frames`: the training views that the surface is looked at from."""
-    from splatctrl_cli.evaluate.cloud import cloud_score, spaced
-    from splatctrl_cli.evaluate.visibility import seen_by
-
     reference, space, counts = spaced(_reference(settings), settings.spacing), settings.space, None
     points = _surface(scene, frames, threads, settings.spacing)
     if space is not None:
@@ -125,10 +124,6 @@ def cloud_figures(
 
 
 def _reference(settings: CloudSettings) -> "Float64":
-    from splatctrl_cli.evaluate.cloud import points_on
-    from splatctrl_cli.mesh_distance import load_mesh
-    from splatctrl_cli.splat_files.points import is_mesh, read_positions
-
     if not is_mesh(settings.path):
         return settings.unit * read_positions(settings.path)
     mesh = load_mesh(settings.path)
@@ -138,11 +133,6 @@ def _reference(settings: CloudSettings) -> "Float64":
 def _surface(scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int, spacing: float) -> "Float64":
     """World points (P, 3) [m] of the final splats' rendered depth at the poses of `frames`, the robot left out,
     `spacing` [m] apart."""
-    import numpy as np
-
-    from splatctrl_cli.evaluate.cloud import spaced, thinned
-    from splatctrl_cli.evaluate.visibility import surface_points
-
     splats = _without_robot(scene)
     parts = []
     for frame in frames:
@@ -152,8 +142,6 @@ def _surface(scene: "SceneFolder", frames: "Sequence[RgbdFrame]", threads: int, 
 
 
 def _without_robot(scene: "SceneFolder") -> "SplatSet | GaussianSet":
-    from splatctrl_cli.records import Label
-
     if scene.is_anisotropic:
         return scene.gaussians()
     splats = scene.splats()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatctrl_cli.cli import launch
 from splatctrl_cli.cli.common import Console, configured, table
 from splatctrl_cli.cli.numbers import setting, whole
 from splatctrl_cli.cli.score_cloud import cloud_settings
@@ -20,9 +21,13 @@ from splatctrl_cli.cli.score_report import COLUMNS, cell, protocol_lines, views_
 from splatctrl_cli.cli.score_scans import masks_of_scan
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.map import MOST_ITERATIONS
+from splatctrl_cli.datasets.dtu import scan_folders
+from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.evaluate.verdict import Verdict, noted, verdict_of
+from splatctrl_cli.files.output import Stopwatch, output_path, write_json, write_run
 
 if TYPE_CHECKING:
     ScoreScene = Callable[[argparse.Namespace, Console, Path | None], tuple[dict[str, Any], Verdict]]
@@ -96,8 +101,6 @@ def run_fit(args: argparse.Namespace, score_scene: "ScoreScene") -> int:
     """Fit, score, print the table, and return the exit code."""
     _refuse(args)
     if args.lpips is not None:
-        from splatctrl_cli.evaluate.perceptual import Lpips
-
         Lpips(args.lpips)  # better refused now than after the fits
     cloud = cloud_settings(args)
     config = configured(args)
@@ -215,8 +218,6 @@ def _reconstruct(args: argparse.Namespace, scene: Path, scan: str, settings: lis
 
     Raises InputError with what it says where it does not end well.
     """
-    from splatctrl_cli.cli import launch
-
     scene.parent.mkdir(parents=True)
     source = [str(args.reference)] if args.dtu is None else ["--dtu", str(args.dtu), "--scan", scan]
     command = [sys.executable, "-m", "splatctrl_cli", "reconstruct", *source, "-q", "-o", str(scene), *settings]
@@ -236,9 +237,6 @@ def _reconstruct(args: argparse.Namespace, scene: Path, scan: str, settings: lis
 
 
 def _scans(args: argparse.Namespace) -> list[str]:
-    from splatctrl_cli.datasets.dtu import scan_folders
-    from splatctrl_cli.datasets.idr import idr_scans
-
     if args.dtu is None:
         return [args.reference.stem]
     found = idr_scans(args.dtu) if not (args.dtu / "Rectified").is_dir() else {}
@@ -254,8 +252,6 @@ def _scans(args: argparse.Namespace) -> list[str]:
 @contextmanager
 def _folder(args: argparse.Namespace) -> Iterator[Path]:
     """Where the scenes go: the output, or a place for the time of the run."""
-    from splatctrl_cli.files.output import output_path
-
     if args.out is None:
         with tempfile.TemporaryDirectory() as folder:
             yield Path(folder)
@@ -349,8 +345,6 @@ def _whole(value: float | None) -> str:
 def _write(
     folder: Path, args: argparse.Namespace, result: dict[str, Any], config: dict[str, Any], verdict: Verdict
 ) -> None:
-    from splatctrl_cli.files.output import Stopwatch, write_json, write_run
-
     write_json(folder / "score.json", result)
     write_run(
         folder,

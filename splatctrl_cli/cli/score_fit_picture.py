@@ -4,20 +4,19 @@ import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.score_reference import cameras_to_score, open_reference
 from splatctrl_cli.cli.score_views import rendered
+from splatctrl_cli.evaluate.images import psnr
+from splatctrl_cli.evaluate.views import views_to_score
+from splatctrl_cli.report.view_picture import renders_picture
+from splatctrl_cli.scene_files.scene_folder import open_scene
 
 
 def draw_methods(args: argparse.Namespace, console: Console, scenes: Mapping[str, Path], path: Path) -> None:
     """Write the first view that is scored, as photographed and as rendered from each of `scenes`, by method."""
-    import numpy as np
-
-    from splatctrl_cli.evaluate.images import psnr
-    from splatctrl_cli.evaluate.views import views_to_score
-    from splatctrl_cli.report.view_picture import renders_picture
-    from splatctrl_cli.scene_files.scene_folder import open_scene
-
     opened = {name: open_scene(scene) for name, scene in scenes.items()}
     training = next(iter(opened.values())).cameras
     reference = open_reference(args, console)

@@ -4,18 +4,20 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from splatctrl_cli.captures.capture import is_capture
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.numbers import whole
 from splatctrl_cli.cli.source_options import source_options
+from splatctrl_cli.containers.bag_log import is_bag_folder
+from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
+from splatctrl_cli.datasets.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.datasets.dtu_source import DtuSource
-    from splatctrl_cli.datasets.protocols import ScoreProtocol, Split
-    from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
-    from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.evaluate.recording import changed_files, differences
+from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
+from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.sources.source import open_source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +68,6 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
 
 def open_dtu(args: argparse.Namespace, masks: Path | None = None) -> "DtuSource":
     """The scan that --dtu, --scan, --holdout, --protocol and --depths name."""
-    from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
-    from splatctrl_cli.datasets.protocols import score_protocol
-
     protocol = None if args.protocol is None else score_protocol(args.protocol)
     holdout = view_numbers(words(args.holdout or ""))
     return DtuSource(
@@ -78,9 +77,6 @@ def open_dtu(args: argparse.Namespace, masks: Path | None = None) -> "DtuSource"
 
 def open_held_out(args: argparse.Namespace, path: Path) -> tuple["RecordSource", "ScoreProtocol", "Split"]:
     """An image folder with the views held out that --protocol holdout:RULE names, by their places in it."""
-    from splatctrl_cli.datasets.protocols import score_protocol
-    from splatctrl_cli.sources.source import open_source
-
     protocol = score_protocol(args.protocol)
     if not is_folder_of_views(path) or not args.protocol.startswith("holdout:"):
         raise UsageError(
@@ -98,9 +94,6 @@ def open_held_out(args: argparse.Namespace, path: Path) -> tuple["RecordSource",
 
 def is_folder_of_views(path: Path) -> bool:
     """Whether a recording is images in a folder, by a TOML or in a dataset's layout; not a log, not a capture."""
-    from splatctrl_cli.captures.capture import is_capture
-    from splatctrl_cli.containers.bag_log import is_bag_folder
-
     return path.suffix == ".toml" or (path.is_dir() and not is_capture(path) and not is_bag_folder(path))
 
 
@@ -115,8 +108,6 @@ def open_reference(args: argparse.Namespace, console: Console) -> Reference:
     """The recording with all its cameras: --cameras chooses those to score, the others say what was seen."""
     if args.dtu is not None:
         return _dtu_reference(args, console)
-    from splatctrl_cli.sources.source import open_source
-
     refuse_scan_options(args)
     if args.masks is not None:
         raise UsageError(f"--masks {args.masks}: only with --dtu", remedy="leave it out")
@@ -137,8 +128,6 @@ def _dtu_reference(args: argparse.Namespace, console: Console) -> Reference:
     source = open_dtu(args, args.masks)
     split, protocol = source.split, None
     if args.protocol is not None:
-        from splatctrl_cli.datasets.protocols import score_protocol
-
         protocol = score_protocol(args.protocol)
     mask, rule = _mask_of(source, "given" if protocol is None else protocol.mask)
     if protocol is not None and protocol.mask == "object" and mask is None:
@@ -242,8 +231,6 @@ def recording_check(
     By the first frame of each camera that trained (not kept by an older version), and the digests of files of the
     same names.
     """
-    from splatctrl_cli.evaluate.recording import changed_files, differences
-
     recorded = scene.run.get("metrics", {}).get("first_frames")
     then = scene.run.get("inputs", {})
     compared = [name for name in then if name in digests]

@@ -1,22 +1,28 @@
 """What `score` prints and writes: the protocol it went by, a row per view, the mean."""
 
 import argparse
+import csv
 from collections.abc import Mapping, Sequence
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.score_baseline import PREFIX, change_cells
 from splatctrl_cli.cli.score_cloud import CloudSettings
 from splatctrl_cli.cli.score_reference import Reference
 from splatctrl_cli.cli.score_views import Scores
-
-if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.perceptual import Lpips
-    from splatctrl_cli.evaluate.verdict import Reason, Verdict
-    from splatctrl_cli.files.output import Stopwatch
-    from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.evaluate.cloud import cloud_names
+from splatctrl_cli.evaluate.free_space import free_mass
+from splatctrl_cli.evaluate.gates import gate_reasons
+from splatctrl_cli.evaluate.perceptual import Lpips
+from splatctrl_cli.evaluate.score import PROTOCOL, as_json, metric_names, total_score
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.field.obstacles import obstacle_spheres
+from splatctrl_cli.files.output import Stopwatch, sha256, write_json, write_run
+from splatctrl_cli.records import Label
+from splatctrl_cli.report.pictures import comparison_picture
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, run_value
 
 
 def result_of(
@@ -31,8 +37,6 @@ def result_of(
     lpips: "Lpips | None",
 ) -> dict[str, Any]:
     """Everything that --json prints."""
-    from splatctrl_cli.evaluate.score import PROTOCOL, as_json, total_score
-
     metrics = total_score(scores.views) | (cloud[1] if cloud else {})
     metrics |= {"free_mass": _free_mass(args.scene, scene), "num_skipped": len(scores.skipped)}
     metrics["num_warnings"] = len(scores.doubts) + len(recording["differences"])
@@ -79,11 +83,6 @@ def _protocol(reference: Reference, scene: "SceneFolder", scores: Scores, lpips:
 
 def _free_mass(path: Path, scene: "SceneFolder") -> float:
     """nan where the scene has no occupancy grid."""
-    from splatctrl_cli.evaluate.free_space import free_mass
-    from splatctrl_cli.field.obstacles import obstacle_spheres
-    from splatctrl_cli.records import Label
-    from splatctrl_cli.scene_files.scene_folder import run_value
-
     if not (path / "occupancy.npz").is_file():
         return nan
     keys = ("config", "occupancy", "free_below")
@@ -94,18 +93,12 @@ def _free_mass(path: Path, scene: "SceneFolder") -> float:
 
 def gated_names(*, with_changes: bool) -> tuple[str, ...]:
     """What --require can name; with_changes: since a --baseline, too."""
-    from splatctrl_cli.evaluate.cloud import cloud_names
-    from splatctrl_cli.evaluate.score import metric_names
-
     names = (*metric_names(), *cloud_names(), "free_mass", "num_skipped", "num_warnings", "num_scans")
     return (*names, *(PREFIX + name for name in names)) if with_changes else names
 
 
 def score_verdict(result: Mapping[str, Any], require: Sequence[str], *, is_damaged: bool) -> "Verdict":
     """The verdict on a result: that there are views, what speaks against its figures, and each ``--require``."""
-    from splatctrl_cli.evaluate.gates import gate_reasons
-    from splatctrl_cli.evaluate.verdict import noted, verdict_of
-
     metrics, counts = result["metrics"], counts_of(result)
     num_scans = metrics.get("num_scans")
     of_scans = "" if num_scans is None else f" of {_count(num_scans, 'scan')}"
@@ -137,8 +130,6 @@ def counts_of(result: Mapping[str, Any]) -> dict[str, int]:
 
 def views_reason(num_views: float) -> "Reason":
     """Whether anything was compared."""
-    from splatctrl_cli.evaluate.verdict import Outcome, Reason
-
     return Reason(
         criterion="views",
         outcome=Outcome.PASSED if num_views else Outcome.NOT_EVALUABLE,
@@ -159,11 +150,6 @@ def write_scores(
     verdict: "Verdict",
 ) -> None:
     """The files of ``score -o``."""
-    import csv
-
-    from splatctrl_cli.files.output import sha256, write_json, write_run
-    from splatctrl_cli.report.pictures import comparison_picture
-
     write_json(folder / "score.json", result)
     with (folder / "views.csv").open("w", newline="", encoding="utf-8") as stream:
         rows = csv.DictWriter(stream, fieldnames=list(result["views"][0]), lineterminator="\n")

@@ -1,6 +1,7 @@
 """``score`` of several scans at once: a folder of scenes, each named like its scan, and the mean over the scans."""
 
 import argparse
+import csv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,10 +11,10 @@ from splatctrl_cli.cli.score_baseline import PREFIX, change_cells, changes, read
 from splatctrl_cli.cli.score_reference import words
 from splatctrl_cli.cli.score_report import COLUMNS, cell, cloud_lines, protocol_lines, score_verdict, with_change
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 
 if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.verdict import Verdict
-
     ScoreScene = Callable[[argparse.Namespace, Console, Path | None], tuple[dict[str, Any], Verdict]]
 
 SUMS = ("num_views", "num_skipped", "num_warnings", "num_points", "num_reference")
@@ -143,10 +144,6 @@ def lines_of_scans(result: dict[str, Any]) -> list[str]:
 
 
 def _write(folder: Path, result: dict[str, Any], verdict: "Verdict") -> None:
-    import csv
-
-    from splatctrl_cli.files.output import Stopwatch, write_json, write_run
-
     write_json(folder / "score.json", result)
     with (folder / "scans.csv").open("w", newline="", encoding="utf-8") as stream:
         names = [name for name in result["metrics"] if name != "num_scans" and not name.startswith(PREFIX)]

@@ -1,25 +1,26 @@
 """Renders the views that are scored, from the splats of their time, and scores them one by one."""
 
 import argparse
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.score_reference import Reference
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.evaluate.doubts import Doubts
-    from splatctrl_cli.evaluate.score import Perceptual, ViewScore
-    from splatctrl_cli.evaluate.views import View
-    from splatctrl_cli.files.output import Stopwatch
-    from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
-    from splatctrl_cli.report.pictures import ComparisonRow
-    from splatctrl_cli.scene.render import Rendering
-    from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.evaluate.doubts import Doubts
+from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
+from splatctrl_cli.evaluate.views import View, views_to_score
+from splatctrl_cli.evaluate.visibility import seen_pixels
+from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
+from splatctrl_cli.report.pictures import ComparisonRow
+from splatctrl_cli.report.view_picture import view_picture
+from splatctrl_cli.scene.gaussians import render_gaussians
+from splatctrl_cli.scene.render import Rendering, render
+from splatctrl_cli.scene_files.scene_folder import SceneFolder
 
 
 @dataclass(kw_only=True)
@@ -51,9 +52,6 @@ class Scorer:
 
     def run(self, console: Console, stopwatch: "Stopwatch") -> Scores:
         """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
-        from splatctrl_cli.evaluate.doubts import Doubts
-        from splatctrl_cli.evaluate.views import views_to_score
-
         args, scene, source = self.args, self.scene, self.reference.source
         has_clock = scene.has_clock and source.has_clock
         splats_at = _SplatsAt(scene, use_snapshots=has_clock and args.snapshots == "newest")
@@ -99,10 +97,6 @@ class Scorer:
             )
 
     def _score_one(self, scores: Scores, doubts: "Doubts", view: "View", splats: "SplatSet | GaussianSet") -> None:
-        from splatctrl_cli.evaluate.score import score_view
-        from splatctrl_cli.evaluate.visibility import seen_pixels
-        from splatctrl_cli.report.pictures import ComparisonRow
-
         frame, protocol = view.frame, self.reference.protocol
         rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.args.threads)
         rendering = rendering.before(self.scene.background)
@@ -150,10 +144,6 @@ def rendered(
     splats: "SplatSet | GaussianSet", intrinsics: "Intrinsics", T_world_camera: "Float64", threads: int
 ) -> "Rendering":
     """What a camera sees of splats of either kind."""
-    from splatctrl_cli.records import GaussianSet
-    from splatctrl_cli.scene.gaussians import render_gaussians
-    from splatctrl_cli.scene.render import render
-
     if isinstance(splats, GaussianSet):
         return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
     return render(splats, intrinsics, T_world_camera, threads=threads)
@@ -173,8 +163,6 @@ class _SplatsAt:
         return bool(self._stamps) and self._stamps[0] <= stamp_ns
 
     def __call__(self, stamp_ns: int) -> "SplatSet | GaussianSet":
-        from bisect import bisect_right
-
         number = bisect_right(self._stamps, stamp_ns) if self._use_snapshots else -1
         if self._loaded is None or self._loaded[0] != number:
             self._loaded = (number, self._read(stamp_ns))
@@ -188,8 +176,6 @@ class _SplatsAt:
 
 def view_drawer(folder: Path) -> "Callable[[ComparisonRow], None]":
     """Writes the pictures of each view into `folder`."""
-    from splatctrl_cli.report.view_picture import view_picture
-
     folder.mkdir(parents=True, exist_ok=True)
 
     def draw(row: "ComparisonRow") -> None:

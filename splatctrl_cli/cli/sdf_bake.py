@@ -1,9 +1,12 @@
 """``splatctrl sdf-bake``: a scene's splats as a distance grid, and its accuracy where the truth is known."""
 
 import argparse
+import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from splatctrl_cli.cli.bake_options import (
     DEFAULT_CHANNELS,
@@ -15,37 +18,47 @@ from splatctrl_cli.cli.bake_options import (
     names_of,
     with_options,
 )
+from splatctrl_cli.cli.bake_report import (
+    FieldReport,
+    bake_verdict,
+    metric_names,
+    metrics,
+    reference_lines,
+    summary_lines,
+    warnings_of,
+    write_pictures,
+)
+from splatctrl_cli.cli.bake_run import CHECKPOINT, FOLDER, BakeTask, bake_to_disk, clear_leftovers
+from splatctrl_cli.cli.bake_source import BakeSource, read_bake_source
+from splatctrl_cli.cli.bake_update import Previous, check_same, read_previous
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, configured
+from splatctrl_cli.cli.field_held_out import compare_with_held_out, held_out_cameras, held_out_lines
+from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
+from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
-
-if TYPE_CHECKING:
-    from splatctrl_cli.cli.bake_report import FieldReport
-    from splatctrl_cli.cli.bake_run import BakeTask
-    from splatctrl_cli.cli.bake_source import BakeSource
-    from splatctrl_cli.cli.bake_update import Previous
-    from splatctrl_cli.config import Config
-    from splatctrl_cli.field.baker import Baker
-    from splatctrl_cli.field.incremental import Changes
-    from splatctrl_cli.field.slabs import UnknownSpace
-    from splatctrl_cli.files.output import Stopwatch
-    from splatctrl_cli.records import DistanceGrid, Label, SplatSet
+from splatctrl_cli.evaluate.reference_mesh import compare_with_mesh
+from splatctrl_cli.field.baker import Baker
+from splatctrl_cli.field.header import field_header
+from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
+from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.field.obstacles import obstacle_spheres
+from splatctrl_cli.field.probability import probabilities
+from splatctrl_cli.field.report import grid_statistics
+from splatctrl_cli.field.slabs import Kept, UnknownSpace, slabs
+from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
+from splatctrl_cli.grid_files.grid_formats import check_formats, write_grid
+from splatctrl_cli.jobs.resume import deciding_versions, told_how_to_go_on
+from splatctrl_cli.records import DistanceGrid, Label, SplatSet
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    add_options(
-        add_command(subparsers, "sdf-bake", run, summary="bake a scene's splats into a distance grid with gradient")
-    )
+    add_options(add_command(subparsers, "sdf-bake", run))
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.cli.bake_report import bake_verdict, metric_names, metrics
-    from splatctrl_cli.cli.bake_run import CHECKPOINT, FOLDER, clear_leftovers
-    from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
-    from splatctrl_cli.jobs.resume import told_how_to_go_on
-
     console, stopwatch, config = Console(args), Stopwatch(), with_options(configured(args), args)
     formats, labels = names_of(args.formats, FORMATS, "--formats"), labels_of(args.include)
     _check_options(args)
@@ -115,8 +128,6 @@ def _check_references(args: argparse.Namespace, source: "BakeSource") -> None:
         if path is not None and not path.exists():
             raise InputError(f"{path}: no such file or folder", remedy="check the path")
     if args.held_out is not None:
-        from splatctrl_cli.cli.field_held_out import held_out_cameras
-
         held_out_cameras(args.held_out, source.cameras)
 
 
@@ -136,13 +147,6 @@ def _read(
     stopwatch: "Stopwatch",
 ) -> _Job:
     """Read the splats, and check that the field can be made of them and written."""
-    from splatctrl_cli.cli.bake_source import read_bake_source
-    from splatctrl_cli.cli.bake_update import check_same, read_previous
-    from splatctrl_cli.field.baker import Baker
-    from splatctrl_cli.field.layout import GridLayout
-    from splatctrl_cli.field.obstacles import obstacle_spheres
-    from splatctrl_cli.grid_files.grid_formats import check_formats
-
     with stopwatch.stage("read"):
         source = read_bake_source(args.scene, args.at)
         previous = None if args.update is None else read_previous(args.update, args.previous_scene or args.scene)
@@ -184,11 +188,6 @@ def _bake(
     job: _Job, args: argparse.Namespace, partial: Path, console: Console, stopwatch: "Stopwatch"
 ) -> tuple["FieldReport", list[str]]:
     """Bake, compare, and write all but ``run.json``; returns the report and what is printed."""
-    from splatctrl_cli.cli.bake_report import FieldReport, summary_lines, warnings_of, write_pictures
-    from splatctrl_cli.field.report import grid_statistics
-    from splatctrl_cli.files.output import write_json
-    from splatctrl_cli.grid_files.grid_formats import write_grid
-
     with stopwatch.stage("bake"):
         grid, changes = _baked(job, args, partial, console)
     with stopwatch.stage("report"):
@@ -212,11 +211,6 @@ def _baked(
     job: _Job, args: argparse.Namespace, partial: Path, console: Console
 ) -> tuple["DistanceGrid", "Changes | None"]:
     """The grid, its channels on disk."""
-    from splatctrl_cli.cli.bake_run import bake_to_disk
-    from splatctrl_cli.field.header import field_header
-    from splatctrl_cli.field.incremental import counts_after
-    from splatctrl_cli.field.slabs import slabs
-
     baker = job.baker
     task, changes, old = _task(job, args)
     if changes is not None and changes.reason:
@@ -241,13 +235,6 @@ def _baked(
 
 def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | None", "Baker | None"]:
     """What has to be baked; with --update also what changed, and the baker of the splats before."""
-    from splatctrl_cli.cli.bake_run import BakeTask
-    from splatctrl_cli.field.baker import Baker
-    from splatctrl_cli.field.incremental import changed_blocks
-    from splatctrl_cli.field.obstacles import obstacle_spheres
-    from splatctrl_cli.field.slabs import Kept
-    from splatctrl_cli.jobs.resume import deciding_versions
-
     settings = {
         **deciding_versions(),
         **{f"field.{name}": value for name, value in asdict(job.config.field).items()},
@@ -277,8 +264,6 @@ def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | N
 
 
 def _unknown(job: _Job) -> "UnknownSpace | None":
-    from splatctrl_cli.field.slabs import UnknownSpace
-
     if job.config.field.unknown == "free":
         return None
     return UnknownSpace(job.baker.layout, job.config.field, job.source.occupancy, job.config.occupancy)
@@ -286,28 +271,19 @@ def _unknown(job: _Job) -> "UnknownSpace | None":
 
 def _compared(report: "FieldReport", job: _Job, args: argparse.Namespace) -> tuple["FieldReport", list[str]]:
     """The report with the accuracy against all that options name, and the tables of it."""
-    from splatctrl_cli.cli.bake_report import reference_lines
-
     grid, curves = report.grid, {}
     found: dict[str, Any] = {}
     lines: list[str] = []
     if args.truth is not None:
-        from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
-        from splatctrl_cli.field.probability import probabilities
-
         forms = probabilities(job.baker.spheres, job.config.field, threads=args.threads)
         compared = compare_with_truth(grid, job.source, args.truth, args.seen_by, seed=args.seed, probabilities=forms)
         found["truth"], curves = compared.as_dict(), dict(compared.reliability)
         lines += ["", *accuracy_lines(compared)]
     if args.reference_mesh is not None:
-        from splatctrl_cli.evaluate.reference_mesh import compare_with_mesh
-
         mesh = compare_with_mesh(grid, args.reference_mesh, seed=args.seed)
         found["reference_mesh"] = {"file": args.reference_mesh.name, **mesh.as_dict()}
         lines += ["", *reference_lines(mesh.accuracy, "mesh")]
     if args.held_out is not None:
-        from splatctrl_cli.cli.field_held_out import compare_with_held_out, held_out_lines
-
         held_out = compare_with_held_out(grid, job.source, args)
         found["held_out_depth"] = held_out.as_dict()
         lines += ["", *held_out_lines(held_out)]
@@ -316,8 +292,6 @@ def _compared(report: "FieldReport", job: _Job, args: argparse.Namespace) -> tup
 
 def _middle(job: _Job) -> list[float]:
     """Where slices are shown: in the middle of the splats in the grid but for the outermost, or of the grid [m]."""
-    import numpy as np
-
     box = job.baker.layout.box
     inside = job.chosen.centers[box.contains(job.chosen.centers)]
     lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)
@@ -326,6 +300,4 @@ def _middle(job: _Job) -> list[float]:
 
 
 def _remove(folder: Path) -> None:
-    import shutil
-
     shutil.rmtree(folder)

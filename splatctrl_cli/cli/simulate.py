@@ -2,21 +2,27 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
 from splatctrl_cli.cli.numbers import MAX_SEED, real, whole
-
-if TYPE_CHECKING:
-    from splatctrl_cli.simulate.recording import Recording, RecordingOptions
-    from splatctrl_cli.simulate.truth import Truth
+from splatctrl_cli.datasets.dtu import DtuView, write_dtu
+from splatctrl_cli.datasets.idr import write_idr
+from splatctrl_cli.files.output import Stopwatch, output_path, write_json, write_run
+from splatctrl_cli.logs.mcap_writer import mcap_log
+from splatctrl_cli.records import JointState
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.recording import Recording, RecordingOptions
+from splatctrl_cli.simulate.shared_workspace import DURATION_S
+from splatctrl_cli.simulate.textures import luminance_std
+from splatctrl_cli.simulate.truth import Truth, truth_document
+from splatctrl_cli.simulate.turntable import object_mask, views
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    parser = add_command(
-        subparsers, "simulate", run, summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth"
-    )
+    parser = add_command(subparsers, "simulate", run)
     add_output(parser, default="simulated", what="folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml")
     parser.add_argument(
         "--seed", type=whole(0, MAX_SEED), default=0, help="seed of the noise and of --human-arm (default: 0)"
@@ -57,11 +63,6 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    from splatctrl_cli.files.output import Stopwatch, output_path, write_json, write_run
-    from splatctrl_cli.simulate.recording import RecordingOptions
-    from splatctrl_cli.simulate.shared_workspace import DURATION_S
-    from splatctrl_cli.simulate.truth import truth_document
-
     default_s = 7.0 if args.human_arm is None else DURATION_S
     console = Console(args)
     options = RecordingOptions(
@@ -100,13 +101,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _record(folder: Path, options: "RecordingOptions", console: Console) -> "tuple[Truth, dict[str, int]]":
     """Write robot files and log; the truth and the number of frames by camera."""
-    from splatctrl_cli.logs.mcap_writer import mcap_log
-    from splatctrl_cli.records import JointState
-    from splatctrl_cli.robot.model import RobotModel
-    from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
-    from splatctrl_cli.simulate.recording import Recording
-    from splatctrl_cli.simulate.textures import luminance_std
-
     urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
     urdf.write_text(arm_urdf(), encoding="utf-8")
     spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
@@ -129,8 +123,6 @@ def _record(folder: Path, options: "RecordingOptions", console: Console) -> "tup
 
 
 def _truth(folder: Path, recording: "Recording", contrast: dict[str, float]) -> "Truth":
-    from splatctrl_cli.simulate.truth import Truth
-
     stamps, clearance = recording.clearances()
     return Truth(
         path=folder / "truth.json",
@@ -147,10 +139,6 @@ def _truth(folder: Path, recording: "Recording", contrast: dict[str, float]) -> 
 
 
 def _write_scan(folder: Path) -> None:
-    from splatctrl_cli.datasets.dtu import DtuView, write_dtu
-    from splatctrl_cli.datasets.idr import write_idr
-    from splatctrl_cli.simulate.turntable import object_mask, views
-
     scan = [
         DtuView(
             name=frame.camera,

@@ -3,13 +3,10 @@
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatctrl_cli.cli.numbers import real, several
 from splatctrl_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from splatctrl_cli.logs.options import CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.logs.options import CameraTopics, PoseTopic, SourceOptions
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
@@ -74,8 +71,6 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 
 def source_options(args: argparse.Namespace) -> "SourceOptions":
     """What `add_source` parsed. Raises UsageError for a value of the wrong form."""
-    from splatctrl_cli.logs.options import SourceOptions
-
     return SourceOptions(
         world_frame=args.world_frame,
         cameras=_names(args.cameras),
@@ -111,8 +106,6 @@ def _names(text: str | None) -> tuple[str, ...] | None:
 
 
 def _topics(text: str) -> "CameraTopics":
-    from splatctrl_cli.logs.options import CameraTopics
-
     name, equals, rest = text.partition("=")
     topics = rest.split(",")
     if not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)):
@@ -144,8 +137,6 @@ def _is_topic(text: str) -> bool:
 
 
 def _pose_topic(text: str) -> tuple[str, "PoseTopic"]:
-    from splatctrl_cli.logs.options import PoseTopic
-
     name, _, rest = text.partition("=")
     topic, at, frame = rest.partition("@")
     if not name or not topic or bool(at) != bool(frame):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.io import loadmat
 
 from splatctrl_cli.datasets.dtu import MILLIMETRES
 from splatctrl_cli.errors import InputError
@@ -95,8 +96,6 @@ def _array(path: Path, name: str, size: int) -> Float64:
 
 
 def _variable(path: Path, name: str) -> Any:
-    from scipy.io import loadmat
-
     if not path.is_file():
         raise InputError(f"{path}: no such file", remedy="give the folder ObsMask of DTU's SampleSet")
     try:

@@ -2,16 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field.layout import available_memory
 from splatctrl_cli.records import Float64
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 REACH = 8  # l, beyond which the kernel counts as zero
 MAX_ITERATIONS = 5000
@@ -45,8 +44,6 @@ def solve_process(
     largest: y of a Matern kernel is ``e^(r / l)``, which overflows. Raises UsageError where the matrix does not fit
     the memory or a group's values are too far apart, NotEvaluableError where the iteration does not converge.
     """
-    from scipy.sparse.csgraph import connected_components
-
     matrix = _kernel_matrix(centers, length, kernel, noise)
     num_groups, group = connected_components(matrix, directed=False)
     largest, smallest = np.full(num_groups, -np.inf), np.full(num_groups, np.inf)
@@ -102,9 +99,6 @@ def _not_solved(what: str) -> NotEvaluableError:
 
 def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: float) -> "csr_array":
     """``K + noise I`` (N, N), zero between centres further than 8 l apart."""
-    from scipy.sparse import csr_array, eye_array
-    from scipy.spatial import cKDTree
-
     tree = cKDTree(centers)
     num_pairs = int(tree.count_neighbors(tree, REACH * length))
     needed, free = BYTES_PER_PAIR * num_pairs, available_memory()

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 ROUGH_LENGTH = 10.0  # [m] from which on float32 costs the Gaussian kernel's distance 0.2 mm; at 100 m 5 cm
 MAX_SPREAD = 30.0  # of the radii: the largest over the smallest above zero
@@ -95,8 +96,6 @@ def _set_warnings(
 
 def median_spacing(centers: NDArray[np.floating]) -> float:
     """Median distance from a splat (N, 3) [m] to the nearest other one; 0 for fewer than two."""
-    from scipy.spatial import cKDTree
-
     if len(centers) < 2:
         return 0.0
     points = np.asarray(centers, dtype=np.float64)

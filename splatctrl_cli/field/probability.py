@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.special import log_ndtr, ndtr
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
@@ -47,8 +48,6 @@ class CalibratedProbability:
 
     def of(self, clearance: Float64) -> Float64:
         """Probability of clearances of any shape [m]."""
-        from scipy.special import ndtr
-
         return np.asarray(ndtr((self.mean - clearance) / self.sigma))
 
     def at(self, points: Float64, sdf: Float64) -> Float64:
@@ -137,8 +136,6 @@ def probability_of_occupancy(occupancy: Float64, explained: Float64) -> Float64:
 
     In logarithms: 1 - Phi loses what is small. Far away it is ``Phi(-3) / Phi(0) = 0.0027``, and not zero.
     """
-    from scipy.special import log_ndtr
-
     deviation = np.sqrt(np.maximum(1.0 - explained, LEAST_VARIANCE) / VARIANCE_DIVISOR)
     return np.asarray(np.exp(log_ndtr((occupancy - 1.0) / deviation) - log_ndtr(occupancy / deviation)))
 

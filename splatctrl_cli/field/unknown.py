@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.declared import check
@@ -93,8 +94,6 @@ class Cubes:
         of the largest difference of a coordinate less half a cell. Inside it is minus the distance to the nearest
         known centre, less half a cell, which the depth does not exceed.
         """
-        from scipy.ndimage import distance_transform_cdt, distance_transform_edt
-
         here = np.indices(is_unknown.shape, dtype=np.int32)
         distance, nearest = distance_transform_edt(~is_unknown, return_indices=True)
         away = (here - nearest).astype(np.float32)

@@ -5,6 +5,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfftn, rfftn
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64
@@ -93,8 +94,6 @@ def _own_terms(share: Float64, kernel: Float64) -> Float64:
 
 
 def _transformed_kernel(sampled: Float64) -> NDArray[np.complex128]:
-    from scipy.fft import rfftn
-
     size = len(sampled)
     padded = np.zeros((NODES,) * 3)
     padded[:size, :size, :size] = sampled
@@ -103,8 +102,6 @@ def _transformed_kernel(sampled: Float64) -> NDArray[np.complex128]:
 
 def _convolved(mass: Float64, transformed: NDArray[np.complex128]) -> Float64:
     """The circular convolution: what wraps around stays within `reach` of the block's faces."""
-    from scipy.fft import irfftn, rfftn
-
     return np.asarray(irfftn(rfftn(mass) * transformed, s=mass.shape))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from skimage.measure import marching_cubes
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.grid_files.grid_channels import CHUNK, check_grid
@@ -87,8 +88,6 @@ def _marching_cubes(
     slab: Float32, is_known: NDArray[np.bool_], level: float
 ) -> tuple[Float64, NDArray[np.int32]] | None:
     """Vertices [cells] and faces, None where no cube of eight known corners crosses `level`."""
-    from skimage.measure import marching_cubes
-
     whole = np.ones([n - 1 for n in slab.shape], bool)
     for corner in np.ndindex(2, 2, 2):
         whole &= is_known[tuple(slice(i, n - 1 + i) for i, n in zip(corner, slab.shape, strict=True))]

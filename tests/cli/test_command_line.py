@@ -17,7 +17,8 @@ import pytest
 
 from splatctrl_cli.captures.capture import write_capture
 from splatctrl_cli.cli import demo
-from splatctrl_cli.cli.main import COMMANDS, build_parser, main
+from splatctrl_cli.cli.main import build_parser, main
+from splatctrl_cli.cli.parser import COMMANDS
 from splatctrl_cli.evaluate.verdict import noted
 from splatctrl_cli.sources.source import open_source
 from tests.cli import here
@@ -271,7 +272,7 @@ def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
 
     build = build_parser
 
-    def parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
+    def parser(words: Sequence[str] | None = None) -> argparse.ArgumentParser:
         made = build(words)
         parse = made.parse_args
         made.parse_args = lambda *given: argparse.Namespace(**{**vars(parse(*given)), "run": step})  # type: ignore
@@ -280,7 +281,7 @@ def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
     monkeypatch.setattr(demo, "_pictures", lambda data, out, threads: {})
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr("splatctrl_cli.cli.main.build_parser", parser)
+        patch.setattr(demo, "build_parser", parser)
         args = build(["demo"]).parse_args(["demo", "-o", str(out)])
         assert demo.run(args) == 0
         said = capsys.readouterr()

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import export_check
+from splatctrl_cli.cli import export, export_check
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.splat_files import splats as splats_module
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.splat_files.isotropic import as_gaussians
 from splatctrl_cli.splat_files.splat_formats import FORMATS
@@ -114,7 +113,7 @@ def test_a_file_that_renders_differently_is_not_left_behind(
     def write_darker(path: Path, splats: SplatSet, comments: dict[str, str]) -> None:
         write_ply(path, replace(splats, colors=splats.colors * np.float32(0.999)), comments)
 
-    monkeypatch.setattr(splats_module, "write_ply", write_darker)
+    monkeypatch.setattr(export, "write_ply", write_darker)
     assert run(scene, "-o", scene.parent / "out.ply") == 6
     assert "out.ply: is not its source: color 0.000" in capsys.readouterr().err
     assert not list(scene.parent.glob("out.ply*"))

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatctrl_cli.cli import score, score_reference
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Float64, Intrinsics, Label, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
-from splatctrl_cli.scene_files import scene_folder
-from splatctrl_cli.sources import source
 from splatctrl_cli.splat_files.splats import write_ply
 
 INTRINSICS = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -133,8 +132,8 @@ def scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def set_up(monkeypatch: pytest.MonkeyPatch, scene: FakeScene, recording: FakeSource) -> None:
-    monkeypatch.setattr(scene_folder, "open_scene", lambda path: scene)
-    monkeypatch.setattr(source, "open_source", lambda path, options: recording)
+    monkeypatch.setattr(score, "open_scene", lambda path: scene)
+    monkeypatch.setattr(score_reference, "open_source", lambda path, options: recording)
 
 
 def run(folder: Path, *arguments: object) -> int:

@@ -15,7 +15,7 @@ import pytest
 from splatctrl_cli.cli import bake_run
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field import layout, slabs
+from splatctrl_cli.field import slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.layout import GridLayout
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
@@ -205,11 +205,11 @@ def test_openvdb_that_does_not_fit_the_memory_is_told_before_anything_is_baked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     grid = GridLayout(origin=np.zeros(3), voxel=0.1, shape=(100, 100, 100))
-    monkeypatch.setattr(layout, "available_memory", lambda: 27 * 10**6)
+    monkeypatch.setattr(bake_run, "available_memory", lambda: 27 * 10**6)
     bake_run.check_vdb(grid, ["sdf"], ["npz"])
     with pytest.raises(UsageError, match=r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats"):
         bake_run.check_vdb(grid, ["sdf"], ["npz", "vdb"])
-    monkeypatch.setattr(layout, "available_memory", lambda: 28 * 10**6)
+    monkeypatch.setattr(bake_run, "available_memory", lambda: 28 * 10**6)
     bake_run.check_vdb(grid, ["sdf"], ["npz", "vdb"])
 
 
