@@ -2,12 +2,13 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUNS := $(VENV)/.runs
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .PHONY: demo test lint types tests fmt bench docs native clean
 
-demo: $(STAMP)
+demo: $(RUNS)
 	$(BIN)/splatctrl demo --force -o demo_output
 
 test: lint types tests
@@ -36,9 +37,14 @@ native: $(STAMP)
 clean:
 	rm -rf $(VENV) build demo_output
 
-# Reinstalls when the build's inputs change; a repeated `make demo` starts at once.
-$(STAMP): pyproject.toml constraints.txt CMakeLists.txt $(wildcard splatctrl_cli/kernels/src/*)
+# What the commands need, and beside it what the tests need. Reinstalls when the build's inputs change.
+$(RUNS): pyproject.toml constraints.txt CMakeLists.txt $(wildcard splatctrl_cli/kernels/src/*)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) install -q -c constraints.txt torch==2.13.0 scikit-build-core nanobind cmake ninja
+	$(PIP) install -q -c constraints.txt scikit-build-core nanobind cmake ninja
+	$(PIP) install -q --no-build-isolation -c constraints.txt -e .
+	touch $(RUNS)
+
+$(STAMP): $(RUNS)
+	$(PIP) install -q -c constraints.txt torch==2.13.0
 	$(PIP) install -q --no-build-isolation -c constraints.txt -e '.[dev]'
 	touch $(STAMP)

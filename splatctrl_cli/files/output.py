@@ -19,7 +19,7 @@ from splatctrl_cli.files.output_lock import held, remove
 
 MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
 PARTIAL = ".partial"  # ends the name of an output that is not whole
-PACKAGES = ("numpy", "scipy", "torch", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
+PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin", "clarabel", "mcap", "rosbags")
 _WRITE_FAILURES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EBADF})
 WITH_PARTS = ("reconstruct", "sdf-bake", "replay")  # commands whose folders others rely on
 NO_PARTS = ("run.json", "checkpoint")  # what holds the digests, and what only an interrupted run reads
