@@ -49,6 +49,8 @@ INTERVENTIONS = frozenset(
 )
 """Kinds in which the controller did something else than it was asked for."""
 
+SHOWN = {"": "", "exact": "", "true": " (truth)"}  # measures whose events people are shown, with what it is called
+
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.control.explain import INTERVENTIONS, Event
+from splatctrl_cli.control.explain import INTERVENTIONS, SHOWN, Event
 from splatctrl_cli.records import Float64, FloatRows
 from splatctrl_cli.report.replay_pictures import (
     clearance_picture,
@@ -35,7 +35,7 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
     curves: dict[str, FloatRows] = {name: of.rows for name, of in replay.audit.clearance.items()}
     if replay.true_clearance is not None:
         curves["truth"] = replay.true_clearance
-    happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in ("", "exact"))
+    happened = _intervals(replay, lambda event: event.kind not in INTERVENTIONS and event.source in SHOWN)
     title = TITLES[replay.mode]
     if replay.closed_loop is not None and replay.start_time_s > 0:
         title += f", from {replay.start_time_s:.2f} s of the log"
@@ -68,9 +68,9 @@ def draw_replay(folder: Path, replay: "Replay", seconds: "Float64") -> None:
 def _intervals(
     replay: "Replay", is_shown: "Callable[[Event], bool]", *, at_least: Sequence[str] = ()
 ) -> dict[str, list[tuple[float, float]]]:
-    """First and last time [s] of the events that are shown, by kind; `at_least` these kinds, if empty."""
+    """First and last time [s] of the events that are shown, by kind and measure; `at_least` these kinds, if empty."""
     found: dict[str, list[tuple[float, float]]] = {kind: [] for kind in at_least}
     for event in replay.events:
         if is_shown(event):
-            found.setdefault(str(event.kind), []).append((event.start_s, event.end_s))
+            found.setdefault(f"{event.kind}{SHOWN.get(event.source, '')}", []).append((event.start_s, event.end_s))
     return found

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.explain import INTERVENTIONS, Event, first_intervention
+from splatctrl_cli.control.explain import INTERVENTIONS, SHOWN, Event, first_intervention
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 from splatctrl_cli.jobs import replay_compare
@@ -99,11 +99,13 @@ def when_and_why(replay: "Replay") -> list[str]:
     if replay.steps:
         first = first_intervention(replay.events)
         lines.append("first intervention: none" if first is None else f"first intervention: {told(first)}")
-    troubles = [event for event in replay.events if event.kind not in INTERVENTIONS and event.source in ("", "exact")]
-    for event in list({event.kind: event for event in reversed(troubles)}.values())[::-1]:
+    troubles = [event for event in replay.events if event.kind not in INTERVENTIONS and event.source in SHOWN]
+    for event in list({(event.kind, event.source): event for event in reversed(troubles)}.values())[::-1]:
         count = sum(other.kind == event.kind and other.source == event.source for other in troubles)
         told_once = told(event, with_kind=False)
-        lines.append(f"{event.kind}: {told_once}" + (f"; {count} such intervals" if count > 1 else ""))
+        lines.append(
+            f"{event.kind}{SHOWN[event.source]}: {told_once}" + (f"; {count} such intervals" if count > 1 else "")
+        )
     if replay.closed_loop is not None and replay.start_time_s > 0:
         lines.append(f"times count from the start, at {replay.start_time_s:.2f} s of the log")
     return lines or ["no event: no state is below the margin, outside its limits or in space that is not known"]

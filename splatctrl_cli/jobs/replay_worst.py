@@ -19,10 +19,15 @@ NAMES = {"exact": "exact", "barrier": "barrier", "certified": "certified bound"}
 
 
 def draw_worst_frames(folder: Path, inputs: "ReplayInputs", replay: "Replay", num: int) -> list[str]:
-    """Write worst_1.png (the least clearance), worst_2.png ... into a folder; returns what there is to say of it."""
+    """Write worst_1.png (the least clearance, by the truth where that is known), worst_2.png ... into a folder; returns
+    what there is to say of it.
+    """
 
     audit = replay.audit
-    states = worst_moments(audit.stamp_ns, audit.clearance["exact"].distance, num)
+    least = audit.clearance["exact"].distance
+    if replay.true_clearance is not None:
+        least = np.fmin(least, np.asarray(replay.true_clearance))
+    states = worst_moments(audit.stamp_ns, least, num)
     if not states or not inputs.source.has_clock:
         return []
     moments = [_moment(inputs, replay, state) for state in states]
