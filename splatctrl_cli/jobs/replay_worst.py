@@ -19,8 +19,8 @@ NAMES = {"exact": "exact", "barrier": "barrier", "certified": "certified bound"}
 
 
 def draw_worst_frames(folder: Path, inputs: "ReplayInputs", replay: "Replay", num: int) -> list[str]:
-    """Write worst_1.png (the least clearance, by the truth where that is known), worst_2.png ... into a folder; returns
-    what there is to say of it.
+    """Write worst_1.png (the least clearance, by the truth where that is known), worst_2.png ...; what there is to
+    say of it.
     """
 
     audit = replay.audit
