@@ -337,22 +337,21 @@ class Balls:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownVoxels:
-    """What was known of space at one moment, and how old that evidence is.
+class SeenVoxels:
+    """When cameras last saw each voxel: its centre is `origin` [m] + its index times the edge `voxel` [m].
 
     last_seen (X, Y, Z) uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which a camera
-    returned depth through or on the voxel, 0 never, `UNANSWERED` never although one looked at it. unrepresented: what
-    is occupied, not the robot, and has no splat.
+    returned depth through or on the voxel, 0 never, `UNANSWERED` never although one looked at it.
     """
 
-    grid: OccupancyGrid
+    origin: Float64
+    voxel: float
     last_seen: NDArray[np.uint16]
     step_stamps_ns: NDArray[np.int64]
-    unrepresented: Balls
 
     def last_seen_ns(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
         """points (Q, 3) [m], world -> stamps (Q,) [ns] at which their voxels were last seen; -1 never, or outside."""
-        cell = np.floor((points - self.grid.origin) / self.grid.voxel + 0.5)
+        cell = np.floor((points - self.origin) / self.voxel + 0.5)
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
         i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
         step = np.where(is_inside, self.last_seen[i, j, k], 0).astype(np.int64)
@@ -361,7 +360,31 @@ class KnownVoxels:
     @cached_property
     def unanswered(self) -> Float64:
         """Centres (K, 3) [m], world, of the voxels that a camera looked at and that never returned depth."""
-        return np.asarray(self.grid.origin + self.grid.voxel * np.argwhere(self.last_seen == UNANSWERED))
+        return np.asarray(self.origin + self.voxel * np.argwhere(self.last_seen == UNANSWERED))
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownVoxels:
+    """What was known of space at one moment, and how old that evidence is.
+
+    last_seen, step_stamps_ns: as `SeenVoxels` has them. unrepresented: what is occupied, not the robot, and has no
+    splat.
+    """
+
+    grid: OccupancyGrid
+    last_seen: NDArray[np.uint16]
+    step_stamps_ns: NDArray[np.int64]
+    unrepresented: Balls
+
+    @property
+    def seen(self) -> SeenVoxels:
+        """When its voxels were last seen."""
+        return SeenVoxels(
+            origin=self.grid.origin,
+            voxel=self.grid.voxel,
+            last_seen=self.last_seen,
+            step_stamps_ns=self.step_stamps_ns,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

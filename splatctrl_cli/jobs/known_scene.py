@@ -32,9 +32,9 @@ from splatctrl_cli.records import (
     DistanceField,
     DistanceGrid,
     Float64,
-    KnownVoxels,
     Label,
     OccupancyGrid,
+    SeenVoxels,
     SplatSet,
     VoxelState,
 )
@@ -213,9 +213,9 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
         return stamps[index] if index < len(stamps) - 1 else None  # the last is the final map
 
     @lru_cache(maxsize=HELD)
-    def voxels(index: int) -> KnownVoxels | None:
+    def voxels(index: int) -> SeenVoxels | None:
         is_last = not has_times or index == len(stamps) - 1
-        return scene.known() if is_last else scene.snapshot_at(stamps[index]).known()
+        return scene.seen() if is_last else scene.snapshot_at(stamps[index]).seen()
 
     def seen_at(stamp_ns: int) -> Seen | None:
         index = bisect_right(stamps, stamp_ns - latency_ns) - 1 if has_times else 0

@@ -31,7 +31,7 @@ from splatctrl_cli.logs.shot import ShotSource
 from splatctrl_cli.records import Float64, UInt8
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene_files.voxel_file import read_known_states, read_unrepresented
+from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.splat_files.splats import read_ply
 from splatctrl_cli.states.state_source import open_states
 
@@ -148,7 +148,7 @@ class Lockstep:
             self._take()
         self._fitted.check_found()
         known_at = fields_at(self._stamps_ns, self._latency_ns, self._files.__getitem__, self._fields)
-        voxels = lru_cache(maxsize=1)(lambda file: read_known_states(file.with_suffix(".npz")))
+        voxels = lru_cache(maxsize=1)(lambda file: read_seen(file.with_suffix(".npz")))
 
         def at(stamp_ns: int) -> KnownFields:
             self._advance(stamp_ns)

@@ -15,11 +15,12 @@ from typing import Any, TypeVar
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.output import PARTIAL
 from splatctrl_cli.files.parts import Parts
-from splatctrl_cli.records import Balls, GaussianSet, KnownVoxels, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Balls, GaussianSet, KnownVoxels, OccupancyGrid, SeenVoxels, SplatSet
 from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,
     read_known_states,
     read_occupancy,
+    read_seen,
     read_states,
     read_unrepresented,
 )
@@ -50,6 +51,10 @@ class Snapshot:
     def known(self) -> KnownVoxels | None:
         """What was known then of each voxel and when it was last seen; None in a scene of an older version."""
         return read_known_states(self._checked(self.occupancy_path)) if self._has_voxels else None
+
+    def seen(self) -> SeenVoxels | None:
+        """When each voxel was last seen; None in a scene of an older version."""
+        return read_seen(self._checked(self.occupancy_path)) if self._has_voxels else None
 
     def unrepresented(self) -> Balls | None:
         """The occupied voxels that had no splat then; None in a scene of an older version."""
@@ -201,6 +206,11 @@ class SceneFolder:
         """What was known at the end, and when it was last seen; None in a scene of an older version."""
         self._expect_isotropic()
         return read_known_occupancy(self.parts.checked(self.path / "occupancy.npz"))
+
+    def seen(self) -> SeenVoxels | None:
+        """When each voxel was last seen, at the end; None in a scene of an older version."""
+        self._expect_isotropic()
+        return read_seen(self.parts.checked(self.path / "occupancy.npz"))
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:

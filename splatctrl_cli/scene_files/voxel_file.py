@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
-from splatctrl_cli.records import UNANSWERED, Balls, KnownVoxels, OccupancyGrid, UInt8, VoxelState
+from splatctrl_cli.records import UNANSWERED, Balls, KnownVoxels, OccupancyGrid, SeenVoxels, UInt8, VoxelState
 
 MOST_VOXELS = 400_000_000  # as many as reconstruct makes
 _HEADER = 1 << 22  # bytes
@@ -82,6 +82,37 @@ def read_states(path: Path) -> OccupancyGrid:
         raise InputError(f"{path}: not the voxel states of a snapshot: {error}") from error
 
 
+def read_seen(path: Path) -> SeenVoxels | None:
+    """When the voxels of either file were last seen, and nothing else: a replay asks for it five times a second.
+
+    None where an older version wrote the file. Raises InputError for anything else.
+    """
+    try:
+        arrays = read_arrays(path, ("header", "last_seen"), most=_HEADER + 2 * MOST_VOXELS)
+        header = json.loads(str(arrays["header"]))
+        stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+        return SeenVoxels(
+            origin=np.array(header["origin"], np.float64),
+            voxel=float(header["voxel"]),
+            last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
+            step_stamps_ns=stamps_ns,
+        )
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        if _is_older(path):
+            return None
+        raise InputError(f"{path}: not a voxel file of ours: {error}") from error
+
+
+def _is_older(path: Path) -> bool:
+    """Whether a file of ours says nothing of evidence."""
+    try:
+        return "step_stamps_ns" not in json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+    except Exception:
+        return False
+
+
 def read_known_states(path: Path) -> KnownVoxels | None:
     """What `write_states` wrote, None where an older version did. Raises as `read_states`."""
     return _read_known(path, ("states",), _grid_of_states, "the voxel states of a snapshot")
@@ -129,14 +160,7 @@ def _read_known(
         arrays = read_arrays(path, (*names, *_EVIDENCE), most=22 * MOST_VOXELS)
         grid = grid_of(arrays, header)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
-        last_seen: NDArray[Any] = arrays["last_seen"]
-        if last_seen.dtype == np.uint8:
-            is_unanswered = (last_seen == _SHORT) & (len(stamps_ns) < _SHORT)
-            last_seen = np.where(is_unanswered, np.uint16(UNANSWERED), last_seen.astype(np.uint16))
-        last_seen = _voxels(last_seen, "last_seen", np.uint16, header)
-        latest = last_seen.max(initial=0, where=last_seen != UNANSWERED)
-        if latest > len(stamps_ns):
-            raise ValueError(f"last_seen: expected at most {len(stamps_ns)} time steps, got {latest}")
+        last_seen = _last_seen(arrays["last_seen"], header, len(stamps_ns))
         balls = _balls(arrays, grid.voxel)
         return KnownVoxels(grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls)
     except FileNotFoundError:
@@ -156,6 +180,23 @@ def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
 def _grid_of_states(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
     states = _voxels(arrays["states"], "states", np.uint8, header)
     return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
+
+
+def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[np.uint16]:
+    """In two bytes, whichever it was stored in. Raises ValueError for another shape, or steps that there are not."""
+    is_short = stored.dtype == np.uint8
+    stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
+    is_unanswered = stored == (_SHORT if is_short else UNANSWERED)
+    if is_short and num_steps >= _SHORT:
+        is_unanswered[:] = False
+    is_late = stored > num_steps
+    if np.count_nonzero(is_late) > np.count_nonzero(is_unanswered):
+        latest = stored[is_late & ~is_unanswered].max()
+        raise ValueError(f"last_seen: expected at most {num_steps} time steps, got {latest}")
+    last_seen = stored.astype(np.uint16)
+    if is_short:
+        last_seen[is_unanswered] = UNANSWERED
+    return last_seen
 
 
 def _balls(arrays: Arrays, voxel: float) -> Balls:

@@ -107,6 +107,6 @@ def test_steps_that_are_thinned_leave_it(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_fitted_scene_knows_it() -> None:
     fitter = SceneFitter(SceneConfig(max_splats=300, first_iterations=1, iterations_per_step=1), CONFIG, WORKSPACE)
     fitter.step([dark_block(0.0)])
-    known = fitter.known_voxels()
+    known = fitter.known_voxels().seen
     assert np.linalg.norm(known.unanswered - [0.0, 0.0, 0.5 * BLOCK], axis=1).min() < CONFIG.voxel
     assert (known.last_seen_ns(known.unanswered) == -1).all()

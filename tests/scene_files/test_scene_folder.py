@@ -19,6 +19,7 @@ from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,
     read_known_states,
     read_occupancy,
+    read_seen,
     read_states,
     write_occupancy,
     write_states,
@@ -180,18 +181,23 @@ def test_a_snapshot_says_when_a_voxel_was_last_seen_and_what_has_no_splat(tmp_pa
     write_occupancy(tmp_path / "b.npz", want)
     for again in (read_known_states(tmp_path / "a.npz"), read_known_occupancy(tmp_path / "b.npz")):
         assert again is not None
-        assert again.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
-        assert again.unanswered == pytest.approx(want.grid.origin + 0.05 * np.array([[2, 0, 1]]))
+        assert (again.last_seen == want.last_seen).all()
+        assert again.seen.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
         assert again.unrepresented.centers.tolist() == want.unrepresented.centers.tolist()
         assert again.unrepresented.labels.tolist() == [Label.HUMAN]
         assert again.unrepresented.radius == pytest.approx(0.025 * 3**0.5)
         assert again.unrepresented.volume == pytest.approx(0.05**3)
+    for name in ("a.npz", "b.npz"):
+        seen = read_seen(tmp_path / name)
+        assert seen is not None and (seen.last_seen == want.last_seen).all()
+        assert seen.last_seen_ns(points).tolist() == [10 * (num_steps - 1), 0, -1, -1]
+        assert seen.unanswered == pytest.approx(want.grid.origin + 0.05 * np.array([[2, 0, 1]]))
 
 
 def test_voxel_files_of_an_older_version_are_read_without_evidence(tmp_path: Path) -> None:
     header = {"origin": [0, 0, 0], "voxel": 0.1, "shape": [1, 1, 1]}
     np.savez(tmp_path / "a.npz", header=np.array(json.dumps(header)), states=np.full((1, 1, 1), 2, np.uint8))
-    assert read_known_states(tmp_path / "a.npz") is None
+    assert read_known_states(tmp_path / "a.npz") is None and read_seen(tmp_path / "a.npz") is None
     assert read_states(tmp_path / "a.npz").log_odds.item() == 20.0
 
 
@@ -209,6 +215,9 @@ def test_evidence_that_is_none_is_named(tmp_path: Path, changed: dict[str, NDArr
     savez(tmp_path / "a.npz", {**read_arrays(tmp_path / "a.npz", most=1 << 20), **changed})
     with pytest.raises(InputError, match=said):
         read_known_occupancy(tmp_path / "a.npz")
+    if "last_seen" in changed:
+        with pytest.raises(InputError, match=said):
+            read_seen(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize(
