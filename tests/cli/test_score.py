@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import score, score_reference
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.geometry import look_at
+from splatctrl_cli.jobs import score, score_reference
 from splatctrl_cli.records import Float64, Intrinsics, Label, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
 from splatctrl_cli.splat_files.splats import write_ply

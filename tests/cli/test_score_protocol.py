@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.cli.score_reference import _missing_views, is_folder_of_views
 from splatctrl_cli.datasets.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.datasets.dtu_source import DtuSource
 from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.datasets.protocols import score_protocol
 from splatctrl_cli.evaluate.cloud import spaced
+from splatctrl_cli.jobs.recording import is_folder_of_views
+from splatctrl_cli.jobs.score_reference import missing_views
 from splatctrl_cli.records import Float64
 from tests.datasets.make_idr import half_size
 from tests.files.make_observed import write_observed
@@ -216,10 +217,10 @@ def test_views_that_are_missing_are_named(
     assert main([*scene, "holdout:0,4", "-q"]) == 4
     assert "got no view 4; the scan has views 0-3, 5-7" in capsys.readouterr().err
     reference = DtuSource(tmp_path / "dtu", protocol=score_protocol("holdout:every5"))
-    first, second = _missing_views(reference, score_protocol("holdout:every5"))
+    first, second = missing_views(reference, score_protocol("holdout:every5"))
     assert first.startswith("dtu/scan1: views 4 are not there: 'holdout:every5' counts those that are, and scores")
     assert second == "rect_005_3_r5000.png: without depth, left out"
-    assert _missing_views(DtuSource(place / "mvsnet"), score_protocol("holdout:every5")) == []
+    assert missing_views(DtuSource(place / "mvsnet"), score_protocol("holdout:every5")) == []
 
 
 def surface(views: list[DtuView]) -> Float64:

@@ -1,23 +1,20 @@
 """Renders the views that are scored, from the splats of their time, and scores them one by one."""
 
-import argparse
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import isnan
-from pathlib import Path
 
-from splatctrl_cli.cli.common import Console
-from splatctrl_cli.cli.score_reference import Reference
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.doubts import Doubts
 from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
 from splatctrl_cli.evaluate.views import View, views_to_score
 from splatctrl_cli.evaluate.visibility import seen_pixels
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.score_reference import Reference
 from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
-from splatctrl_cli.report.view_picture import view_picture
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
@@ -31,30 +28,35 @@ class Scores:
     """
 
     has_clock: bool
-    views: list["ViewScore"] = field(default_factory=list)
+    views: list[ViewScore] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
-    best: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
-    worst: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
-    training: tuple["RgbdFrame", ...] = ()
+    best: dict[str, tuple[float, ComparisonRow]] = field(default_factory=dict)
+    worst: dict[str, tuple[float, ComparisonRow]] = field(default_factory=dict)
+    training: tuple[RgbdFrame, ...] = ()
     doubts: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scorer:
-    """Scores views of `reference`; every view's row of pictures goes to `draw`, where there is one."""
+    """Scores views of `reference`; every view's row of pictures goes to `draw`, where there is one.
 
-    args: argparse.Namespace
-    scene: "SceneFolder"
+    newest: a view is rendered from the newest snapshot not later than it, else from the final splats.
+    """
+
+    scene: SceneFolder
     reference: Reference
     cameras: tuple[str, ...]
-    perceptual: "Perceptual | None" = None
-    draw: "Callable[[ComparisonRow], None] | None" = None
+    perceptual: Perceptual | None = None
+    draw: Callable[[ComparisonRow], None] | None = None
+    newest: bool = True
+    allow_training: bool = False
+    threads: int = 0
 
-    def run(self, console: Console, stopwatch: "Stopwatch") -> Scores:
+    def run(self, progress: Progress, stopwatch: Stopwatch) -> Scores:
         """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
-        args, scene, source = self.args, self.scene, self.reference.source
+        scene, source = self.scene, self.reference.source
         has_clock = scene.has_clock and source.has_clock
-        splats_at = _SplatsAt(scene, use_snapshots=has_clock and args.snapshots == "newest")
+        splats_at = _SplatsAt(scene, use_snapshots=has_clock and self.newest)
         scores = Scores(has_clock=has_clock)
         views = views_to_score(
             source,
@@ -63,7 +65,7 @@ class Scorer:
             has_clock=has_clock,
             numbered_by_stamp=self.reference.numbered_by_stamp,
         )
-        may_train = args.allow_training or self.reference.scores_training
+        may_train = self.allow_training or self.reference.scores_training
         doubts = Doubts(is_still=not has_clock, may_train=may_train, mask_rule=self.reference.mask_rule)
         for view in views:
             if view.frame.stamp_ns in scene.training_stamps_ns and not may_train:
@@ -77,13 +79,13 @@ class Scorer:
             with stopwatch.stage("score"):
                 self._score_one(scores, doubts, view, splats_at(view.frame.stamp_ns))
             if len(scores.views) % 20 == 0:
-                console.log(f"scored {len(scores.views)} views")
+                progress.log(f"scored {len(scores.views)} views")
         self._check(scores)
         scores.doubts += [*self.reference.doubts, *doubts.lines()]
         return scores
 
     def _check(self, scores: Scores) -> None:
-        where, cameras = self.args.reference or self.args.dtu, ", ".join(self.cameras)
+        where, cameras = self.reference.where, ", ".join(self.cameras)
         if not scores.views:
             raise NotEvaluableError(
                 f"{where}: no view of {cameras} to score; {len(scores.skipped)} lie before the first snapshot of the"
@@ -96,9 +98,9 @@ class Scorer:
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",
             )
 
-    def _score_one(self, scores: Scores, doubts: "Doubts", view: "View", splats: "SplatSet | GaussianSet") -> None:
+    def _score_one(self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet) -> None:
         frame, protocol = view.frame, self.reference.protocol
-        rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.args.threads)
+        rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.threads)
         rendering = rendering.before(self.scene.background)
         depth = rendering.normalised_depth()
         mask = None if self.reference.mask is None else self.reference.mask(frame)
@@ -134,25 +136,30 @@ class Scorer:
             scores.worst[frame.camera] = (rank, row)
 
 
-def _figures(score: "ViewScore") -> str:
+def _figures(score: ViewScore) -> str:
     parts = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
     parts += [f"{score.masked.psnr:.1f} masked"] if score.masked is not None else []
     return "dB: " + ", ".join([*parts, f"{score.all.psnr:.1f} all"])
 
 
 def rendered(
-    splats: "SplatSet | GaussianSet", intrinsics: "Intrinsics", T_world_camera: "Float64", threads: int
-) -> "Rendering":
+    splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int
+) -> Rendering:
     """What a camera sees of splats of either kind."""
     if isinstance(splats, GaussianSet):
         return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
     return render(splats, intrinsics, T_world_camera, threads=threads)
 
 
+def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
+    """The splats of either kind that a scene ended with."""
+    return scene.gaussians() if scene.is_anisotropic else scene.splats()
+
+
 class _SplatsAt:
     """The splats that a view is rendered from; a snapshot is read once for all the views it serves."""
 
-    def __init__(self, scene: "SceneFolder", *, use_snapshots: bool) -> None:
+    def __init__(self, scene: SceneFolder, *, use_snapshots: bool) -> None:
         self._scene = scene
         self._stamps = [] if scene.is_anisotropic else sorted(snapshot.stamp_ns for snapshot in scene.snapshots)
         self._use_snapshots = use_snapshots
@@ -162,23 +169,11 @@ class _SplatsAt:
         """Whether the scene had a snapshot at that time."""
         return bool(self._stamps) and self._stamps[0] <= stamp_ns
 
-    def __call__(self, stamp_ns: int) -> "SplatSet | GaussianSet":
+    def __call__(self, stamp_ns: int) -> SplatSet | GaussianSet:
         number = bisect_right(self._stamps, stamp_ns) if self._use_snapshots else -1
         if self._loaded is None or self._loaded[0] != number:
             self._loaded = (number, self._read(stamp_ns))
         return self._loaded[1]
 
-    def _read(self, stamp_ns: int) -> "SplatSet | GaussianSet":
-        if self._scene.is_anisotropic:
-            return self._scene.gaussians()
-        return self._scene.splats_at(stamp_ns) if self._use_snapshots else self._scene.splats()
-
-
-def view_drawer(folder: Path) -> "Callable[[ComparisonRow], None]":
-    """Writes the pictures of each view into `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
-
-    def draw(row: "ComparisonRow") -> None:
-        view_picture(folder / f"{row.title}.png", row)
-
-    return draw
+    def _read(self, stamp_ns: int) -> SplatSet | GaussianSet:
+        return self._scene.splats_at(stamp_ns) if self._use_snapshots else final_splats(self._scene)
