@@ -29,47 +29,40 @@ PASSED_ON = ("out", "force", "images", "lpips", "allow_training", "allow_other_r
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
     parser = add_command(subparsers, "score", run)
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "scene",
         type=Path,
         nargs="?",
         metavar="SCENE",
         help="a folder that reconstruct wrote, or one of such folders, named like the scans of --dtu",
     )
-    reference = parser.add_mutually_exclusive_group(required=True)
-    reference.add_argument(
-        "--reference", type=Path, metavar="PATH", help="a log, a capture, or an image folder's TOML"
-    )
-    reference.add_argument(
-        "--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, or in IDR's and NeuS's"
-    )
+    either = parser.add_mutually_exclusive_group(required=True).add_argument
+    either("--reference", type=Path, metavar="PATH", help="a log, a capture, or an image folder's TOML")
+    either("--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, or in IDR's and NeuS's")
     add_scan(parser)
-    parser.add_argument(
-        "--masks", type=Path, metavar="DIR", help="object masks 000.png and so on, for MVSNet's layout"
-    )
-    parser.add_argument(
+    add("--masks", type=Path, metavar="DIR", help="object masks 000.png and so on, for MVSNet's layout")
+    add(
         "--snapshots",
         choices=("newest", "final"),
         default="newest",
         help="render each view from the newest snapshot not later than it, or all from the final splats",
     )
-    parser.add_argument("--allow-training", action="store_true", help="also score cameras that trained the scene")
-    parser.add_argument(
+    add("--allow-training", action="store_true", help="also score cameras that trained the scene")
+    add(
         "--allow-other-recording",
         action="store_true",
         help="go on where this is not the recording that made the scene",
     )
-    parser.add_argument(
+    add(
         "--images",
         choices=("all", "best-worst", "none"),
         default="best-worst",
         help="with -o: pictures of every view, of each camera's best and worst, or of none (default: best-worst)",
     )
-    parser.add_argument(
-        "--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none come along"
-    )
+    add("--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none come along")
     _add_cloud(parser.add_argument_group("surface"))
-    parser.add_argument(
+    add(
         "--baseline",
         type=Path,
         metavar="FILE",
@@ -84,33 +77,34 @@ def register(subparsers: Subparsers) -> None:
 
 def _add_cloud(group: argparse._ActionsContainer) -> None:
     """``--cloud`` and what goes with it."""
-    group.add_argument(
+    add = group.add_argument
+    add(
         "--cloud",
         type=Path,
         metavar="FILE",
         help="reference points (.ply) or mesh: accuracy, completeness, Chamfer; or a folder of stl024_total.ply or"
         " scan24.ply",
     )
-    group.add_argument(
+    add(
         "--cloud-masks",
         type=Path,
         metavar="DIR",
         help="DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where its own evaluation does",
     )
-    group.add_argument(
+    add(
         "--cloud-unit",
         type=real(1e-9, 1e3, "m"),
         metavar="M",
         help="metres per unit (default: 0.001 with --dtu, else 1)",
     )
-    group.add_argument(
+    add(
         "--cloud-max",
         type=real(1e-6, 1e3, "m"),
         default=0.02,
         metavar="M",
         help="farther points count in a share, not in a mean",
     )
-    group.add_argument(
+    add(
         "--cloud-spacing",
         type=real(1e-6, 1e3, "m"),
         default=0.0002,
@@ -121,19 +115,20 @@ def _add_cloud(group: argparse._ActionsContainer) -> None:
 
 def _add_fit(group: argparse._ActionsContainer) -> None:
     """``--fit`` and its options."""
-    group.add_argument(
+    add = group.add_argument
+    add(
         "--fit",
         action="store_true",
         help="fit the scans of --dtu (--scan A,B; default: all), or the image folder of --reference, with both"
         f" methods, then score them (default protocol of scans: {PROTOCOL})",
     )
-    group.add_argument(
+    add(
         "--fit-iterations",
         type=whole(1, MOST_ITERATIONS),
         metavar="N",
         help="of each method (default: those of the configuration, 2300)",
     )
-    group.add_argument(
+    add(
         "--fit-splats",
         type=setting(SceneConfig, "max_splats"),
         metavar="N",

@@ -90,11 +90,11 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def recording_of(args: argparse.Namespace, path: Path | None, masks: Path | None = None) -> RecordingRequest:
-    """What `add_source` and `add_scan` parsed: the recording at `path`, or that of --dtu."""
+def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
+    """What `add_source` and `add_scan` parsed: the recording at `path`, where there is no --dtu."""
     return RecordingRequest(
-        path=path,
-        dtu=args.dtu,
+        path=args.dtu or path,
+        is_dtu=args.dtu is not None,
         options=source_options(args),
         scan=args.scan,
         protocol=args.protocol,

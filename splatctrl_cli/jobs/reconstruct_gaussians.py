@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
@@ -14,7 +15,7 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult
 from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
 from splatctrl_cli.jobs.reconstruction import training_cameras
-from splatctrl_cli.records import Box, RecordSource, RgbdFrame
+from splatctrl_cli.records import RecordSource, RgbdFrame
 from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow, GaussianFitter
 from splatctrl_cli.scene.time_steps import depth_box
 from splatctrl_cli.scene_files.scene_folder import FORMAT
@@ -46,12 +47,23 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
             comments = {"format": FORMAT, "source": source.name}
             write_gaussian_ply(partial / "splats.ply", fitter.gaussians(), comments)
         figures = _figures(rows)
-        metrics = _views(frames) | figures | _space(fitter, workspace)
+        metrics = (
+            _views(frames)
+            | figures
+            | {
+                "background": list(fitter.background),
+                "workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()],
+            }
+        )
         counts = dict.fromkeys(GATED, len(frames))
-        gates = gate_reasons(request.require, {name: _number(figures[name]) for name in GATED}, counts)
+        values = {name: None if figures[name] is None else float(figures[name]) for name in GATED}
         verdict = verdict_of(
             "reconstruct",
-            [map_reason(rows[-1].gaussians), *loss_notes(source.loss), *gates],
+            [
+                map_reason(rows[-1].gaussians),
+                *loss_notes(source.loss),
+                *gate_reasons(request.require, values, counts),
+            ],
             scope=f"{len(frames)} views, {rows[-1].gaussians} Gaussians",
             is_damaged=bool(source.loss.damaged),
             counts=counts,
@@ -118,7 +130,7 @@ def _views(frames: list[RgbdFrame]) -> dict[str, object]:
     }
 
 
-def _figures(rows: list[GaussianAuditRow]) -> dict[str, float | None]:
+def _figures(rows: list[GaussianAuditRow]) -> dict[str, Any]:
     last = rows[-1]
     return {
         "iterations": last.iteration,
@@ -131,14 +143,3 @@ def _figures(rows: list[GaussianAuditRow]) -> dict[str, float | None]:
         "loss": last.loss,
         "psnr": last.psnr,
     }
-
-
-def _space(fitter: GaussianFitter, workspace: Box) -> dict[str, object]:
-    return {
-        "background": list(fitter.background),
-        "workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()],
-    }
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None else float(value)

@@ -17,29 +17,21 @@ from splatctrl_cli.sources.source import open_source
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingRequest:
-    """Either `path`, a log, a capture or an image folder, or `scan` (None: the only one) of the DTU data set `dtu`.
+    """path: a log, a capture or an image folder, or a DTU data set, of whose scans it is `scan` (None: the only one).
 
     options: how it is read; of a scan, its holdout alone. protocol: which views train and which are scored. masks,
     depths: folders with what the layout of the scan lacks. downscale: by how much its images are made smaller (None:
     down to the size of the protocol).
     """
 
-    path: Path | None = None
-    dtu: Path | None = None
+    path: Path
+    is_dtu: bool = False
     options: SourceOptions = field(default_factory=SourceOptions)
     scan: str | None = None
     protocol: str | None = None
     masks: Path | None = None
     depths: Path | None = None
     downscale: int | None = None
-
-    @property
-    def where(self) -> Path:
-        """The log, folder or data set. Raises UsageError for none."""
-        where = self.path or self.dtu
-        if where is None:
-            raise UsageError("recording: expected a path or a data set, got neither")
-        return where
 
 
 def open_to_train(
@@ -48,18 +40,18 @@ def open_to_train(
     """The recording without the views that it holds out. Raises UsageError for options that do not belong to it, and
     InputError for a scan without depth and for a camera that jumps farther than `max_pose_jump` [m].
     """
-    if recording.dtu is not None:
+    if recording.is_dtu:
         scan = open_dtu(recording)
         if needs_depth and not scan.has_depth:
             raise InputError(
-                f"{recording.dtu}: scan '{scan.name}' has no depth",
+                f"{recording.path}: scan '{scan.name}' has no depth",
                 remedy="give --depths DIR, or --points FILE.ply instead",
             )
         return scan
     refuse_scan_options(recording)
     if recording.protocol is not None:
         return open_held_out(recording)[0]
-    source = open_source(recording.where, recording.options)
+    source = open_source(recording.path, recording.options)
     check_pose_jumps(source, max_pose_jump)
     return source
 
@@ -67,7 +59,7 @@ def open_to_train(
 def open_dtu(recording: RecordingRequest) -> DtuSource:
     """A scan of a DTU data set."""
     return DtuSource(
-        recording.where,
+        recording.path,
         recording.scan,
         view_numbers(recording.options.holdout or ()),
         protocol=None if recording.protocol is None else score_protocol(recording.protocol),
@@ -79,7 +71,7 @@ def open_dtu(recording: RecordingRequest) -> DtuSource:
 
 def open_held_out(recording: RecordingRequest) -> tuple[RecordSource, ScoreProtocol, Split]:
     """An image folder with the views held out that the protocol holdout:RULE names, by their places in it."""
-    name, path = recording.protocol or "", recording.where
+    name, path = recording.protocol or "", recording.path
     protocol = score_protocol(name)
     if not is_folder_of_views(path) or not name.startswith("holdout:"):
         raise UsageError(

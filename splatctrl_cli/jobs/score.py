@@ -84,11 +84,14 @@ class ScoreRequest(Scoring):
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreResult:
-    """report: everything that ``score.json`` holds; the folder `out` where one was asked for."""
+    """report: everything that ``score.json`` holds; the folder `out` where one was asked for; first_view: photo and
+    render of the first view that was scored of one scene.
+    """
 
     report: Mapping[str, Any]
     verdict: Verdict
     out: Path | None = None
+    first_view: ComparisonRow | None = None
 
     @property
     def metrics(self) -> Mapping[str, float | None]:
@@ -125,6 +128,8 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
 def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
     """Score one scene, and write what is asked for into `folder`, where there is one."""
     stopwatch, recording = Stopwatch(), request.recording
+    if folder:
+        folder.mkdir(exist_ok=True)
     lpips = None if request.lpips is None else Lpips(request.lpips)
     scene = open_scene(request.scene)
     if scene.is_anisotropic:
@@ -173,7 +178,8 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
             {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scores.views
         ],
     }
-    result = _concluded(request, report, is_damaged=bool(reference.source.loss.damaged))
+    is_damaged = bool(reference.source.loss.damaged)
+    result = replace(_concluded(request, report, is_damaged=is_damaged), first_view=scores.first)
     if folder:
         with stopwatch.stage("pictures"):
             if request.images != "none":
@@ -231,8 +237,7 @@ def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
 
 
 def _draw_extremes(folder: Path, scores: Scores) -> None:
-    for camera, (_, best) in scores.best.items():
-        worst = scores.worst[camera][1]
+    for (_, best), (_, worst) in scores.extremes.values():
         comparison = [best] if worst.title == best.title else [best, worst]
         comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
 
@@ -265,26 +270,21 @@ def _write(
 
 
 def _scenes_of_scans(request: ScoreRequest) -> dict[str, Path]:
-    """The scenes by scan where the request's is a folder of them; empty where it is one, or of no data set.
-
-    Raises InputError naming a scan that is asked for and has none.
-    """
+    """The scenes by scan where the request's is a folder of them; empty where it is one, or of no data set."""
     folder, recording = request.scene, request.recording
-    if recording.dtu is None or not folder.is_dir() or (folder / "splats.ply").is_file():
+    if not recording.is_dtu or not folder.is_dir() or (folder / "splats.ply").is_file():
         return {}
     found = {path.name: path for path in sorted(folder.iterdir()) if (path / "splats.ply").is_file()}
-    if not found or recording.scan is None:
-        return found
-    wanted = scan_names(recording.scan)
-    missing = [name for name in wanted if name not in found]
-    if missing:
-        raise InputError(f"{folder}: no scene '{missing[0]}'", remedy=f"scenes: {', '.join(found)}")
-    return {name: found[name] for name in wanted}
+    return {name: found[name] for name in chosen(list(found), recording.scan, folder, "scene")} if found else {}
 
 
-def scan_names(text: str) -> list[str]:
-    """The names between commas, each once."""
-    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+def chosen(known: Sequence[str], text: str | None, where: Path, noun: str) -> list[str]:
+    """The names between commas, each once; all that are known for None. Raises InputError for one that is not."""
+    wanted = known if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in wanted if name not in known]
+    if unknown:
+        raise InputError(f"{where}: no {noun} {unknown[0]!r}", remedy=f"{noun}s: {', '.join(known)}")
+    return list(dict.fromkeys(wanted))
 
 
 def _score_scans(
@@ -294,14 +294,11 @@ def _score_scans(
     results: dict[str, ScoreResult] = {}
     for scan, scene in scenes.items():
         progress.log(f"{scan}: scores {scene}")
-        place = None if folder is None else folder / scan
-        if place is not None:
-            place.mkdir()
         recording = of_scan(request.recording, scan)
         # the means alone are held to gates and a baseline
         alone = replace(request, scene=scene, recording=recording, require=(), baseline=None)
-        results[scan] = score_scene(alone, place, progress)
-    report = {"scenes": str(request.scene), "reference": str(request.recording.where)}
+        results[scan] = score_scene(alone, folder and folder / scan, progress)
+    report = {"scenes": str(request.scene), "reference": str(request.recording.path)}
     report |= report_of_scans({scan: result.report for scan, result in results.items()})
     is_damaged = any(result.verdict.is_damaged for result in results.values())
     result = _concluded(request, report, is_damaged=is_damaged)

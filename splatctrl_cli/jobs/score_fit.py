@@ -2,7 +2,7 @@
 
 import gc
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -18,18 +18,14 @@ from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.evaluate.score_report import AVERAGING, judged, mean_of
-from splatctrl_cli.evaluate.views import views_to_score
 from splatctrl_cli.files.output import Stopwatch, output_path, write_json, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.recording import RecordingRequest, is_folder_of_views, open_to_train
-from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, Scoring, scan_names, score_scene
-from splatctrl_cli.jobs.score_reference import cameras_to_score, open_reference
-from splatctrl_cli.jobs.score_views import final_splats, rendered
+from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, Scoring, chosen, score_scene
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.report.view_picture import renders_picture
-from splatctrl_cli.scene_files.scene_folder import open_scene
 
 NUM_SPLATS = 10_000  # IV-A: what both methods begin with, and the budget of ours
 PROTOCOL = "dtu-holdout8"  # the paper names neither scans nor views
@@ -79,18 +75,18 @@ class FitRequest(Scoring):
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
     """One method on one scan: its scene, the peak memory [MiB] of this process during the fit (None where the system
-    does not tell), and the report on its views.
+    does not tell), and the score of its views.
     """
 
     scan: str
     method: str
     scene: ReconstructResult
     memory: float | None
-    report: Mapping[str, Any]
+    score: ScoreResult
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; psnr [dB] by the protocol: over the mask where there is one."""
-        metrics = self.report["metrics"]
+        metrics = self.score.report["metrics"]
         return {
             "scan": self.scan,
             "method": self.method,
@@ -121,20 +117,15 @@ def score_fits(request: FitRequest, progress: Progress = SILENT) -> ScoreResult:
             for method, about in METHODS.items():
                 progress.log(f"{scan}: fits {about.name}, {request.iterations} iterations")
                 made[method] = _reconstruct(request, scoring, method, folder / scan / method / "scene")
-            for method, (
-                scene,
-                memory,
-            ) in made.items():  # after both fits: what scoring leaves in memory is of neither
-                place = folder / scan / method / "score" if request.out is not None else None
-                if place is not None:
-                    place.mkdir()
-                report = score_scene(replace(scoring, scene=scene.out), place, progress).report
-                fits.append(Fitted(scan=scan, method=method, scene=scene, memory=memory, report=report))
+            # scored after both were fitted: what scoring leaves in memory then counts for neither
+            for method, (scene, memory) in made.items():
+                place = None if request.out is None else folder / scan / method / "score"
+                score = score_scene(replace(scoring, scene=scene.out), place, progress)
+                fits.append(Fitted(scan=scan, method=method, scene=scene, memory=memory, score=score))
             if request.out is not None and request.images != "none":
-                scenes = {method.name: folder / scan / name / "scene" for name, method in METHODS.items()}
-                _draw(scoring, scenes, folder / scan / "methods.png", progress)
+                _draw(folder / scan / "methods.png", fits[-len(METHODS) :])
         report = _report(request, fits)
-        num_views = min(fit.report["metrics"]["num_views"] for fit in fits)
+        num_views = min(fit.score.report["metrics"]["num_views"] for fit in fits)
         verdict = judged(
             dict.fromkeys(GATED, None) | report["metrics"],
             report["warnings"],
@@ -152,18 +143,18 @@ def score_fits(request: FitRequest, progress: Progress = SILENT) -> ScoreResult:
 def _checked(request: FitRequest) -> FitRequest:
     """The request with its defaults. Raises for what is better refused now than after the fits."""
     recording, holdout = request.recording, request.recording.options.holdout
-    if recording.dtu is not None and holdout:
+    if recording.is_dtu and holdout:
         raise UsageError("--fit: goes by a protocol", remedy=f"give --protocol holdout:{','.join(holdout)}")
-    if recording.dtu is None and not is_folder_of_views(recording.where):
+    if not recording.is_dtu and not is_folder_of_views(recording.path):
         raise UsageError(
-            f"--fit: expected scans (--dtu) or an image folder, got {recording.where}",
+            f"--fit: expected scans (--dtu) or an image folder, got {recording.path}",
             remedy="the baseline fits views of a scene that stands still",
         )
     if request.lpips is not None:
         Lpips(request.lpips)
     scene = load_config(request.config, request.settings).scene
     check_gate_names(request.require, GATED)
-    if recording.dtu is not None:
+    if recording.is_dtu:
         recording = replace(recording, protocol=recording.protocol or PROTOCOL)
     iterations = request.iterations
     if iterations is None:
@@ -174,16 +165,14 @@ def _checked(request: FitRequest) -> FitRequest:
 
 
 def _scans(recording: RecordingRequest) -> list[str]:
-    root = recording.dtu
-    if root is None:
-        return [recording.where.stem]
+    root = recording.path
+    if not recording.is_dtu:
+        return [root.stem]
     found = idr_scans(root) if not (root / "Rectified").is_dir() else {}
     known = list(found or scan_folders(root))
-    wanted = known if recording.scan is None else scan_names(recording.scan)
-    unknown = [name for name in wanted if name not in known]
-    if unknown or not wanted:
-        got = f"no scan {unknown[0]!r}" if unknown else "no scan"
-        raise InputError(f"{root}: {got}", remedy=f"scans: {', '.join(known) or 'none is there'}")
+    wanted = chosen(known, recording.scan, root, "scan")
+    if not wanted:
+        raise InputError(f"{root}: no scan", remedy=f"scans: {', '.join(known) or 'none is there'}")
     return wanted
 
 
@@ -201,7 +190,7 @@ def _folder(request: FitRequest) -> Iterator[Path]:
 def _scoring(request: FitRequest, scan: str) -> ScoreRequest:
     """How the scenes of one scan are scored; the gates are on both fits together."""
     recording = request.recording
-    if recording.dtu is not None:
+    if recording.is_dtu:
         masks = recording.masks
         if masks is not None and (masks / scan).is_dir():
             masks = masks / scan
@@ -259,28 +248,15 @@ def _config(request: FitRequest) -> Config:
     return replace(config, scene=replace(config.scene, max_splats=request.num_splats))
 
 
-def _draw(scoring: ScoreRequest, scenes: dict[str, Path], path: Path, progress: Progress) -> None:
-    """The first view that is scored, as photographed and as rendered from each of `scenes`, by method."""
-    opened = {name: open_scene(scene) for name, scene in scenes.items()}
-    training = next(iter(opened.values())).cameras
-    reference = open_reference(scoring.recording, progress)
-    wanted = scoring.recording.options.cameras
-    view = next(
-        views_to_score(
-            reference.source,
-            scoring=cameras_to_score(wanted, reference, training, allow_training=scoring.allow_training),
-            training=training,
-            has_clock=False,
-            numbered_by_stamp=reference.numbered_by_stamp,
-        )
-    )
-    frame, renders = view.frame, {}
-    for name, scene in opened.items():
-        splats = final_splats(scene)
-        rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, scoring.threads)
-        color = np.clip(rendering.before(scene.background).color, 0.0, 1.0)
-        renders[f"{name}   {psnr(color, frame.color / 255.0):.1f} dB all, {len(splats):,} splats"] = color
-    renders_picture(path, view.name, frame.color, renders)
+def _draw(path: Path, fits: Sequence[Fitted]) -> None:
+    """The first view that was scored, as photographed and as rendered from the scene of each of `fits`."""
+    views = [fit.score.first_view for fit in fits if fit.score.first_view is not None]
+    renders = {}
+    for fit, view in zip(fits, views, strict=True):
+        color = np.clip(view.render, 0.0, 1.0)
+        figures = f"{psnr(color, view.photo / 255.0):.1f} dB all, {fit.scene.metrics['splats']:,} splats"
+        renders[f"{METHODS[fit.method].name}   {figures}"] = color
+    renders_picture(path, views[0].title, views[0].photo, renders)
 
 
 def _report(request: FitRequest, fits: Sequence[Fitted]) -> dict[str, Any]:
@@ -294,12 +270,14 @@ def _report(request: FitRequest, fits: Sequence[Fitted]) -> dict[str, Any]:
         metrics |= {f"{what}_{method.key}": value for what, value in means.items()}
     ours, theirs = metrics["psnr_ours"], metrics["psnr_3dgs"]
     metrics["psnr_gain"] = None if ours is None or theirs is None else ours - theirs
-    first = fits[0].report["protocol"]
+    first = fits[0].score.report["protocol"]
     scans = list(dict.fromkeys(fit.scan for fit in fits))
-    warnings = [f"{fit.scan}, {METHODS[fit.method].name}: {line}" for fit in fits for line in fit.report["warnings"]]
+    warnings = [
+        f"{fit.scan}, {METHODS[fit.method].name}: {line}" for fit in fits for line in fit.score.report["warnings"]
+    ]
     metrics |= {"num_scans": len(scans), "num_warnings": len(warnings)}
     return {
-        "source": str(request.recording.dtu or request.recording.where),
+        "source": str(request.recording.path),
         "scans": scans,
         "protocol": first | {"averaging": AVERAGING + (" of a scan, then over the scans" if len(scans) > 1 else "")},
         "psnr": "over every pixel" if first["mask_rule"] == "none" else "over the mask",

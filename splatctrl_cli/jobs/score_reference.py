@@ -47,10 +47,10 @@ class Reference:
 
 def open_reference(recording: RecordingRequest, progress: Progress) -> Reference:
     """The recording with all its cameras: those chosen are scored, the others say what was seen."""
-    if recording.dtu is not None:
+    if recording.is_dtu:
         return _dtu_reference(recording, progress)
     refuse_scan_options(recording)
-    where = recording.where
+    where = recording.path
     if recording.protocol is None:
         return Reference(where=where, source=open_source(where, replace(recording.options, cameras=None)))
     source, protocol, split = open_held_out(recording)
@@ -75,7 +75,7 @@ def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference
             " pixel counts here; --masks DIR gives the masks"
         )
     return Reference(
-        where=recording.where,
+        where=recording.path,
         source=source,
         layout=f"{source.layout}'s",
         scan=source.scan,

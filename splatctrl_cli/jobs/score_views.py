@@ -4,6 +4,7 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import isnan
+from operator import itemgetter
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.doubts import Doubts
@@ -19,10 +20,14 @@ from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
 
+Ranked = tuple[float, ComparisonRow]
+"""PSNR [dB] over what was seen, or over all, and the view."""
+
 
 @dataclass(kw_only=True)
 class Scores:
-    """What scoring gathers: the views, the names of those before the first snapshot, each camera's extremes.
+    """What scoring gathers: the views, the names of those before the first snapshot, the pictures of the first view
+    and of each camera's best and worst.
 
     training: the frames that count as known at the last view; doubts: what speaks against the scores, in words.
     """
@@ -30,8 +35,8 @@ class Scores:
     has_clock: bool
     views: list[ViewScore] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
-    best: dict[str, tuple[float, ComparisonRow]] = field(default_factory=dict)
-    worst: dict[str, tuple[float, ComparisonRow]] = field(default_factory=dict)
+    first: ComparisonRow | None = None
+    extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
     training: tuple[RgbdFrame, ...] = ()
     doubts: list[str] = field(default_factory=list)
 
@@ -130,10 +135,10 @@ class Scorer:
         )
         if self.draw is not None:
             self.draw(row)
-        if frame.camera not in scores.best or rank > scores.best[frame.camera][0]:
-            scores.best[frame.camera] = (rank, row)
-        if frame.camera not in scores.worst or rank < scores.worst[frame.camera][0]:
-            scores.worst[frame.camera] = (rank, row)
+        scores.first = scores.first or row
+        best, worst = scores.extremes.get(frame.camera, ((rank, row), (rank, row)))
+        ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
+        scores.extremes[frame.camera] = ends
 
 
 def _figures(score: ViewScore) -> str:
