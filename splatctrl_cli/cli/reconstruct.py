@@ -31,16 +31,7 @@ DECIDING_OPTIONS = (
     *("holdout", "scan", "box"),
 )  # what decides the bytes of a scene, beside the configuration
 PASSED_ON = (
-    "urdf",
-    "spheres",
-    "points",
-    "declare",
-    "allow_disagreement",
-    "force",
-    "resume",
-    "seed",
-    "threads",
-    "require",
+    *("urdf", "spheres", "points", "declare", "allow_disagreement", "force", "resume", "seed", "threads", "require"),
 )
 
 

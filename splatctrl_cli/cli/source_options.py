@@ -96,11 +96,8 @@ def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None
         path=args.dtu or path,
         is_dtu=args.dtu is not None,
         options=source_options(args),
-        scan=args.scan,
-        protocol=args.protocol,
         masks=masks,
-        depths=args.depths,
-        downscale=args.downscale,
+        **{name: getattr(args, name) for name in ("scan", "protocol", "depths", "downscale")},
     )
 
 

@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
@@ -119,10 +119,15 @@ def score(request: ScoreRequest, progress: Progress = SILENT) -> ScoreResult:
     names = NAMES if request.baseline is None else NAMES_WITH_CHANGES
     check_gate_names(request.require, names, {"--baseline": NAMES_WITH_CHANGES})
     scenes = _scenes_of_scans(request)
-    with output_path(request.out, force=request.force, is_folder=True) if request.out else nullcontext() as folder:
+    with folder_of(request) or nullcontext() as folder:
         if scenes:
             return _score_scans(request, scenes, folder, progress)
         return score_scene(request, folder, progress)
+
+
+def folder_of(request: Scoring) -> AbstractContextManager[Path] | None:
+    """The output folder while it is written, None where nothing is."""
+    return output_path(request.out, force=request.force, is_folder=True) if request.out else None
 
 
 def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) -> ScoreResult:
@@ -181,12 +186,14 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
     is_damaged = bool(reference.source.loss.damaged)
     result = replace(_concluded(request, report, is_damaged=is_damaged), first_view=scores.first)
     if folder:
+        _write_table(folder / "views.csv", report["views"])
         with stopwatch.stage("pictures"):
-            if request.images != "none":
-                _draw_extremes(folder, scores)
+            for (_, best), (_, worst) in scores.extremes.values() if request.images != "none" else ():
+                comparison = [best] if worst.title == best.title else [best, worst]
+                comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
         config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
         inputs = {**digests, "scene/splats.ply": sha256(request.scene / "splats.ply")}
-        _write(folder, "views.csv", report["views"], result, config=config, inputs=inputs, stopwatch=stopwatch)
+        write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
     return result
 
 
@@ -236,35 +243,32 @@ def _view_drawer(folder: Path) -> Callable[[ComparisonRow], None]:
     return lambda row: view_picture(folder / f"{row.title}.png", row)
 
 
-def _draw_extremes(folder: Path, scores: Scores) -> None:
-    for (_, best), (_, worst) in scores.extremes.values():
-        comparison = [best] if worst.title == best.title else [best, worst]
-        comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        table = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
 
 
-def _write(
+def write_result(
     folder: Path,
-    name: str,
-    rows: Sequence[Mapping[str, Any]],
     result: ScoreResult,
     *,
     config: Mapping[str, Any],
-    inputs: Mapping[str, str],
-    stopwatch: Stopwatch,
+    inputs: Mapping[str, str] | None = None,
+    stopwatch: Stopwatch | None = None,
+    seed: int = 0,
 ) -> None:
-    """``score.json``, the table `name` of the rows, and ``run.json``."""
+    """``score.json`` and ``run.json``."""
     write_json(folder / "score.json", result.report)
-    with (folder / name).open("w", newline="", encoding="utf-8") as stream:
-        table = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator="\n", extrasaction="ignore")
-        table.writeheader()
-        table.writerows(rows)
     write_run(
         folder,
         command="score",
         config=config,
-        inputs=inputs,
+        inputs=inputs or {},
         metrics=result.metrics,
-        stopwatch=stopwatch,
+        stopwatch=stopwatch or Stopwatch(),
+        seed=seed,
         verdict=result.verdict.as_dict(),
     )
 
@@ -305,7 +309,8 @@ def _score_scans(
     if folder is not None:
         names = [name for name in result.metrics if name != "num_scans" and not name.startswith(PREFIX)]
         rows = [{"scan": scan, **{n: one.metrics.get(n) for n in names}} for scan, one in results.items()]
-        _write(folder, "scans.csv", rows, result, config={"scans": report["scans"]}, inputs={}, stopwatch=Stopwatch())
+        _write_table(folder / "scans.csv", rows)
+        write_result(folder, result, config={"scans": report["scans"]})
     return result
 
 

@@ -2,8 +2,7 @@
 
 import gc
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,11 @@ from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.evaluate.score_report import AVERAGING, judged, mean_of
-from splatctrl_cli.files.output import Stopwatch, output_path, write_json, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.recording import RecordingRequest, is_folder_of_views, open_to_train
-from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, Scoring, chosen, score_scene
+from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, Scoring, chosen, folder_of, score_scene, write_result
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.report.view_picture import renders_picture
 
@@ -110,7 +108,8 @@ def score_fits(request: FitRequest, progress: Progress = SILENT) -> ScoreResult:
         for scan in scans:
             request.cloud.of_scan(scan)
     fits: list[Fitted] = []
-    with _folder(request) as folder:
+    with folder_of(request) or tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
         for scan in scans:
             scoring = _scoring(request, scan)
             made = {}
@@ -119,8 +118,8 @@ def score_fits(request: FitRequest, progress: Progress = SILENT) -> ScoreResult:
                 made[method] = _reconstruct(request, scoring, method, folder / scan / method / "scene")
             # scored after both were fitted: what scoring leaves in memory then counts for neither
             for method, (scene, memory) in made.items():
-                place = None if request.out is None else folder / scan / method / "score"
-                score = score_scene(replace(scoring, scene=scene.out), place, progress)
+                kept = None if request.out is None else folder / scan / method / "score"
+                score = score_scene(replace(scoring, scene=scene.out), kept, progress)
                 fits.append(Fitted(scan=scan, method=method, scene=scene, memory=memory, score=score))
             if request.out is not None and request.images != "none":
                 _draw(folder / scan / "methods.png", fits[-len(METHODS) :])
@@ -136,7 +135,8 @@ def score_fits(request: FitRequest, progress: Progress = SILENT) -> ScoreResult:
         )
         result = ScoreResult(report=report, verdict=verdict, out=request.out)
         if request.out is not None:
-            _write(folder, request, result)
+            config = load_config(request.config, request.settings).as_dict()
+            write_result(folder, result, config=config, seed=request.seed)
     return result
 
 
@@ -174,17 +174,6 @@ def _scans(recording: RecordingRequest) -> list[str]:
     if not wanted:
         raise InputError(f"{root}: no scan", remedy=f"scans: {', '.join(known) or 'none is there'}")
     return wanted
-
-
-@contextmanager
-def _folder(request: FitRequest) -> Iterator[Path]:
-    """Where the scenes go: the output, or a place for the time of the run."""
-    if request.out is None:
-        with tempfile.TemporaryDirectory() as folder:
-            yield Path(folder)
-        return
-    with output_path(request.out, force=request.force, is_folder=True) as partial:
-        yield partial
 
 
 def _scoring(request: FitRequest, scan: str) -> ScoreRequest:
@@ -292,17 +281,3 @@ def _report(request: FitRequest, fits: Sequence[Fitted]) -> dict[str, Any]:
         "warnings": warnings,
         "fits": [fit.as_dict() for fit in fits],
     }
-
-
-def _write(folder: Path, request: FitRequest, result: ScoreResult) -> None:
-    write_json(folder / "score.json", result.report)
-    write_run(
-        folder,
-        command="score",
-        config=load_config(request.config, request.settings).as_dict(),
-        inputs={},
-        metrics=result.metrics,
-        stopwatch=Stopwatch(),
-        seed=request.seed,
-        verdict=result.verdict.as_dict(),
-    )

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from math import isnan
 from operator import itemgetter
 
@@ -61,7 +62,12 @@ class Scorer:
         """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
         scene, source = self.scene, self.reference.source
         has_clock = scene.has_clock and source.has_clock
-        splats_at = _SplatsAt(scene, use_snapshots=has_clock and self.newest)
+        stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
+
+        @lru_cache(maxsize=1)  # a snapshot is read once for all the views it serves
+        def splats_at(stamp_ns: int | None) -> SplatSet | GaussianSet:
+            return final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
+
         scores = Scores(has_clock=has_clock)
         views = views_to_score(
             source,
@@ -78,11 +84,13 @@ class Scorer:
                     f"{view.name}: trained the scene, its score says nothing about other views",
                     remedy="give the --holdout or --protocol that reconstruct was given, or --allow-training",
                 )
-            if has_clock and not splats_at.is_known(view.frame.stamp_ns):
+            num_known = bisect_right(stamps, view.frame.stamp_ns)
+            if has_clock and not num_known:
                 scores.skipped.append(view.name)
                 continue
             with stopwatch.stage("score"):
-                self._score_one(scores, doubts, view, splats_at(view.frame.stamp_ns))
+                splats = splats_at(stamps[num_known - 1] if has_clock and self.newest else None)
+                self._score_one(scores, doubts, view, splats)
             if len(scores.views) % 20 == 0:
                 progress.log(f"scored {len(scores.views)} views")
         self._check(scores)
@@ -159,26 +167,3 @@ def rendered(
 def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
     """The splats of either kind that a scene ended with."""
     return scene.gaussians() if scene.is_anisotropic else scene.splats()
-
-
-class _SplatsAt:
-    """The splats that a view is rendered from; a snapshot is read once for all the views it serves."""
-
-    def __init__(self, scene: SceneFolder, *, use_snapshots: bool) -> None:
-        self._scene = scene
-        self._stamps = [] if scene.is_anisotropic else sorted(snapshot.stamp_ns for snapshot in scene.snapshots)
-        self._use_snapshots = use_snapshots
-        self._loaded: tuple[int, SplatSet | GaussianSet] | None = None
-
-    def is_known(self, stamp_ns: int) -> bool:
-        """Whether the scene had a snapshot at that time."""
-        return bool(self._stamps) and self._stamps[0] <= stamp_ns
-
-    def __call__(self, stamp_ns: int) -> SplatSet | GaussianSet:
-        number = bisect_right(self._stamps, stamp_ns) if self._use_snapshots else -1
-        if self._loaded is None or self._loaded[0] != number:
-            self._loaded = (number, self._read(stamp_ns))
-        return self._loaded[1]
-
-    def _read(self, stamp_ns: int) -> SplatSet | GaussianSet:
-        return self._scene.splats_at(stamp_ns) if self._use_snapshots else final_splats(self._scene)
