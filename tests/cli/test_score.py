@@ -60,6 +60,11 @@ def test_damaged_input_exits_3(scored: Path, monkeypatch: pytest.MonkeyPatch) ->
         (["--require", "psnr_seen>=nan"], 2, "--require psnr_seen>=nan: expected METRIC>=NUMBER"),
         (["--scan", "scan1"], 2, "--scan scan1: only with --dtu"),
         (["--dtu", "root"], 2, "not allowed with argument"),
+        (["--images", "all"], 2, "--images all: expected a folder for them; give -o"),
+        (["--seed", "3"], 2, "--seed: only with --fit"),
+        (["--fit-iterations", "3"], 2, "--fit-iterations: only with --fit"),
+        (["--cloud-unit", "1"], 2, "--cloud-unit: only with --cloud"),
+        (["--cloud", "a.ply", "--cloud-max", "0"], 2, "--cloud-max: expected 1e-06 to 1000 m, got '0'"),
     ],
 )
 def test_bad_usage_names_the_thing_and_the_choices(
