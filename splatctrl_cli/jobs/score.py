@@ -37,7 +37,7 @@ from splatctrl_cli.jobs.score_reference import (
     open_reference,
     recording_check,
 )
-from splatctrl_cli.jobs.score_views import Scorer, Scores
+from splatctrl_cli.jobs.score_views import Ranked, Scorer, Scores
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture
 from splatctrl_cli.report.view_picture import view_picture
@@ -162,39 +162,56 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
     if cloud is not None:
         with stopwatch.stage("cloud"):
             surface = cloud_figures(cloud, scene, scores.training, request.threads)
-    definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
     protocol = _protocol(reference, scene, scores, None if lpips is None else lpips.name)
+    definitions = PROTOCOL | ({} if cloud is None else {"cloud": cloud.words()})
     metrics = total_score(scores.views) | surface
     metrics |= {"free_mass": _free_mass(request.scene, scene), "num_skipped": len(scores.skipped)}
     metrics["num_warnings"] = len(scores.doubts) + len(same["differences"])
-    report: dict[str, Any] = {
-        "scene": str(request.scene),
-        "reference": str(reference.where),
-        "cameras": list(scorer.cameras),
-        "training_cameras": list(scene.cameras),
-        "has_clock": scores.has_clock,
-        "snapshots": "newest" if scores.has_clock and request.newest else "final",
-        "recording": same,
-        "protocol": protocol | {"definitions": definitions},
-        "metrics": as_json(metrics),
-        "warnings": [*(f"another recording: {line}" for line in same["differences"]), *scores.doubts],
-        "skipped_views": scores.skipped,
-        "views": [
-            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in scores.views
-        ],
-    }
+    report = _report(request, scorer, scores, same, protocol | {"definitions": definitions}, as_json(metrics))
     is_damaged = bool(reference.source.loss.damaged)
     result = replace(_concluded(request, report, is_damaged=is_damaged), first_view=scores.first)
     if folder:
         _write_table(folder / "views.csv", report["views"])
         with stopwatch.stage("pictures"):
-            for (_, best), (_, worst) in scores.extremes.values() if request.images != "none" else ():
-                comparison = [best] if worst.title == best.title else [best, worst]
-                comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
+            _draw_extremes(folder, {} if request.images == "none" else scores.extremes)
         config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
         inputs = {**digests, "scene/splats.ply": sha256(request.scene / "splats.ply")}
         write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
     return result
+
+
+def _report(
+    request: ScoreRequest,
+    scorer: Scorer,
+    scores: Scores,
+    recording: dict[str, Any],
+    protocol: dict[str, Any],
+    metrics: dict[str, Any],
+) -> dict[str, Any]:
+    other = [f"another recording: {line}" for line in recording["differences"]]
+    views = scores.views
+    return {
+        "scene": str(request.scene),
+        "reference": str(scorer.reference.where),
+        "cameras": list(scorer.cameras),
+        "training_cameras": list(scorer.scene.cameras),
+        "has_clock": scores.has_clock,
+        "snapshots": "newest" if scores.has_clock and request.newest else "final",
+        "recording": recording,
+        "protocol": protocol,
+        "metrics": metrics,
+        "warnings": [*other, *scores.doubts],
+        "skipped_views": scores.skipped,
+        "views": [
+            {"view": v.view, "camera": v.camera, "stamp_ns": v.stamp_ns, **as_json(v.figures())} for v in views
+        ],
+    }
+
+
+def _draw_extremes(folder: Path, extremes: Mapping[str, tuple[Ranked, Ranked]]) -> None:
+    for (_, best), (_, worst) in extremes.values():
+        comparison = [best] if worst.title == best.title else [best, worst]
+        comparison_picture(folder / f"{best.title.rsplit('-', 1)[0]}_best_worst.png", comparison)
 
 
 def _protocol(reference: Reference, scene: SceneFolder, scores: Scores, lpips: str | None) -> dict[str, Any]:
