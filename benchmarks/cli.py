@@ -7,8 +7,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks import launch
 from benchmarks.measure import ROOT, SAMPLE, Limit, Options, Result
-from splatctrl_cli.cli import launch
 
 SPLATCTRL = str(Path(sys.executable).with_name("splatctrl"))
 

@@ -12,9 +12,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks import launch
 from benchmarks.measure import ROOT, SAMPLE, Limit, Options, Result
 from benchmarks.scenes import enlarged, sample_robot
-from splatctrl_cli.cli import launch
 from splatctrl_cli.config import load_config
 from splatctrl_cli.records import Box, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter

@@ -1,8 +1,10 @@
 """``splatctrl reconstruct``: a log into splats, occupancy, audit and snapshots."""
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from splatctrl_cli.cli.common import (
     Console,
@@ -15,31 +17,21 @@ from splatctrl_cli.cli.common import (
     table,
 )
 from splatctrl_cli.cli.numbers import MAX_LENGTH, real, setting
-from splatctrl_cli.cli.reconstruct_gaussians import run as run_gaussians
-from splatctrl_cli.cli.score_reference import add_scan, open_dtu, open_held_out, refuse_scan_options
-from splatctrl_cli.cli.source_options import add_source, source_options
+from splatctrl_cli.cli.source_options import add_scan, add_source, recording_of
 from splatctrl_cli.config import Config, SceneConfig
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, check_pose_jumps, reconstruct
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
+from splatctrl_cli.jobs.recording import open_to_train
+from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP
 from splatctrl_cli.records import Box, RecordSource
-from splatctrl_cli.sources.source import open_source
 
-DEFAULT_POSE_JUMP = 1.0  # [m]
 DECIDING_OPTIONS = (
     *("cameras", "camera", "camera_pose", "world_frame", "depth_scale", "pairing_tolerance", "joint_topic"),
     *("holdout", "scan", "box"),
 )  # what decides the bytes of a scene, beside the configuration
 PASSED_ON = (
-    "urdf",
-    "spheres",
-    "points",
-    "declare",
-    "allow_disagreement",
-    "force",
-    "resume",
-    "seed",
-    "threads",
-    "require",
+    *("urdf", "spheres", "points", "declare", "allow_disagreement", "force", "resume", "seed", "threads", "require"),
 )
 
 
@@ -112,32 +104,30 @@ def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     if args.device == "cuda":
         raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
-    if args.method == "3dgs":
-        return run_gaussians(args, _config(args), _open(args), _box(args))
     request = ReconstructRequest(
         config=_config(args),  # refused before the source is opened
         source=_open(args),
         out=args.out or Path("scene"),
-        box=_box(args),
+        box=None if args.box is None else Box.from_text(args.box),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
         **{name: getattr(args, name) for name in PASSED_ON},
     )
-    console = Console(args)
-    result = reconstruct(request, console)
-    found = {"scene": str(result.out), "metrics": result.metrics, "removed": result.removed}
-    console.concluded(result.verdict, found, [*_lines(result), f"wrote {result.out}"], result.verdict.exit_code)
+    console, is_baseline = Console(args), args.method == "3dgs"
+    result = (reconstruct_gaussians if is_baseline else reconstruct)(request, console)
+    found = {"scene": str(result.out), "metrics": result.metrics}
+    found |= {} if is_baseline else {"removed": result.removed}
+    lines = _baseline_lines(result) if is_baseline else _lines(result)
+    console.concluded(result.verdict, found, [*lines, f"wrote {result.out}"], result.verdict.exit_code)
     return result.verdict.exit_code
 
 
-def _lines(result: "ReconstructResult") -> list[str]:
+def _lines(result: ReconstructResult) -> list[str]:
     metrics, removed = result.metrics, result.removed
-    psnr = metrics["psnr"]
     columns = {
         **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
         "robot": metrics["robot_splats"],
         **{name: metrics[name] for name in ("added", "relocated", "unmet")},
-        "training dB": "-" if psnr is None else f"{psnr:.2f}",
-        "seconds": f"{result.seconds:.1f}",
+        **_quality(metrics, sum(result.seconds.values())),
     }
     lines = table(list(columns), [list(columns.values())])
     reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
@@ -145,31 +135,27 @@ def _lines(result: "ReconstructResult") -> list[str]:
     return lines
 
 
-def _box(args: argparse.Namespace) -> "Box | None":
-    return None if args.box is None else Box.from_text(args.box)
+def _baseline_lines(result: ReconstructResult) -> list[str]:
+    names = ("iterations", "splats", "cloned", "split", "pruned", "unmet")
+    columns = {name: result.metrics[name] for name in names} | _quality(result.metrics, result.seconds["fit"])
+    return table(list(columns), [list(columns.values())])
 
 
-def _config(args: argparse.Namespace) -> "Config":
+def _quality(metrics: Mapping[str, Any], seconds: float) -> dict[str, str]:
+    psnr = metrics["psnr"]
+    return {"training dB": "-" if psnr is None else f"{psnr:.2f}", "seconds": f"{seconds:.1f}"}
+
+
+def _config(args: argparse.Namespace) -> Config:
     config = configured(args)
     if args.max_splats is None:
         return config
     return replace(config, scene=replace(config.scene, max_splats=args.max_splats))
 
 
-def _open(args: argparse.Namespace) -> "RecordSource":
+def _open(args: argparse.Namespace) -> RecordSource:
     if (args.source is None) == (args.dtu is None):
         raise UsageError("reconstruct: expected a SOURCE or --dtu ROOT, and not both")
-    if args.dtu is not None:
-        scan = open_dtu(args)
-        if not scan.has_depth and args.points is None:
-            raise InputError(
-                f"{args.dtu}: scan '{scan.name}' has no depth",
-                remedy="give --depths DIR, or --points FILE.ply instead",
-            )
-        return scan
-    refuse_scan_options(args)
-    if args.protocol is not None:
-        return open_held_out(args, args.source)[0]
-    source = open_source(args.source, source_options(args))
-    check_pose_jumps(source, args.max_pose_jump)
-    return source
+    return open_to_train(
+        recording_of(args, args.source), max_pose_jump=args.max_pose_jump, needs_depth=args.points is None
+    )

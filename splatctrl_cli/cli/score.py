@@ -1,142 +1,195 @@
 """``splatctrl score``: renders views that did not train a scene and compares them with what was recorded."""
 
 import argparse
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
-from splatctrl_cli.cli.score_baseline import add_baseline, changes, read_baseline
-from splatctrl_cli.cli.score_cloud import add_cloud, cloud_figures, cloud_settings
-from splatctrl_cli.cli.score_fit import add_fit, run_fit
-from splatctrl_cli.cli.score_reference import (
-    add_scan,
-    cameras_to_score,
-    check_training,
-    open_reference,
-    recording_check,
-)
-from splatctrl_cli.cli.score_report import gated_names, lines_of, result_of, score_verdict, write_scores
-from splatctrl_cli.cli.score_scans import lines_of_scans, scenes_of_scans, score_scans
-from splatctrl_cli.cli.score_views import Scorer, view_drawer
-from splatctrl_cli.cli.source_options import add_source
+from splatctrl_cli.cli.numbers import real, setting, whole
+from splatctrl_cli.cli.score_report import lines_of
+from splatctrl_cli.cli.source_options import add_scan, add_source, recording_of
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.map import MOST_ITERATIONS
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.perceptual import Lpips
-from splatctrl_cli.evaluate.verdict import Verdict
-from splatctrl_cli.field.selection import field_splats
-from splatctrl_cli.files.output import Stopwatch, output_path
-from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.score_cloud import CloudSettings
+from splatctrl_cli.jobs.score_fit import NUM_SPLATS, PROTOCOL, FitRequest, score_fits
+
+MILLIMETRE = 0.001  # [m], the unit of DTU's clouds
+OF_FITS: tuple[tuple[str, object], ...] = (
+    ("config", None),
+    ("set", []),
+    ("seed", 0),
+    ("fit_iterations", None),
+    ("fit_splats", None),
+)
+PASSED_ON = ("out", "force", "images", "lpips", "allow_training", "allow_other_recording", "threads")
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
     parser = add_command(subparsers, "score", run)
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "scene",
         type=Path,
         nargs="?",
         metavar="SCENE",
         help="a folder that reconstruct wrote, or one of such folders, named like the scans of --dtu",
     )
-    reference = parser.add_mutually_exclusive_group(required=True)
-    reference.add_argument(
-        "--reference", type=Path, metavar="PATH", help="a log, a capture, or an image folder's TOML"
-    )
-    reference.add_argument(
-        "--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, or in IDR's and NeuS's"
-    )
+    either = parser.add_mutually_exclusive_group(required=True).add_argument
+    either("--reference", type=Path, metavar="PATH", help="a log, a capture, or an image folder's TOML")
+    either("--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, or in IDR's and NeuS's")
     add_scan(parser)
-    parser.add_argument(
-        "--masks", type=Path, metavar="DIR", help="object masks 000.png and so on, for MVSNet's layout"
-    )
-    parser.add_argument(
+    add("--masks", type=Path, metavar="DIR", help="object masks 000.png and so on, for MVSNet's layout")
+    add(
         "--snapshots",
         choices=("newest", "final"),
         default="newest",
         help="render each view from the newest snapshot not later than it, or all from the final splats",
     )
-    parser.add_argument("--allow-training", action="store_true", help="also score cameras that trained the scene")
-    parser.add_argument(
+    add("--allow-training", action="store_true", help="also score cameras that trained the scene")
+    add(
         "--allow-other-recording",
         action="store_true",
         help="go on where this is not the recording that made the scene",
     )
-    parser.add_argument(
+    add(
         "--images",
         choices=("all", "best-worst", "none"),
         default="best-worst",
         help="with -o: pictures of every view, of each camera's best and worst, or of none (default: best-worst)",
     )
-    parser.add_argument(
-        "--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none come along"
+    add("--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none come along")
+    _add_cloud(parser.add_argument_group("surface"))
+    add(
+        "--baseline",
+        type=Path,
+        metavar="FILE",
+        help="score.json of an earlier score -o: prints the change of each figure, gated as change_NAME",
     )
-    add_cloud(parser)
-    add_baseline(parser)
-    add_fit(parser)
+    _add_fit(parser.add_argument_group("fit"))
     add_source(parser)
     add_output(parser, default="none, the scores are only printed", what="folder for scores and pictures")
     add_config(parser)
     add_gates(parser)
 
 
+def _add_cloud(group: argparse._ActionsContainer) -> None:
+    """``--cloud`` and what goes with it."""
+    add = group.add_argument
+    add(
+        "--cloud",
+        type=Path,
+        metavar="FILE",
+        help="reference points (.ply) or mesh: accuracy, completeness, Chamfer; or a folder of stl024_total.ply or"
+        " scan24.ply",
+    )
+    add(
+        "--cloud-masks",
+        type=Path,
+        metavar="DIR",
+        help="DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where its own evaluation does",
+    )
+    add(
+        "--cloud-unit",
+        type=real(1e-9, 1e3, "m"),
+        metavar="M",
+        help="metres per unit (default: 0.001 with --dtu, else 1)",
+    )
+    add(
+        "--cloud-max",
+        type=real(1e-6, 1e3, "m"),
+        default=0.02,
+        metavar="M",
+        help="farther points count in a share, not in a mean",
+    )
+    add(
+        "--cloud-spacing",
+        type=real(1e-6, 1e3, "m"),
+        default=0.0002,
+        metavar="M",
+        help="both sides are thinned to points this far apart (default: 0.0002)",
+    )
+
+
+def _add_fit(group: argparse._ActionsContainer) -> None:
+    """``--fit`` and its options."""
+    add = group.add_argument
+    add(
+        "--fit",
+        action="store_true",
+        help="fit the scans of --dtu (--scan A,B; default: all), or the image folder of --reference, with both"
+        f" methods, then score them (default protocol of scans: {PROTOCOL})",
+    )
+    add(
+        "--fit-iterations",
+        type=whole(1, MOST_ITERATIONS),
+        metavar="N",
+        help="of each method (default: those of the configuration, 2300)",
+    )
+    add(
+        "--fit-splats",
+        type=setting(SceneConfig, "max_splats"),
+        metavar="N",
+        help="the budget, and Gaussians to begin with (default: 10000)",
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    if args.images == "all" and args.out is None:
-        raise UsageError("--images all: expected a folder for them", remedy="give -o")
-    if args.fit:
-        return run_fit(args, score_scene)
+    result = _score_fits(args) if args.fit else _score(args)
+    Console(args).concluded(result.verdict, result.report, lines_of(result.report), result.verdict.exit_code)
+    return result.verdict.exit_code
+
+
+def _score(args: argparse.Namespace) -> ScoreResult:
     if args.scene is None:
         raise UsageError("score: expected a SCENE, got none", remedy="give what reconstruct wrote, or --fit")
-    for name, default in (("config", None), ("set", []), ("seed", 0), ("fit_iterations", None), ("fit_splats", None)):
+    for name, default in OF_FITS:
         if getattr(args, name) != default:
             raise UsageError(f"--{name.replace('_', '-')}: only with --fit", remedy="leave it out")
-    names, changed = gated_names(with_changes=False), gated_names(with_changes=True)
-    if args.baseline is not None:
-        read_baseline(args.baseline)  # better refused now than after the views
-    check_gate_names(args.require, names if args.baseline is None else changed, {"--baseline": changed})
-    console = Console(args)
-    scenes = scenes_of_scans(args)
-    output = output_path(args.out, force=args.force, is_folder=True) if args.out else nullcontext()
-    with output as folder:
-        if scenes:
-            result, verdict = score_scans(args, console, scenes, score_scene, folder)
-        else:
-            result, verdict = score_scene(args, console, folder)
-    lines = lines_of_scans(result) if scenes else lines_of(result)
-    console.concluded(verdict, result, lines, verdict.exit_code)
-    return verdict.exit_code
+    return score(ScoreRequest(scene=args.scene, baseline=args.baseline, **_scoring(args)), Console(args))
 
 
-def score_scene(args: argparse.Namespace, console: Console, folder: Path | None) -> "tuple[dict[str, Any], Verdict]":
-    """Score one scene, write what `-o` asks for into `folder`, and return everything that --json prints, and the
-    verdict.
-    """
-    stopwatch = Stopwatch()
-    cloud = cloud_settings(args)
-    lpips = None if args.lpips is None else Lpips(args.lpips)
-    scene = open_scene(args.scene)
-    if scene.is_anisotropic:
-        scene.gaussians()  # either raises where there is none to compare
-    else:
-        field_splats(scene.splats())
-    reference = open_reference(args, console)
-    cloud = None if cloud is None else cloud.of_scan(reference.scan)
-    cameras = cameras_to_score(args, reference, scene.cameras)
-    check_training(args, reference, scene)
-    digests = reference.source.digests()
-    recording = recording_check(args, reference, scene, digests)
-    draw = view_drawer(folder / "views") if folder and args.images == "all" else None
-    scorer = Scorer(args=args, scene=scene, reference=reference, cameras=cameras, perceptual=lpips, draw=draw)
-    scores = scorer.run(console, stopwatch)
-    surface = None
-    if cloud is not None:
-        with stopwatch.stage("cloud"):
-            surface = (cloud, cloud_figures(cloud, scene, scores.training, args.threads))
-    result = result_of(args, scene, reference, cameras, scores, recording=recording, cloud=surface, lpips=lpips)
+def _score_fits(args: argparse.Namespace) -> ScoreResult:
+    if args.scene is not None:
+        raise UsageError(f"--fit: makes the scenes itself, got {args.scene}", remedy="leave SCENE or --fit out")
     if args.baseline is not None:
-        result["metrics"] |= changes(result, read_baseline(args.baseline), args.baseline)
-    verdict = score_verdict(result, args.require, is_damaged=bool(reference.source.loss.damaged))
-    if folder:
-        write_scores(folder, args, digests, result, scores, stopwatch, verdict)
-    return result, verdict
+        raise UsageError("--baseline: not with --fit", remedy="score the scenes that --fit -o leaves")
+    request = FitRequest(
+        config=args.config,
+        settings=tuple(args.set),
+        seed=args.seed,
+        iterations=args.fit_iterations,
+        num_splats=NUM_SPLATS if args.fit_splats is None else args.fit_splats,
+        **_scoring(args),
+    )
+    return score_fits(request, Console(args))
+
+
+def _scoring(args: argparse.Namespace) -> dict[str, Any]:
+    """What both kinds of request have in common."""
+    return {
+        "recording": recording_of(args, args.reference, args.masks),
+        "newest": args.snapshots == "newest",
+        "cloud": _cloud(args),
+        "require": tuple(args.require),
+        **{name: getattr(args, name) for name in PASSED_ON},
+    }
+
+
+def _cloud(args: argparse.Namespace) -> CloudSettings | None:
+    """None where no cloud is given. Raises UsageError for options that mean nothing here."""
+    if args.cloud is None:
+        for name in ("unit", "masks"):
+            if getattr(args, f"cloud_{name}") is not None:
+                raise UsageError(f"--cloud-{name}: only with --cloud", remedy="leave it out")
+        return None
+    if args.dtu is None and (args.cloud_masks is not None or args.cloud.is_dir()):
+        what = "--cloud-masks" if args.cloud_masks is not None else f"--cloud {args.cloud}"
+        raise UsageError(f"{what}: a folder of scans, only with --dtu", remedy="give the file of this recording")
+    unit = args.cloud_unit if args.cloud_unit is not None else (MILLIMETRE if args.dtu is not None else 1.0)
+    return CloudSettings(
+        path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing, masks=args.cloud_masks
+    )

@@ -4,8 +4,9 @@ import argparse
 import re
 from pathlib import Path
 
-from splatctrl_cli.cli.numbers import real, several
+from splatctrl_cli.cli.numbers import real, several, whole
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.recording import RecordingRequest
 from splatctrl_cli.logs.options import CameraTopics, PoseTopic, SourceOptions
 
 
@@ -66,6 +67,37 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         type=_Listed("--holdout"),
         metavar="0,6",
         help="frames of an image folder that become camera 'holdout'",
+    )
+
+
+def add_scan(parser: argparse.ArgumentParser) -> None:
+    """``--scan``, ``--protocol``, ``--depths`` and ``--downscale``: the options of a DTU scan."""
+    parser.add_argument("--scan", metavar="NAME", help="which scan of --dtu (default: the only one)")
+    parser.add_argument(
+        "--protocol",
+        metavar="NAME",
+        help="which views train and which are scored: dtu-train, dtu-holdout8, regnerf-3, regnerf-6, regnerf-9, "
+        "mvsnerf, holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (docs/score.md)",
+    )
+    parser.add_argument(
+        "--depths", type=Path, metavar="DIR", help="depth_map_0000.pfm and so on of a scan in IDR's layout"
+    )
+    parser.add_argument(
+        "--downscale",
+        type=whole(1, 64),
+        metavar="N",
+        help="make images of --dtu N times smaller (default: down to the size of the protocol, if a whole factor)",
+    )
+
+
+def recording_of(args: argparse.Namespace, path: Path, masks: Path | None = None) -> RecordingRequest:
+    """What `add_source` and `add_scan` parsed: the recording at `path`, where there is no --dtu."""
+    return RecordingRequest(
+        path=args.dtu or path,
+        is_dtu=args.dtu is not None,
+        options=source_options(args),
+        masks=masks,
+        **{name: getattr(args, name) for name in ("scan", "protocol", "depths", "downscale")},
     )
 
 

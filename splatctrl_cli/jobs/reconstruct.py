@@ -52,15 +52,15 @@ class ReconstructRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructResult:
-    """The scene folder `out`, its metrics and verdict as in ``run.json``, splats removed by reason, and the time it
-    took [s].
+    """The scene folder `out`, its metrics and verdict as in ``run.json``, splats removed by reason, and wall time by
+    stage [s].
     """
 
     out: Path
     metrics: Mapping[str, Any]
     verdict: Verdict
     removed: Mapping[str, int]
-    seconds: float
+    seconds: Mapping[str, float]
 
 
 def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> ReconstructResult:
@@ -142,7 +142,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         metrics=metrics,
         verdict=verdict,
         removed={name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed},
-        seconds=sum(stopwatch.seconds.values()),
+        seconds=stopwatch.seconds,
     )
 
 

@@ -1,6 +1,7 @@
 """What the figures of the commands that judge files rest on."""
 
-from splatctrl_cli.cli import bake_report, score_report
+from splatctrl_cli.cli import bake_report
+from splatctrl_cli.evaluate import score_report
 
 
 def test_a_figure_of_a_band_rests_on_the_cells_of_that_band() -> None:

@@ -7,10 +7,13 @@ from typing import Any
 import cv2
 import pytest
 
-from splatctrl_cli.cli import score_fit
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.datasets.dtu import read_dtu
 from splatctrl_cli.datasets.idr import write_idr
+from splatctrl_cli.evaluate.verdict import verdict_of
+from splatctrl_cli.jobs import score_fit
+from splatctrl_cli.jobs.reconstruct import ReconstructResult
+from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult
 from tests.datasets.make_idr import half_size
 
 QUICK = ("--fit", "--fit-iterations", "6", "--fit-splats", "400", "--threads", "1")
@@ -54,22 +57,23 @@ def test_the_mean_is_over_the_scans(
         (tmp_path / "Rectified" / f"{scan}_train").mkdir(parents=True)
     psnr = {("scan1", "3dgs"): 20.0, ("scan1", "budget"): 21.0, ("scan2", "3dgs"): 30.0, ("scan2", "budget"): 32.5}
 
-    def reconstruct(args: Any, scene: Path, scan: str, settings: list[str]) -> tuple[Path, float]:
-        scene.mkdir(parents=True)
-        run = {"metrics": {"splats": 100, "iterations": 5}, "seconds": {"fit": 3.0}}
-        (scene / "run.json").write_text(json.dumps(run))
-        return scene, 50.0 if scan == "scan1" else 70.0
+    def reconstruct(request: Any, scoring: ScoreRequest, method: str, out: Path) -> Any:
+        metrics = {"splats": 100, "iterations": 5}
+        verdict = verdict_of("reconstruct", [])
+        scene = ReconstructResult(out=out, metrics=metrics, verdict=verdict, removed={}, seconds={"fit": 3.0})
+        return scene, 50.0 if scoring.recording.scan == "scan1" else 70.0
 
-    def score(args: Any, console: Any, folder: Path | None) -> Any:
+    def score(request: ScoreRequest, folder: Path | None, progress: Any) -> ScoreResult:
         metrics = dict.fromkeys(("psnr_seen", "ssim_all", "num_views"), 1.0) | {
-            "psnr_all": psnr.get((args.scan, args.scene.parent.name))
+            "psnr_all": psnr.get((request.recording.scan, request.scene.parent.name))
         }
         protocol = {"name": "x", "source": "y", "split": "z", "mask_rule": "none", "background": [0.0],
                     "published_resolution": None, "published_scans": None, "resolution": ["1x1"]}  # fmt: skip
-        return {"metrics": metrics, "protocol": protocol, "warnings": ["odd"]}, None
+        report = {"metrics": metrics, "protocol": protocol, "warnings": ["odd"]}
+        return ScoreResult(report=report, verdict=verdict_of("score", []))
 
     monkeypatch.setattr(score_fit, "_reconstruct", reconstruct)
-    monkeypatch.setattr("splatctrl_cli.cli.score.score_scene", score)
+    monkeypatch.setattr(score_fit, "score_scene", score)
     assert main(["score", "--fit", "--dtu", str(tmp_path), "-q", "--json", "--require", "psnr_gain>=1.7"]) == 0
     result = json.loads(capsys.readouterr().out)
     metrics = result["metrics"]

@@ -10,6 +10,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.datasets.dtu import read_dtu
 from splatctrl_cli.datasets.idr import write_idr
+from splatctrl_cli.evaluate.score_report import other_scans
 from tests.datasets.make_idr import half_size
 
 HOLDOUT = ("--protocol", "holdout:0")
@@ -93,10 +94,8 @@ def test_a_scene_of_another_scan_is_refused(place: Path, tmp_path: Path, capsys:
 
 
 def test_scans_that_are_not_those_of_the_published_mean_are_named() -> None:
-    from splatctrl_cli.cli.score_scans import _other_scans
-
     protocol = {"name": "mvsnerf", "published_scans": [1, 8, 21, 103, 114]}
-    (line,) = _other_scans(protocol, ["scan8", "scan21", "bird"])
+    (line,) = other_scans(protocol, ["scan8", "scan21", "bird"])
     assert line == ("mvsnerf: this mean lacks scans 1, 103, 114 and has bird more; the published one is of 5 scans")
-    assert _other_scans(protocol, [f"scan{n}" for n in (1, 8, 21, 103, 114)]) == []
-    assert _other_scans(protocol | {"published_scans": None}, ["scan8"]) == []
+    assert other_scans(protocol, [f"scan{n}" for n in (1, 8, 21, 103, 114)]) == []
+    assert other_scans(protocol | {"published_scans": None}, ["scan8"]) == []

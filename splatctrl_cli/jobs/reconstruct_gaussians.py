@@ -1,21 +1,21 @@
-"""``splatctrl reconstruct --method 3dgs``: 3D Gaussian splatting on views of a scene that stands still."""
+"""3D Gaussian splatting on views of a scene that stands still: the baseline beside `reconstruct`."""
 
-import argparse
 import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from splatctrl_cli.cli.common import Console, table
-from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.recording import first_frame
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path, write_run
+from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult
 from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
 from splatctrl_cli.jobs.reconstruction import training_cameras
-from splatctrl_cli.records import Box, RecordSource, RgbdFrame
+from splatctrl_cli.records import RecordSource, RgbdFrame
 from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow, GaussianFitter
 from splatctrl_cli.scene.time_steps import depth_box
 from splatctrl_cli.scene_files.scene_folder import FORMAT
@@ -25,33 +25,45 @@ GATED = ("iterations", "splats", "cloned", "split", "pruned", "unmet", "loss", "
 ROUTES = "leave out --method, or give a folder of views (a TOML file or --dtu)"
 
 
-def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box: "Box | None") -> int:
-    """Fit, write the scene folder and return the exit code."""
-    check_gate_names(args.require, GATED)
-    _refuse_what_needs_time(args, source)
-    console, stopwatch = Console(args), Stopwatch()
-    out = args.out or Path("scene")
-    with output_path(out, force=args.force, is_folder=True) as partial:
+def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILENT) -> ReconstructResult:
+    """Fit, and write the scene folder; nothing is `removed`.
+
+    Raises UsageError for a recording with a clock, and for a request with a robot, points, or a run to go on with.
+    """
+    source, config = request.source, request.config
+    check_gate_names(request.require, GATED)
+    _refuse_what_needs_time(request)
+    stopwatch = Stopwatch()
+    with output_path(request.out, force=request.force, is_folder=True) as partial:
         rows: list[GaussianAuditRow] = []
         with stopwatch.stage("read"):
             frames = _frames(source)
-            workspace = _workspace(frames, box, config)
+            workspace = depth_box(frames, config.occupancy.max_range) if request.box is None else request.box
         with stopwatch.stage("fit"):
-            fitter = GaussianFitter(config, workspace, frames, seed=args.seed, threads=args.threads)
-            console.log(f"{len(fitter.arrays)} Gaussians seeded, extent of the scene {fitter.extent:.3f} m")
-            fitter.fit(_audit(partial / "audit.jsonl", rows, console))
+            fitter = GaussianFitter(config, workspace, frames, seed=request.seed, threads=request.threads)
+            progress.log(f"{len(fitter.arrays)} Gaussians seeded, extent of the scene {fitter.extent:.3f} m")
+            fitter.fit(_audit(partial / "audit.jsonl", rows, progress))
         with stopwatch.stage("write"):
             comments = {"format": FORMAT, "source": source.name}
             write_gaussian_ply(partial / "splats.ply", fitter.gaussians(), comments)
-        metrics = _metrics(rows, frames) | {
-            "background": list(fitter.background),
-            "workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()],
-        }
+        figures = _figures(rows)
+        metrics = (
+            _views(frames)
+            | figures
+            | {
+                "background": list(fitter.background),
+                "workspace": [*workspace.lower.tolist(), *workspace.upper.tolist()],
+            }
+        )
         counts = dict.fromkeys(GATED, len(frames))
-        gates = gate_reasons(args.require, {name: _number(metrics[name]) for name in GATED}, counts)
+        values = {name: None if figures[name] is None else float(figures[name]) for name in GATED}
         verdict = verdict_of(
             "reconstruct",
-            [map_reason(rows[-1].gaussians), *loss_notes(source.loss), *gates],
+            [
+                map_reason(rows[-1].gaussians),
+                *loss_notes(source.loss),
+                *gate_reasons(request.require, values, counts),
+            ],
             scope=f"{len(frames)} views, {rows[-1].gaussians} Gaussians",
             is_damaged=bool(source.loss.damaged),
             counts=counts,
@@ -63,26 +75,24 @@ def run(args: argparse.Namespace, config: "Config", source: "RecordSource", box:
             inputs=source.digests(),
             metrics=metrics,
             stopwatch=stopwatch,
-            seed=args.seed,
+            seed=request.seed,
             verdict=verdict.as_dict(),
         )
-    lines = [*_lines(metrics, stopwatch.seconds["fit"]), f"wrote {out}"]
-    console.concluded(verdict, {"scene": str(out), "metrics": metrics}, lines, verdict.exit_code)
-    return verdict.exit_code
+    return ReconstructResult(out=request.out, metrics=metrics, verdict=verdict, removed={}, seconds=stopwatch.seconds)
 
 
-def _refuse_what_needs_time(args: argparse.Namespace, source: "RecordSource") -> None:
-    training_cameras(source)
-    if source.has_clock:
+def _refuse_what_needs_time(request: ReconstructRequest) -> None:
+    training_cameras(request.source)
+    if request.source.has_clock:
         raise UsageError(
-            f"--method 3dgs: {source.name} has a clock, and this method's scene stands still", remedy=ROUTES
+            f"--method 3dgs: {request.source.name} has a clock, and this method's scene stands still", remedy=ROUTES
         )
     for name in ("urdf", "spheres", "points", "resume"):
-        if getattr(args, name):
+        if getattr(request, name):
             raise UsageError(f"--{name}: does not apply to --method 3dgs", remedy="leave out one of them")
 
 
-def _frames(source: "RecordSource") -> "list[RgbdFrame]":
+def _frames(source: RecordSource) -> list[RgbdFrame]:
     cameras = training_cameras(source)
     frames = [r for r in source.records() if isinstance(r, RgbdFrame) and r.camera in cameras]
     if not frames:
@@ -93,27 +103,22 @@ def _frames(source: "RecordSource") -> "list[RgbdFrame]":
     return frames
 
 
-def _workspace(frames: "list[RgbdFrame]", box: "Box | None", config: "Config") -> "Box":
-    return depth_box(frames, config.occupancy.max_range) if box is None else box
-
-
-def _audit(path: Path, rows: "list[GaussianAuditRow]", console: Console) -> "Callable[[GaussianAuditRow], None]":
+def _audit(path: Path, rows: list[GaussianAuditRow], progress: Progress) -> Callable[[GaussianAuditRow], None]:
     """Keeps every row, writes it to `path`, and says how far it is."""
 
-    def audit(row: "GaussianAuditRow") -> None:
+    def audit(row: GaussianAuditRow) -> None:
         rows.append(row)
         with path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(asdict(row)) + "\n")
         quality = "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB"
         full = f", {row.unmet} more had no room (gaussians.max_gaussians)" if row.unmet else ""
-        console.log(f"iteration {row.iteration}: {row.gaussians} Gaussians, {quality}{full}")
+        progress.log(f"iteration {row.iteration}: {row.gaussians} Gaussians, {quality}{full}")
 
     return audit
 
 
-def _metrics(rows: "list[GaussianAuditRow]", frames: "list[RgbdFrame]") -> dict[str, object]:
-    """For ``run.json`` and gates."""
-    last = rows[-1]
+def _views(frames: list[RgbdFrame]) -> dict[str, object]:
+    """What ``run.json`` says of the views."""
     first = {frame.camera: frame for frame in reversed(frames)}
     return {
         "method": "3dgs",
@@ -122,6 +127,12 @@ def _metrics(rows: "list[GaussianAuditRow]", frames: "list[RgbdFrame]") -> dict[
         "stamp_ns": max(frame.stamp_ns for frame in frames),
         "training_stamps_ns": [frame.stamp_ns for frame in frames],
         "first_frames": [first_frame(frame).as_dict() for frame in first.values()],
+    }
+
+
+def _figures(rows: list[GaussianAuditRow]) -> dict[str, Any]:
+    last = rows[-1]
+    return {
         "iterations": last.iteration,
         "splats": last.gaussians,
         "degree": last.degree,
@@ -132,16 +143,3 @@ def _metrics(rows: "list[GaussianAuditRow]", frames: "list[RgbdFrame]") -> dict[
         "loss": last.loss,
         "psnr": last.psnr,
     }
-
-
-def _lines(metrics: dict[str, object], seconds: float) -> list[str]:
-    psnr = _number(metrics["psnr"])
-    names = ("iterations", "splats", "cloned", "split", "pruned", "unmet")
-    return table(
-        [*names, "training dB", "seconds"],
-        [[*(metrics[name] for name in names), "-" if psnr is None else f"{psnr:.2f}", f"{seconds:.1f}"]],
-    )
-
-
-def _number(value: object) -> float | None:
-    return None if value is None else float(str(value))

@@ -1,60 +1,73 @@
 """Renders the views that are scored, from the splats of their time, and scores them one by one."""
 
-import argparse
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from math import isnan
-from pathlib import Path
+from operator import itemgetter
 
-from splatctrl_cli.cli.common import Console
-from splatctrl_cli.cli.score_reference import Reference
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.doubts import Doubts
 from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
 from splatctrl_cli.evaluate.views import View, views_to_score
 from splatctrl_cli.evaluate.visibility import seen_pixels
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.score_reference import Reference
 from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
-from splatctrl_cli.report.view_picture import view_picture
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
 
+Ranked = tuple[float, ComparisonRow]
+"""PSNR [dB] over what was seen, or over all, and the view."""
+
 
 @dataclass(kw_only=True)
 class Scores:
-    """What scoring gathers: the views, the names of those before the first snapshot, each camera's extremes.
+    """What scoring gathers: the views, the names of those before the first snapshot, the pictures of the first view
+    and of each camera's best and worst.
 
     training: the frames that count as known at the last view; doubts: what speaks against the scores, in words.
     """
 
     has_clock: bool
-    views: list["ViewScore"] = field(default_factory=list)
+    views: list[ViewScore] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
-    best: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
-    worst: dict[str, tuple[float, "ComparisonRow"]] = field(default_factory=dict)
-    training: tuple["RgbdFrame", ...] = ()
+    first: ComparisonRow | None = None
+    extremes: dict[str, tuple[Ranked, Ranked]] = field(default_factory=dict)
+    training: tuple[RgbdFrame, ...] = ()
     doubts: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scorer:
-    """Scores views of `reference`; every view's row of pictures goes to `draw`, where there is one."""
+    """Scores views of `reference`; every view's row of pictures goes to `draw`, where there is one.
 
-    args: argparse.Namespace
-    scene: "SceneFolder"
+    newest: a view is rendered from the newest snapshot not later than it, else from the final splats.
+    """
+
+    scene: SceneFolder
     reference: Reference
     cameras: tuple[str, ...]
-    perceptual: "Perceptual | None" = None
-    draw: "Callable[[ComparisonRow], None] | None" = None
+    perceptual: Perceptual | None = None
+    draw: Callable[[ComparisonRow], None] | None = None
+    newest: bool = True
+    allow_training: bool = False
+    threads: int = 0
 
-    def run(self, console: Console, stopwatch: "Stopwatch") -> Scores:
+    def run(self, progress: Progress, stopwatch: Stopwatch) -> Scores:
         """Score every view. Raises NotEvaluableError where there is none, or not one pixel of any was seen."""
-        args, scene, source = self.args, self.scene, self.reference.source
+        scene, source = self.scene, self.reference.source
         has_clock = scene.has_clock and source.has_clock
-        splats_at = _SplatsAt(scene, use_snapshots=has_clock and args.snapshots == "newest")
+        stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
+
+        @lru_cache(maxsize=1)  # a snapshot is read once for all the views it serves
+        def splats_at(stamp_ns: int | None) -> SplatSet | GaussianSet:
+            return final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
+
         scores = Scores(has_clock=has_clock)
         views = views_to_score(
             source,
@@ -63,7 +76,7 @@ class Scorer:
             has_clock=has_clock,
             numbered_by_stamp=self.reference.numbered_by_stamp,
         )
-        may_train = args.allow_training or self.reference.scores_training
+        may_train = self.allow_training or self.reference.scores_training
         doubts = Doubts(is_still=not has_clock, may_train=may_train, mask_rule=self.reference.mask_rule)
         for view in views:
             if view.frame.stamp_ns in scene.training_stamps_ns and not may_train:
@@ -71,19 +84,21 @@ class Scorer:
                     f"{view.name}: trained the scene, its score says nothing about other views",
                     remedy="give the --holdout or --protocol that reconstruct was given, or --allow-training",
                 )
-            if has_clock and not splats_at.is_known(view.frame.stamp_ns):
+            num_known = bisect_right(stamps, view.frame.stamp_ns)
+            if has_clock and not num_known:
                 scores.skipped.append(view.name)
                 continue
             with stopwatch.stage("score"):
-                self._score_one(scores, doubts, view, splats_at(view.frame.stamp_ns))
+                splats = splats_at(stamps[num_known - 1] if has_clock and self.newest else None)
+                self._score_one(scores, doubts, view, splats)
             if len(scores.views) % 20 == 0:
-                console.log(f"scored {len(scores.views)} views")
+                progress.log(f"scored {len(scores.views)} views")
         self._check(scores)
         scores.doubts += [*self.reference.doubts, *doubts.lines()]
         return scores
 
     def _check(self, scores: Scores) -> None:
-        where, cameras = self.args.reference or self.args.dtu, ", ".join(self.cameras)
+        where, cameras = self.reference.where, ", ".join(self.cameras)
         if not scores.views:
             raise NotEvaluableError(
                 f"{where}: no view of {cameras} to score; {len(scores.skipped)} lie before the first snapshot of the"
@@ -96,9 +111,9 @@ class Scorer:
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",
             )
 
-    def _score_one(self, scores: Scores, doubts: "Doubts", view: "View", splats: "SplatSet | GaussianSet") -> None:
+    def _score_one(self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet) -> None:
         frame, protocol = view.frame, self.reference.protocol
-        rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.args.threads)
+        rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.threads)
         rendering = rendering.before(self.scene.background)
         depth = rendering.normalised_depth()
         mask = None if self.reference.mask is None else self.reference.mask(frame)
@@ -128,57 +143,27 @@ class Scorer:
         )
         if self.draw is not None:
             self.draw(row)
-        if frame.camera not in scores.best or rank > scores.best[frame.camera][0]:
-            scores.best[frame.camera] = (rank, row)
-        if frame.camera not in scores.worst or rank < scores.worst[frame.camera][0]:
-            scores.worst[frame.camera] = (rank, row)
+        scores.first = scores.first or row
+        best, worst = scores.extremes.get(frame.camera, ((rank, row), (rank, row)))
+        ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
+        scores.extremes[frame.camera] = ends
 
 
-def _figures(score: "ViewScore") -> str:
+def _figures(score: ViewScore) -> str:
     parts = [] if isnan(score.seen.psnr) else [f"{score.seen.psnr:.1f} seen"]
     parts += [f"{score.masked.psnr:.1f} masked"] if score.masked is not None else []
     return "dB: " + ", ".join([*parts, f"{score.all.psnr:.1f} all"])
 
 
 def rendered(
-    splats: "SplatSet | GaussianSet", intrinsics: "Intrinsics", T_world_camera: "Float64", threads: int
-) -> "Rendering":
+    splats: SplatSet | GaussianSet, intrinsics: Intrinsics, T_world_camera: Float64, threads: int
+) -> Rendering:
     """What a camera sees of splats of either kind."""
     if isinstance(splats, GaussianSet):
         return render_gaussians(splats, intrinsics, T_world_camera, threads=threads)
     return render(splats, intrinsics, T_world_camera, threads=threads)
 
 
-class _SplatsAt:
-    """The splats that a view is rendered from; a snapshot is read once for all the views it serves."""
-
-    def __init__(self, scene: "SceneFolder", *, use_snapshots: bool) -> None:
-        self._scene = scene
-        self._stamps = [] if scene.is_anisotropic else sorted(snapshot.stamp_ns for snapshot in scene.snapshots)
-        self._use_snapshots = use_snapshots
-        self._loaded: tuple[int, SplatSet | GaussianSet] | None = None
-
-    def is_known(self, stamp_ns: int) -> bool:
-        """Whether the scene had a snapshot at that time."""
-        return bool(self._stamps) and self._stamps[0] <= stamp_ns
-
-    def __call__(self, stamp_ns: int) -> "SplatSet | GaussianSet":
-        number = bisect_right(self._stamps, stamp_ns) if self._use_snapshots else -1
-        if self._loaded is None or self._loaded[0] != number:
-            self._loaded = (number, self._read(stamp_ns))
-        return self._loaded[1]
-
-    def _read(self, stamp_ns: int) -> "SplatSet | GaussianSet":
-        if self._scene.is_anisotropic:
-            return self._scene.gaussians()
-        return self._scene.splats_at(stamp_ns) if self._use_snapshots else self._scene.splats()
-
-
-def view_drawer(folder: Path) -> "Callable[[ComparisonRow], None]":
-    """Writes the pictures of each view into `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
-
-    def draw(row: "ComparisonRow") -> None:
-        view_picture(folder / f"{row.title}.png", row)
-
-    return draw
+def final_splats(scene: SceneFolder) -> SplatSet | GaussianSet:
+    """The splats of either kind that a scene ended with."""
+    return scene.gaussians() if scene.is_anisotropic else scene.splats()

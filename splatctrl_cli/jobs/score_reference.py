@@ -1,0 +1,183 @@
+"""What `score` compares with: the recording, which of its views are scored by which protocol, and their masks."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.datasets.dtu_source import DtuSource
+from splatctrl_cli.datasets.protocols import ScoreProtocol, Split, score_protocol
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.recording import changed_files, differences
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.recording import RecordingRequest, open_dtu, open_held_out, refuse_scan_options
+from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
+from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.sources.source import open_source
+
+Mask = Callable[[RgbdFrame], Bool | None]
+"""A frame -> the pixels (H, W) that the mask rule selects."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """source: the recording `where` with all its cameras. scan: its name in a data set of several. protocol and split
+    where one was named; training_stamps_ns: of the views that it trains on. mask_rule says in words what `mask`
+    selects. Without depth, nothing says what a training camera saw. doubts: what speaks against the scores, in words.
+    """
+
+    where: Path
+    source: RecordSource
+    layout: str = ""
+    scan: str | None = None
+    protocol: ScoreProtocol | None = None
+    split: Split | None = None
+    training_stamps_ns: frozenset[int] = frozenset()
+    mask: Mask | None = None
+    mask_rule: str = "none"
+    numbered_by_stamp: bool = False
+    has_depth: bool = True
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def scores_training(self) -> bool:
+        """Whether the protocol scores the views that trained."""
+        return self.protocol is not None and self.protocol.scores_training
+
+
+def open_reference(recording: RecordingRequest, progress: Progress) -> Reference:
+    """The recording with all its cameras: those chosen are scored, the others say what was seen."""
+    if recording.is_dtu:
+        return _dtu_reference(recording, progress)
+    refuse_scan_options(recording)
+    where = recording.path
+    if recording.protocol is None:
+        return Reference(where=where, source=open_source(where, replace(recording.options, cameras=None)))
+    source, protocol, split = open_held_out(recording)
+    stamps = [stamp for stamp, _, _ in source.poses()]  # type: ignore[attr-defined]
+    return Reference(
+        where=where,
+        source=source,
+        layout="image folder",
+        protocol=protocol,
+        split=split,
+        training_stamps_ns=frozenset(stamps[n] for n in split.training),
+    )
+
+
+def _dtu_reference(recording: RecordingRequest, progress: Progress) -> Reference:
+    source = open_dtu(recording)
+    protocol = None if recording.protocol is None else score_protocol(recording.protocol)
+    mask, rule = _mask_of(source, "given" if protocol is None else protocol.mask)
+    if protocol is not None and protocol.mask == "object" and mask is None:
+        progress.log(
+            f"warning: {protocol.name}: its published figures are over the object alone, and there is no mask: every"
+            " pixel counts here; --masks DIR gives the masks"
+        )
+    return Reference(
+        where=recording.path,
+        source=source,
+        layout=f"{source.layout}'s",
+        scan=source.scan,
+        protocol=protocol,
+        split=source.split,
+        training_stamps_ns=frozenset(source.split.training) if protocol else frozenset(),
+        mask=mask,
+        mask_rule=rule,
+        numbered_by_stamp=True,
+        has_depth=source.has_depth,
+        doubts=tuple(missing_views(source, protocol)),
+    )
+
+
+def missing_views(source: DtuSource, protocol: ScoreProtocol | None) -> list[str]:
+    """In words, which views of the scan are not there, where that changes which are scored, or that lack depth."""
+    numbers = sorted({*source.split.training, *source.split.scored, *source.split.left_out})
+    missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
+    lines = []
+    if missing and protocol is not None and protocol.every:
+        listed = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
+        lines.append(
+            f"{source.name}: views {listed} are not there: '{protocol.name}' counts those that are, and scores others"
+            " than of a whole scan; add the views, or name those to score as holdout:0,8"
+        )
+    if source.has_depth and source.loss.notes:
+        more = len(source.loss.notes) - 1
+        lines.append(source.loss.notes[0] + (f" (and {more} more)" if more else ""))
+    return lines
+
+
+def _mask_of(source: DtuSource, wanted: str) -> tuple[Mask | None, str]:
+    if wanted == "depth":
+        return (lambda frame: frame.depth > 0), "pixels with a reference depth"
+    if any(source.mask(number) is not None for number in source.split.scored or source.split.training):
+        return (lambda frame: source.mask(frame.stamp_ns)), "object mask"
+    return None, "none"
+
+
+def cameras_to_score(
+    wanted: Sequence[str] | None, reference: Reference, training: Sequence[str], *, allow_training: bool
+) -> tuple[str, ...]:
+    """The cameras that are scored: by default those that did not train. Raises UsageError where there is none."""
+    recorded = reference.source.cameras
+    if reference.scores_training:
+        return recorded
+    if wanted is None:
+        cameras = tuple(name for name in recorded if name not in training)
+        if cameras or (allow_training and recorded):
+            return cameras or recorded
+        raise UsageError(
+            f"{reference.where}: each camera is called like one that trained the scene ({', '.join(recorded)})",
+            remedy="give the views that reconstruct left out as --holdout or --protocol, or --allow-training",
+        )
+    cameras = tuple(dict.fromkeys(wanted))
+    unknown = [name for name in cameras if name not in recorded]
+    if unknown:
+        raise InputError(f"{reference.where}: no camera {unknown[0]!r}", remedy=f"use one of: {', '.join(recorded)}")
+    trained = [name for name in cameras if name in training]
+    if trained and not allow_training:
+        raise UsageError(
+            f"--cameras {','.join(wanted)}: {trained[0]} trained the scene, its score says nothing about other views",
+            remedy="give a camera that was held out, or --allow-training",
+        )
+    return cameras
+
+
+def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None:
+    """Raise UsageError where the scene at `path` was not trained on the views that the protocol trains on."""
+    if reference.protocol is None or reference.split is None:
+        return
+    trained, expected = scene.training_stamps_ns, reference.training_stamps_ns
+    if trained == expected:
+        return
+    lacks, others = len(expected - trained), len(trained - expected)
+    raise UsageError(
+        f"{path}: protocol {reference.protocol.name} trains on {len(expected)} views"
+        f" ({reference.split.words()}), of which {lacks} did not train the scene, and {others} others did",
+        remedy=f"reconstruct with --protocol {reference.protocol.name}",
+    )
+
+
+def recording_check(
+    path: Path, scene: SceneFolder, reference: Reference, digests: Mapping[str, str], *, allow_other: bool
+) -> dict[str, Any]:
+    """What the recording has in common with the one that made the scene at `path`. Raises InputError where they
+    differ, unless that is allowed.
+
+    By the first frame of each camera that trained (not kept by an older version), and the digests of files of the
+    same names.
+    """
+    recorded = scene.run.get("metrics", {}).get("first_frames")
+    then = scene.run.get("inputs", {})
+    compared = [name for name in then if name in digests]
+    basis = [f"digests of {len(compared)} files of the same names"] if compared else []
+    lines = changed_files(then, digests)
+    if recorded:
+        basis.append("intrinsics, stamp, pose and picture of each training camera's first frame")
+        lines += differences(recorded, reference.source.records())
+    if lines and not allow_other:
+        raise InputError(
+            f"{reference.where}: not the recording that {path} was made from: {'; '.join(lines)}",
+            remedy="give that recording, or --allow-other-recording to score against this one",
+        )
+    return {"basis": basis, "differences": lines}
