@@ -6,18 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import bake_options
-from splatctrl_cli.cli.bake_report import SUMMARY_METRICS
-from splatctrl_cli.cli.field_truth import FIELDS
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.numbers import words
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import metric_names
-from splatctrl_cli.field import baker, distance, probability, weights
+from splatctrl_cli.evaluate.field_truth import FIELDS
+from splatctrl_cli.field import distance, probability, weights
 from splatctrl_cli.field.grid import exact_channel
-from splatctrl_cli.grid_files import grid_formats
 from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.jobs.bake import SUMMARY_METRICS
 from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
@@ -249,6 +247,3 @@ def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(weights.METHODS) == words(FieldConfig, "weights")
     assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
-    assert tuple(baker.CHANNELS) == bake_options.CHANNELS
-    assert baker.DEFAULT_CHANNELS == bake_options.DEFAULT_CHANNELS
-    assert tuple(grid_formats.FORMATS) == bake_options.FORMATS

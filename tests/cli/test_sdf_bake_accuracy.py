@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatctrl_cli.cli.field_held_out import split_cameras
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.cli.sdf_bake import split_cameras
 from splatctrl_cli.simulate.truth import load_truth
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import splat_set

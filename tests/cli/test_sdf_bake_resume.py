@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatctrl_cli.cli import bake_run
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field import slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.layout import GridLayout
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
+from splatctrl_cli.jobs import bake_slabs
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 
@@ -194,7 +194,7 @@ def test_a_full_disk_is_told_before_anything_is_baked(
     splats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(bake_run.shutil, "disk_usage", lambda path: usage(0, 0, 3 * 2**20))
+    monkeypatch.setattr(bake_slabs.shutil, "disk_usage", lambda path: usage(0, 0, 3 * 2**20))
     assert bake(splats, tmp_path / "field") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "of disk" in line and "0.0 GiB (3145728 bytes) is free at" in line and "fewer --channels" in line
@@ -205,12 +205,12 @@ def test_openvdb_that_does_not_fit_the_memory_is_told_before_anything_is_baked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     grid = GridLayout(origin=np.zeros(3), voxel=0.1, shape=(100, 100, 100))
-    monkeypatch.setattr(bake_run, "available_memory", lambda: 27 * 10**6)
-    bake_run.check_vdb(grid, ["sdf"], ["npz"])
+    monkeypatch.setattr(bake_slabs, "available_memory", lambda: 27 * 10**6)
+    bake_slabs.check_vdb(grid, ["sdf"], ["npz"])
     with pytest.raises(UsageError, match=r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats"):
-        bake_run.check_vdb(grid, ["sdf"], ["npz", "vdb"])
-    monkeypatch.setattr(bake_run, "available_memory", lambda: 28 * 10**6)
-    bake_run.check_vdb(grid, ["sdf"], ["npz", "vdb"])
+        bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
+    monkeypatch.setattr(bake_slabs, "available_memory", lambda: 28 * 10**6)
+    bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
 
 
 @pytest.mark.usefixtures("small_slabs")

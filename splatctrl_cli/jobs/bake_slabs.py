@@ -3,19 +3,19 @@
 import json
 import shutil
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from splatctrl_cli.cli.common import Console
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.layout import GridLayout, available_memory
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
+from splatctrl_cli.jobs.progress import Progress
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
@@ -31,14 +31,14 @@ class BakeTask:
     `unknown` is what is done with unknown space (None: nothing).
     """
 
-    baker: "Baker"
+    baker: Baker
     settings: Mapping[str, Any]
-    kept: "Kept | None" = None
-    unknown: "UnknownSpace | None" = None
-    formats: tuple[str, ...] = field(default=())
+    kept: Kept | None = None
+    unknown: UnknownSpace | None = None
+    formats: tuple[str, ...] = ()
 
 
-def bake_to_disk(task: BakeTask, partial: Path, console: Console, *, resume: bool) -> "GridSlabs":
+def bake_to_disk(task: BakeTask, partial: Path, progress: Progress, *, resume: bool) -> GridSlabs:
     """The channels in ``partial/channels``; the baker's counts are then those of all that was baked.
 
     With `resume` it goes on after the last slab that an interrupted bake of the same settings left. Raises UsageError
@@ -60,9 +60,9 @@ def bake_to_disk(task: BakeTask, partial: Path, console: Console, *, resume: boo
     store = resume_slabs(folder, plan) if resume else start_slabs(folder, plan)
     counts = _counts(folder)
     if store.num_layers:
-        console.log(f"{partial}: goes on after {store.num_layers} of {layout.shape[0]} planes")
+        progress.log(f"{partial}: goes on after {store.num_layers} of {layout.shape[0]} planes")
         _set_counts(task, counts[str(store.num_layers)])
-    hidden = True if console.is_quiet else None
+    hidden = True if progress.is_quiet else None
     with tqdm(total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=hidden) as bar:
         for first, last in slabs(layout, baker.channels, store.num_layers):
             planes = baked_planes(baker, first, last, task.kept)
@@ -82,7 +82,7 @@ def clear_leftovers(partial: Path) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def check_disk(folder: Path, layout: "GridLayout", channels: Collection[str], formats: Collection[str]) -> None:
+def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where the channels and the files made of them do not fit the disk."""
     per_cell = bytes_per_cell(channels)
     copies = per_cell * sum(name in WHOLE_FORMATS for name in formats) + 4 * ("curobo" in formats)
@@ -97,7 +97,7 @@ def check_disk(folder: Path, layout: "GridLayout", channels: Collection[str], fo
         )
 
 
-def check_vdb(layout: "GridLayout", channels: Collection[str], formats: Collection[str]) -> None:
+def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where OpenVDB is asked for and cannot hold the grid in memory, as its library does."""
     needed, free = VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, available_memory()
     if "vdb" in formats and needed > free:
