@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy
 from splatctrl_cli.evaluate.visibility import seen_by
-from splatctrl_cli.records import Bool, Box, Float64, RgbdFrame
+from splatctrl_cli.records import Box, Float64, RgbdFrame
 from splatctrl_cli.report.reliability import Reliability, reliability
 
 FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
@@ -80,7 +80,7 @@ def compare_with_truth(
     if not is_near.any():
         raise NotEvaluableError(f"{name}: no cell of the grid lies within {BANDS[-1][1]} m outside an object")
     seen, in_workspace = np.zeros_like(is_near), np.ones_like(is_near)
-    seen[is_around] = _seen(cells.surface[is_around], frames)
+    seen[is_around] = seen_by(cells.surface[is_around], frames)
     if workspace is not None:
         in_workspace[is_around] = workspace.contains(cells.surface[is_around])
     is_counted = seen & in_workspace
@@ -105,14 +105,6 @@ def compare_with_truth(
         error_mean=float(error.mean()) if len(error) else None,
         error_sigma=float(error.std()) if len(error) else None,
     )
-
-
-def _seen(surface: Float64, frames: Iterable[RgbdFrame]) -> Bool:
-    seen = np.zeros(len(surface), dtype=np.bool_)
-    for frame in frames:
-        unseen = np.flatnonzero(~seen)
-        seen[unseen] = seen_by(surface[unseen], [frame])
-    return seen
 
 
 def _curve(found: Reliability) -> dict[str, object]:

@@ -17,7 +17,7 @@ from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.parts import Parts
 from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.records import Balls, Box, DistanceGrid, Label, OccupancyGrid, SplatSet
-from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
 from splatctrl_cli.splat_files.splats import read_world_splats
 
 NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell
@@ -75,12 +75,12 @@ class BakeSource:
     """
 
     splats: SplatSet
-    occupancy: OccupancyGrid | None
-    unrepresented: Balls | None
-    stamp_ns: int | None
-    workspace: Box | None
-    cameras: tuple[str, ...] | None
     digests: dict[str, str]
+    occupancy: OccupancyGrid | None = None
+    unrepresented: Balls | None = None
+    stamp_ns: int | None = None
+    workspace: Box | None = None
+    cameras: tuple[str, ...] | None = None
 
 
 def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
@@ -95,41 +95,29 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
         return _read_folder(path, at_seconds)
     if at_seconds is not None:
         raise UsageError(f"--at {at_seconds:g}: {path} is one splat set", remedy="give the scene's folder")
-    return BakeSource(
-        splats=read_world_splats(path),
-        occupancy=None,
-        unrepresented=None,
-        stamp_ns=None,
-        workspace=None,
-        cameras=None,
-        digests={path.name: sha256(path)},
-    )
+    return BakeSource(splats=read_world_splats(path), digests={path.name: sha256(path)})
 
 
 def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
     scene = open_scene(path)
     final = scene.occupancy()
-    occupancy: OccupancyGrid | None
-    if at_seconds is None:
-        splats, occupancy, stamp_ns = scene.splats(), final, scene.stamp_ns
-        unrepresented = scene.unrepresented_at(None)
-        files = [path / "splats.ply", path / "occupancy.npz"]
-    else:
+    then: SceneFolder | Snapshot = scene
+    wanted_ns, files = None, [path / "splats.ply", path / "occupancy.npz"]
+    if at_seconds is not None:
         if not scene.snapshots:
             raise NotEvaluableError(f"{path}: has no snapshots", remedy="bake without --at")
         wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
-        snapshot = scene.snapshot_at(wanted_ns)
-        splats, occupancy, stamp_ns = snapshot.splats(), snapshot.occupancy(), snapshot.stamp_ns
-        unrepresented = scene.unrepresented_at(wanted_ns)
-        files = [snapshot.path] if occupancy is None else [snapshot.path, snapshot.occupancy_path]
+        then = scene.snapshot_at(wanted_ns)
+        files = [then.path, then.occupancy_path]
+    occupancy = then.occupancy()
     return BakeSource(
-        splats=splats,
+        splats=then.splats(),
         occupancy=occupancy,
-        unrepresented=unrepresented,
-        stamp_ns=stamp_ns,
+        unrepresented=scene.unrepresented_at(wanted_ns),
+        stamp_ns=then.stamp_ns,
         workspace=_workspace(final),
         cameras=scene.cameras,
-        digests={file.name: sha256(file) for file in files},
+        digests={file.name: sha256(file) for file in (files if occupancy is not None else files[:1])},
     )
 
 
@@ -146,9 +134,8 @@ class Previous:
     @property
     def box(self) -> Box:
         """The box of the cell centres: a grid over it, with the same voxel, has the same cells."""
-        shape = self.grid.channels["sdf"].shape
-        upper = [o + self.grid.voxel * (n - 1) for o, n in zip(self.grid.origin.tolist(), shape, strict=True)]
-        return Box(lower=self.grid.origin, upper=self.grid.origin * 0 + upper)
+        x, y, z = self.grid.channels["sdf"].shape
+        return GridLayout(origin=self.grid.origin, voxel=self.grid.voxel, shape=(x, y, z)).box
 
 
 def read_previous(path: Path, scene: Path) -> Previous:
@@ -181,21 +168,21 @@ def check_same(
 ) -> None:
     """Raise UsageError naming what differs between the bake before and this one."""
     grid = previous.grid
-    before: dict[str, object] = {"field.voxel": grid.voxel, "cells": " x ".join(map(str, grid.channels["sdf"].shape))}
-    now: dict[str, object] = {"field.voxel": layout.voxel, "cells": " x ".join(map(str, layout.shape))}
-    before["first cell"], now["first cell"] = grid.origin.tolist(), np.asarray(layout.origin).tolist()
-    before["channels"], now["channels"] = ",".join(sorted(grid.channels)), ",".join(sorted(channels))
-    before["labels"], now["labels"] = grid.header.get("labels"), labels
     used = previous.run.get("config", {}).get("field", {})
-    for name, value in vars(config).items():
-        if name not in NOT_COMPARED:
-            before[f"field.{name}"], now[f"field.{name}"] = used.get(name), value
-    differing = [name for name in now if before[name] != now[name]]
+    settings = {name: value for name, value in vars(config).items() if name not in NOT_COMPARED}
+    then_and_now: dict[str, tuple[object, object]] = {
+        "field.voxel": (grid.voxel, layout.voxel),
+        "cells": (" x ".join(map(str, grid.channels["sdf"].shape)), " x ".join(map(str, layout.shape))),
+        "first cell": (grid.origin.tolist(), layout.origin.tolist()),
+        "channels": (",".join(sorted(grid.channels)), ",".join(sorted(channels))),
+        "labels": (grid.header.get("labels"), labels),
+        **{f"field.{name}": (used.get(name), value) for name, value in settings.items()},
+    }
+    differing = [f"{name} was {then}, is {now}" for name, (then, now) in then_and_now.items() if then != now]
     if differing:
-        said = ", ".join(f"{name} was {before[name]}, is {now[name]}" for name in differing[:3])
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise UsageError(
-            f"--update {previous.path}: that field was baked otherwise: {said}{more}",
+            f"--update {previous.path}: that field was baked otherwise: {', '.join(differing[:3])}{more}",
             remedy="give the options it was baked with, or bake without --update",
         )
 

@@ -62,11 +62,11 @@ def stopped(monkeypatch: pytest.MonkeyPatch, error: BaseException, after: int) -
     """The slab number `after` raises instead of being written."""
     real, calls = GridSlabs.write, []
 
-    def write(self: GridSlabs, slab: Any) -> None:
+    def write(self: GridSlabs, *slab: Any) -> None:
         calls.append(1)
         if len(calls) == after:
             raise error
-        real(self, slab)
+        real(self, *slab)
 
     monkeypatch.setattr(GridSlabs, "write", write)
 
@@ -120,8 +120,8 @@ from splatctrl_cli.field import layout, slabs
 from splatctrl_cli.field.layout import GridLayout
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 slabs.SLAB_BYTES, real, calls = 1, GridSlabs.write, []
-def write(self, slab):
-    real(self, slab)
+def write(self, *slab):
+    real(self, *slab)
     calls.append(1)
     if len(calls) == 2:
         os.kill(os.getpid(), signal.SIGKILL)
