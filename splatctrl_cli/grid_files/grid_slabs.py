@@ -89,12 +89,6 @@ class GridSlabs:
         origin = np.array(self.plan.origin, np.float64)
         return DistanceGrid(origin=origin, voxel=self.plan.voxel, channels=channels, header=dict(header))
 
-    def remove(self) -> None:
-        """Delete the files and the folder."""
-        for path in (self.folder / PROGRESS, *(self._path(name) for name in self.plan.channels)):
-            path.unlink(missing_ok=True)
-        self.folder.rmdir()
-
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npy"
 
