@@ -15,6 +15,7 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.evaluate.field_truth import FIELDS
 from splatctrl_cli.field import distance, probability, weights
+from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid import exact_channel
 from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.jobs.bake import SUMMARY_METRICS
@@ -291,3 +292,20 @@ def test_the_field_that_is_updated_is_not_replaced(tmp_path: Path, splats: Path)
     assert updated.returncode == 0
     assert "blocks baked" in updated.stdout
     assert (tmp_path / "same" / "field.npz").read_bytes() == (field / "field.npz").read_bytes()
+
+
+def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = ["sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--formats", "npz"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("splatctrl_cli.field.header.label_counts", interrupt)
+        stopped = here.splatctrl(*given)
+    assert stopped.returncode == 130
+    assert "go on with the same command and --resume" in stopped.stderr
+    monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake
+    resumed = here.splatctrl(*given, "--resume")
+    assert resumed.returncode == 0
+    assert "goes on after" in resumed.stderr
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
