@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.config import Config
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_truth import FIELDS
@@ -101,7 +100,7 @@ def bake(request: BakeRequest, progress: Progress = SILENT) -> BakeResult:
             partial,
             command="sdf-bake",
             config=request.config.as_dict(),
-            inputs=job.source.digests | ({} if job.previous is None else job.previous.digests),
+            inputs=job.digests,
             metrics=metrics,
             stopwatch=stopwatch,
             seed=request.seed,
@@ -142,8 +141,9 @@ class _Job:
     baker: Baker
 
     @property
-    def config(self) -> Config:
-        return self.request.config
+    def digests(self) -> dict[str, str]:
+        """sha256 of every file that was read."""
+        return self.source.digests | ({} if self.previous is None else self.previous.digests)
 
 
 def _read(request: BakeRequest, stopwatch: Stopwatch) -> _Job:
@@ -205,7 +205,7 @@ def _box(request: BakeRequest, source: BakeSource, previous: Previous | None) ->
 
 def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, Changes | None]:
     """The grid, its channels on disk; of an update, also what changed."""
-    baker, previous, source, config = job.baker, job.previous, job.source, job.config
+    baker, previous, source, config = job.baker, job.previous, job.source, job.request.config
     changes = kept = old = None
     if previous is not None:
         before = obstacle_spheres(previous.source.splats, previous.source.unrepresented, job.request.labels).splats
@@ -240,12 +240,12 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
 
 def _settings(job: _Job) -> dict[str, Any]:
     """Everything that decides the bytes beside the grid and its channels."""
-    digests = job.source.digests | ({} if job.previous is None else job.previous.digests)
+    config = job.request.config
     return {
         **deciding_versions(),
-        **{f"field.{name}": value for name, value in asdict(job.config.field).items()},
-        **{f"occupancy.{name}": value for name, value in asdict(job.config.occupancy).items()},
-        **{f"sha256 of {name}": value for name, value in digests.items()},
+        **{f"field.{name}": value for name, value in asdict(config.field).items()},
+        **{f"occupancy.{name}": value for name, value in asdict(config.occupancy).items()},
+        **{f"sha256 of {name}": value for name, value in job.digests.items()},
         "labels": ",".join(job.request.label_names),
     }
 

@@ -11,7 +11,7 @@ import numpy as np
 from splatctrl_cli import __version__
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field.layout import GridLayout, available_memory
+from splatctrl_cli.field.layout import GridLayout, check_room
 from splatctrl_cli.field.selection import DEFAULT_LABELS
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.parts import Parts
@@ -109,7 +109,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
         wanted_ns = scene.snapshots[0].stamp_ns + round(at_seconds * 1e9)
         then = scene.snapshot_at(wanted_ns)
         files = [then.path, then.occupancy_path]
-    occupancy = then.occupancy()
+    occupancy = final if wanted_ns is None else then.occupancy()
     return BakeSource(
         splats=then.splats(),
         occupancy=occupancy,
@@ -148,7 +148,7 @@ def read_previous(path: Path, scene: Path) -> Previous:
         raise InputError(f"--update {path}: no such folder", remedy="give a folder that sdf-bake wrote")
     file = path / "field.npz"
     if file.is_file():
-        _check_memory(file)
+        check_room(f"--update: {file}", file.stat().st_size, "bake without --update, which needs less")
     run = _run_of(path)
     grid = read_npz(Parts.of_run(path, run).checked(file))
     is_ours = run.get("command") == "sdf-bake" and run.get("splatctrl") == __version__
@@ -195,15 +195,6 @@ def _run_of(folder: Path) -> dict[str, Any]:
     if not isinstance(run, dict):
         raise InputError(f"--update {folder}: has no readable run.json", remedy="bake it once without --update")
     return run
-
-
-def _check_memory(file: Path) -> None:
-    needed, free = file.stat().st_size, available_memory()
-    if needed > free:
-        raise UsageError(
-            f"--update: {file} needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free",
-            remedy="bake without --update, which needs less",
-        )
 
 
 def _its_source(path: Path, grid: DistanceGrid, scene: Path) -> BakeSource:

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.layout import GridLayout, available_memory
+from splatctrl_cli.field.layout import GridLayout, check_room
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.jobs.progress import Progress
@@ -93,12 +93,9 @@ def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], form
 
 def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where OpenVDB is asked for and cannot hold the grid in memory, as its library does."""
-    needed, free = VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, available_memory()
-    if "vdb" in formats and needed > free:
-        raise UsageError(
-            f"format vdb: needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free",
-            remedy="leave it out of --formats (nrrd needs no memory), or give a larger --voxel or fewer --channels",
-        )
+    if "vdb" in formats:
+        remedy = "leave it out of --formats (nrrd needs no memory), or give a larger --voxel or fewer --channels"
+        check_room("format vdb:", VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, remedy)
 
 
 def _counts_now(task: BakeTask) -> dict[str, int]:
