@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.jobs.bake import BakeResult
 from splatctrl_cli.simulate.truth import load_truth
-from splatctrl_cli.splat_files.splats import write_ply
+from splatctrl_cli.splat_files.splats import read_ply, write_ply
+from tests.cli.replay_desk import write_scene
 from tests.field.scenes import splat_set
 from tests.jobs.bakes import baked, field_json
 
@@ -59,6 +60,13 @@ def test_cameras_of_held_out_depth_are_named(true_splats: Path, sample_data: Pat
     with pytest.raises(InputError):
         bake(true_splats, tmp_path / "field", held_out=tmp_path / "none.mcap")
     assert not list(tmp_path.iterdir())
+
+
+def test_depth_later_than_the_scene_does_not_count(true_splats: Path, sample_data: Path, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene", (1, read_ply(true_splats)[0]))
+    log = sample_data / "tabletop" / "log.mcap"
+    with pytest.raises(NotEvaluableError, match="no frame of cam3 up to the time of the scene"):
+        bake(scene, tmp_path / "field", held_out=log, held_out_cameras=("cam3",))
 
 
 def test_probability_is_held_to_the_truth(true_splats: Path, sample_data: Path, tmp_path: Path) -> None:
