@@ -1,303 +1,268 @@
 """``splatctrl sdf-bake``: a scene's splats as a distance grid, and its accuracy where the truth is known."""
 
 import argparse
-import shutil
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from splatctrl_cli.cli.common import (
+    Console,
+    Subparsers,
+    add_command,
+    add_config,
+    add_gates,
+    add_output,
+    configured,
+    table,
+)
+from splatctrl_cli.cli.numbers import MAX_SECONDS, real, setting, words
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.field_accuracy import BandAccuracy
+from splatctrl_cli.evaluate.field_truth import NEAR, TruthComparison
+from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS
+from splatctrl_cli.grid_files.grid_formats import FORMATS
+from splatctrl_cli.jobs.bake import BakeResult, bake
+from splatctrl_cli.jobs.bake_request import BakeRequest
+from splatctrl_cli.records import Box, Label
 
-from splatctrl_cli.cli.bake_options import (
-    DEFAULT_CHANNELS,
-    FORMATS,
-    add_options,
-    box_of,
-    channels_of,
-    labels_of,
-    names_of,
-    with_options,
-)
-from splatctrl_cli.cli.bake_report import (
-    FieldReport,
-    bake_verdict,
-    metric_names,
-    metrics,
-    reference_lines,
-    summary_lines,
-    warnings_of,
-    write_pictures,
-)
-from splatctrl_cli.cli.bake_run import CHECKPOINT, FOLDER, BakeTask, bake_to_disk, clear_leftovers
-from splatctrl_cli.cli.bake_source import BakeSource, read_bake_source
-from splatctrl_cli.cli.bake_update import Previous, check_same, read_previous
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, configured
-from splatctrl_cli.cli.field_held_out import compare_with_held_out, held_out_cameras, held_out_lines
-from splatctrl_cli.cli.field_truth import accuracy_lines, compare_with_truth
-from splatctrl_cli.config import Config
-from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.gates import check_gate_names
-from splatctrl_cli.evaluate.reference_mesh import compare_with_mesh
-from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.header import field_header
-from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.layout import GridLayout
-from splatctrl_cli.field.obstacles import obstacle_spheres
-from splatctrl_cli.field.probability import probabilities
-from splatctrl_cli.field.report import grid_statistics
-from splatctrl_cli.field.slabs import Kept, UnknownSpace, slabs
-from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
-from splatctrl_cli.grid_files.grid_formats import check_formats, write_grid
-from splatctrl_cli.jobs.resume import deciding_versions, told_how_to_go_on
-from splatctrl_cli.records import DistanceGrid, Label, SplatSet
+SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options
+SAME = (
+    *("scene", "at", "urdf", "spheres", "truth", "seen_by", "reference_mesh", "no_report", "update"),
+    *("previous_scene", "resume", "force", "seed", "threads"),
+)  # options that the request has by the same names
+ERRORS = ("mean", "rmse", "over_95", "over_max")
+COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 
 
 def register(subparsers: Subparsers) -> None:
     """Add the subcommand to the parser."""
-    add_options(add_command(subparsers, "sdf-bake", run))
+    parser = add_command(subparsers, "sdf-bake", run)
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a folder that reconstruct wrote, or a splats.ply")
+    add_output(parser, default="field", what="folder to write: the grid, field.json, report/, run.json")
+    parser.add_argument(
+        "--at",
+        type=real(-MAX_SECONDS, MAX_SECONDS, "s"),
+        metavar="SECONDS",
+        help="the scene as known that long after its start",
+    )
+    parser.add_argument(
+        "--include",
+        default="human",
+        metavar="NAME,...",
+        help="labels in the field beside object: robot, human, or none (default: human; the robot is left out)",
+    )
+    _add_grid(parser)
+    _add_field(parser)
+    _add_truth(parser)
+    _add_going_on(parser)
+    add_config(parser)
+    add_gates(parser)
+
+
+def _add_grid(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--box", metavar="X0,Y0,Z0,X1,Y1,Z1", help="what the grid covers [m]; write --box=-1,... for a negative start"
+    )
+    parser.add_argument("--urdf", type=Path, help="cover the reach of this robot around its base, without --box")
+    parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its spheres (default: the URDF's own)")
+    parser.add_argument("--voxel", type=setting(FieldConfig, "voxel"), metavar="M", help="cell size (field.voxel)")
+    parser.add_argument(
+        "--channels",
+        metavar="NAME,...",
+        help=f"what is baked beside sdf, of {', '.join(CHANNELS)} (default: {','.join(DEFAULT_CHANNELS)})",
+    )
+    parser.add_argument(
+        "--formats", default="npz,vti", metavar="NAME,...", help=f"of {', '.join(FORMATS)} (default: npz,vti)"
+    )
+
+
+def _add_field(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--distance",
+        choices=words(FieldConfig, "distance"),
+        help="what sdf is: min(se, hard), min(gpdf, hard), the exact distance, either kernel field (field.distance)",
+    )
+    parser.add_argument(
+        "--weights",
+        choices=words(FieldConfig, "weights"),
+        help="of the kernel field: row sums, voxels, the full GP (field.weights)",
+    )
+    parser.add_argument(
+        "--length-scale",
+        type=setting(FieldConfig, "length_scale"),
+        metavar="M",
+        help="l of the kernel (field.length_scale)",
+    )
+    parser.add_argument(
+        "--unknown", choices=words(FieldConfig, "unknown"), help="what never-seen space counts as (field.unknown)"
+    )
+    parser.add_argument(
+        "--probability",
+        choices=words(FieldConfig, "probability"),
+        help="bake the channel probability, of collision, in this form (field.probability)",
+    )
+
+
+def _add_truth(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--truth", type=Path, metavar="truth.json", help="measure the field against this truth")
+    parser.add_argument(
+        "--seen-by", type=Path, metavar="LOG", help="the log or capture whose cameras saw the scene, for --truth"
+    )
+    parser.add_argument(
+        "--reference-mesh", type=Path, metavar="FILE", help="measure the field against this mesh (world, metres)"
+    )
+    parser.add_argument(
+        "--held-out",
+        metavar="LOG[:CAMERA,...]",
+        help="measure the field against depth of cameras that did not train; --urdf tells which pixels are robot",
+    )
+    parser.add_argument("--no-report", action="store_true", help="draw no pictures")
+
+
+def _add_going_on(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--update", type=Path, metavar="FIELD", help="bake anew only what changed since that field folder was baked"
+    )
+    parser.add_argument(
+        "--previous-scene", type=Path, metavar="SCENE", help="what --update's field was baked from (default: SCENE)"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with a bake that was interrupted, to the same bytes"
+    )
+
+
+def _names_of(text: str, choices: Sequence[str], option: str) -> tuple[str, ...]:
+    """The names in a list with commas. Raises UsageError for one that is no choice, or none at all."""
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    unknown = [name for name in names if name not in choices]
+    if unknown or not names:
+        raise UsageError(f"{option} {text}: expected some of: {', '.join(choices)}")
+    return names
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    console, stopwatch, config = Console(args), Stopwatch(), with_options(configured(args), args)
-    formats, labels = names_of(args.formats, FORMATS, "--formats"), labels_of(args.include)
-    _check_options(args)
-    check_gate_names(args.require, metric_names(with_truth=args.truth is not None))
-    out = args.out or Path("field")
-    checkpoint = partial_path(out) / CHECKPOINT
-    _tell_of_partial(args, checkpoint, console)
-    with (
-        told_how_to_go_on(checkpoint),
-        output_path(out, force=args.force, is_folder=True, checkpoint=CHECKPOINT, resume=args.resume) as partial,
-    ):
-        job = _read(args, config, formats, labels, stopwatch)
-        clear_leftovers(partial)
-        report, lines = _bake(job, args, partial, console, stopwatch)
-        result = report.summary() | ({"accuracy": report.accuracy} if report.accuracy else {})
-        truth = None if report.accuracy is None else report.accuracy.get("truth")
-        figures = metrics(result, truth)
-        has_occupancy = job.source.occupancy is not None
-        verdict = bake_verdict(report, config.field.max_loss, args.require, figures, has_occupancy=has_occupancy)
-        _remove(partial / FOLDER)
-        write_run(
-            partial,
-            command="sdf-bake",
-            config=config.as_dict(),
-            inputs=job.source.digests | ({} if job.previous is None else job.previous.digests),
-            metrics=figures,
-            stopwatch=stopwatch,
-            seed=args.seed,
-            verdict=verdict.as_dict(),
-        )
-    console.log(f"baked in {stopwatch.seconds['bake']:.2f} s; wrote {out}")
-    console.concluded(verdict, result, lines, verdict.exit_code)
-    return verdict.exit_code
+    console, request = Console(args), _request(args)
+    result = bake(request, console)
+    console.log(f"baked in {result.seconds['bake']:.2f} s; wrote {result.out}")
+    compared = result.accuracy.as_dict()
+    printed = {**result.summary, **({"accuracy": compared} if compared else {})}
+    console.concluded(result.verdict, printed, _lines(result), result.verdict.exit_code)
+    return result.verdict.exit_code
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Job:
-    """What was read, and what is to be made of it; chosen: the spheres of the field, splats and then
-    balls around unrepresented voxels.
-    """
-
-    config: "Config"
-    source: "BakeSource"
-    previous: "Previous | None"
-    chosen: "SplatSet"
-    num_unrepresented: int
-    labels: "frozenset[Label]"
-    formats: tuple[str, ...]
-    baker: "Baker"
-
-    @property
-    def label_names(self) -> list[str]:
-        """As the header has them."""
-        return sorted(label.name.lower() for label in self.labels)
-
-
-def _check_options(args: argparse.Namespace) -> None:
-    if (args.truth is None) != (args.seen_by is None):
-        raise UsageError("--truth and --seen-by: expected both or neither")
-    if args.previous_scene is not None and args.update is None:
-        raise UsageError("--previous-scene: belongs to --update", remedy="give the field folder to --update as well")
-
-
-def _check_references(args: argparse.Namespace, source: "BakeSource") -> None:
-    """Raise for what cannot be compared with, before a bake that may take long."""
-    for path in (args.truth, args.seen_by, args.reference_mesh):
-        if path is not None and not path.exists():
-            raise InputError(f"{path}: no such file or folder", remedy="check the path")
-    if args.held_out is not None:
-        held_out_cameras(args.held_out, source.cameras)
-
-
-def _tell_of_partial(args: argparse.Namespace, checkpoint: Path, console: Console) -> None:
-    partial = checkpoint.parent.parent
-    if args.resume and not checkpoint.is_file():
-        console.log(f"{partial}: nothing to go on from; starts at the beginning")
-    elif checkpoint.is_file() and not args.resume:
-        console.log(f"warning: {partial}: an interrupted bake is replaced; --resume would have gone on with it")
-
-
-def _read(
-    args: argparse.Namespace,
-    config: "Config",
-    formats: tuple[str, ...],
-    labels: "frozenset[Label]",
-    stopwatch: "Stopwatch",
-) -> _Job:
-    """Read the splats, and check that the field can be made of them and written."""
-    with stopwatch.stage("read"):
-        source = read_bake_source(args.scene, args.at)
-        previous = None if args.update is None else read_previous(args.update, args.previous_scene or args.scene)
-    obstacles = obstacle_spheres(source.splats, source.unrepresented, labels)
-    chosen = obstacles.splats
-    channels = channels_of(
-        args, DEFAULT_CHANNELS if previous is None else tuple(previous.grid.channels), config.field.unknown
-    )
-    _check_references(args, source)
-    check_formats(formats, channels, unknown=config.field.unknown)
-    has_box = previous is None or args.box is not None or args.urdf is not None
-    box = box_of(args, source.splats, labels, config.field.padding) if has_box or previous is None else previous.box
-    layout = GridLayout.over(box, config.field.voxel)
-    if previous is not None:
-        check_same(previous, layout, config.field, channels, sorted(label.name.lower() for label in labels))
-    with stopwatch.stage("bake"):
-        baker = Baker(
-            chosen,
-            layout,
-            config.field,
-            channels=channels,
-            occupancy=source.occupancy,
-            thresholds=config.occupancy,
-            threads=args.threads,
-        )
-    return _Job(
-        config=config,
-        source=source,
-        previous=previous,
-        chosen=chosen,
-        num_unrepresented=obstacles.num_unrepresented,
-        labels=labels,
-        formats=formats,
-        baker=baker,
+def _request(args: argparse.Namespace) -> BakeRequest:
+    config = configured(args)
+    given = {name: getattr(args, name) for name in SETTINGS if getattr(args, name) is not None}
+    log, cameras = (None, ()) if args.held_out is None else split_cameras(args.held_out)
+    return BakeRequest(
+        out=args.out or Path("field"),
+        config=replace(config, field=replace(config.field, **given)),
+        formats=_names_of(args.formats, tuple(FORMATS), "--formats"),
+        labels=_labels_of(args.include),
+        box=None if args.box is None else Box.from_text(args.box),
+        channels=None if args.channels is None else _names_of(args.channels, tuple(CHANNELS), "--channels"),
+        with_probability=args.probability is not None,
+        held_out=log,
+        held_out_cameras=cameras,
+        require=tuple(args.require),
+        **{name: getattr(args, name) for name in SAME},
     )
 
 
-def _bake(
-    job: _Job, args: argparse.Namespace, partial: Path, console: Console, stopwatch: "Stopwatch"
-) -> tuple["FieldReport", list[str]]:
-    """Bake, compare, and write all but ``run.json``; returns the report and what is printed."""
-    with stopwatch.stage("bake"):
-        grid, changes = _baked(job, args, partial, console)
-    with stopwatch.stage("report"):
-        statistics = grid_statistics(grid)
-        warnings = warnings_of(grid.header, statistics)
-    with stopwatch.stage("write"):
-        write_grid(partial, grid, job.formats)
-    report = FieldReport(grid=grid, statistics=statistics, warnings=warnings, changes=changes)
-    lines = summary_lines(report.summary())
-    with stopwatch.stage("accuracy"):
-        report, compared_lines = _compared(report, job, args)
-        lines += compared_lines
-    with stopwatch.stage("report"):
-        write_json(partial / "field.json", report.as_dict())
-        if not args.no_report:
-            write_pictures(partial, report, _middle(job))
-    return report, lines
+def _labels_of(text: str) -> frozenset[Label]:
+    """The labels in the field: objects, and those that --include names."""
+    names = () if text.strip() == "none" else _names_of(text, ("robot", "human"), "--include")
+    return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
 
 
-def _baked(
-    job: _Job, args: argparse.Namespace, partial: Path, console: Console
-) -> tuple["DistanceGrid", "Changes | None"]:
-    """The grid, its channels on disk."""
-    baker = job.baker
-    task, changes, old = _task(job, args)
-    if changes is not None and changes.reason:
-        console.log(f"--update: every block is baked anew: {changes.reason}")
-    store = bake_to_disk(task, partial, console, resume=args.resume)
-    if task.kept is not None and old is not None and job.previous is not None:
-        counts: Any = job.previous.grid.header["kernel_counts"]
-        ranges = list(slabs(baker.layout, baker.channels))
-        baker.counts = counts_after(counts, old, baker, task.kept.mask, ranges)
-    header = field_header(
-        job.source.splats,
-        job.chosen,
-        job.labels,
-        baker,
-        has_occupancy=job.source.occupancy is not None,
-        num_unrepresented=job.num_unrepresented,
+def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:
+    """The log and the cameras of ``LOG:camera,...``; none named means every one that did not train."""
+    path, colon, cameras = text.rpartition(":")
+    if not colon or Path(text).exists():
+        return Path(text), ()
+    return Path(path), tuple(name.strip() for name in cameras.split(",") if name.strip())
+
+
+def _lines(result: BakeResult) -> list[str]:
+    """The summary, and a table for each thing that the field was compared with."""
+    rows = [(name.replace("_", " "), _shown(value)) for name, value in result.summary.items()]
+    lines = table(("field", ""), rows)
+    truth, mesh, held_out = result.accuracy.truth, result.accuracy.reference_mesh, result.accuracy.held_out_depth
+    if truth is not None:
+        lines += ["", *_truth_lines(truth)]
+    if mesh is not None:
+        cells = [(name, _band(band), *_errors(band)) for name, band in _each(mesh.accuracy.everywhere)]
+        lines += ["", *table(("field", "from mesh cm", *COLUMNS), cells)]
+    if held_out is not None:
+        note = "before it: points whose ball up to it was seen to be free"
+        lines += ["", f"held-out depth of {held_out.num_frames} frames; {note}"]
+        places = {name: [("on it", band)] for name, band in held_out.on_surface.items()}
+        for name, band in _each(held_out.before.seen):
+            places[name].append((_band(band), band))
+        cells = [(name, place, *_errors(band)) for name, bands in places.items() for place, band in bands]
+        lines += table(("field", "from depth cm", *COLUMNS), cells)
+    return lines
+
+
+def _truth_lines(compared: TruthComparison) -> list[str]:
+    """The table by band, and whether the exact distance keeps to its allowance."""
+    accuracy, figures = compared.accuracy, ("mean", "rmse", "median", "over_95", "over_max")
+    rows = [
+        (where, name, _band(band), *_errors(band, figures))
+        for where, fields in (("seen", accuracy.seen), ("all", accuracy.everywhere))
+        for name, band in _each(fields)
+    ]
+    over = accuracy.over_estimate
+    verdict = (
+        f"hard exceeds the truth by more than {over.allowance * 1e3:.1f} mm at {over.count_beyond} of {over.count} "
+        "seen cells"
     )
-    treated = {} if task.unknown is None else task.unknown.header()
-    place = {"digests": job.source.digests, "stamp_ns": job.source.stamp_ns}
-    return store.grid({**header, **treated, **place}), changes
-
-
-def _task(job: _Job, args: argparse.Namespace) -> tuple["BakeTask", "Changes | None", "Baker | None"]:
-    """What has to be baked; with --update also what changed, and the baker of the splats before."""
-    settings = {
-        **deciding_versions(),
-        **{f"field.{name}": value for name, value in asdict(job.config.field).items()},
-        **{f"occupancy.{name}": value for name, value in asdict(job.config.occupancy).items()},
-        **{f"sha256 of {name}": value for name, value in job.source.digests.items()},
-        "labels": ",".join(job.label_names),
-    }
-    if job.previous is None:
-        task = BakeTask(baker=job.baker, settings=settings, unknown=_unknown(job), formats=job.formats)
-        return task, None, None
-    settings |= {f"sha256 of {name}": value for name, value in job.previous.digests.items()}
-    past = job.previous.source
-    before = obstacle_spheres(past.splats, past.unrepresented, job.labels).splats
-    needed = [name for name in ("sdf", "se", "gpdf") if name in job.baker.channels]
-    old = Baker(before, job.baker.layout, job.config.field, channels=needed, threads=args.threads)
-    changes = changed_blocks(before, old, job.chosen, job.baker)
-    kept = None
-    if changes.mask is not None:
-        kept = Kept(
-            grid=job.previous.grid,
-            mask=changes.mask,
-            occupancy=job.source.occupancy,
-            thresholds=job.config.occupancy,
+    if over.median_beyond is not None and over.max_error is not None:
+        verdict += (
+            f": in the median by {over.median_beyond * 1e3:.1f} mm more than that; "
+            f"the largest error is {over.max_error * 1e3:.1f} mm"
         )
-    task = BakeTask(baker=job.baker, settings=settings, kept=kept, unknown=_unknown(job), formats=job.formats)
-    return task, changes, old
+    if compared.num_outside_workspace:
+        verdict += f"; {compared.num_outside_workspace} cells before seen surfaces outside the workspace do not count"
+    expected = [
+        f"probability, {name}: calibration error {curve.calibration_error:.3f} at seen cells"
+        for name, curve in compared.reliability.items()
+    ]
+    if compared.error_mean is not None and compared.error_sigma:
+        mean, sigma = compared.error_mean, compared.error_sigma
+        expected.append(
+            f"within {NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- {sigma * 1e3:.1f} mm: "
+            f"calibrate the probability with --set field.error_mean={mean:.4f} --set field.error={sigma:.4f}"
+        )
+    return [
+        "error = field - truth, positive where clearance is over-estimated",
+        *table(("cells", "field", "true cm", *COLUMNS[:3], "median mm", *COLUMNS[3:]), rows),
+        "seen: cells whose nearest true surface a camera saw; all: also those before backs that none saw",
+        verdict,
+        *expected,
+    ]
 
 
-def _unknown(job: _Job) -> "UnknownSpace | None":
-    if job.config.field.unknown == "free":
-        return None
-    return UnknownSpace(job.baker.layout, job.config.field, job.source.occupancy, job.config.occupancy)
+def _each(fields: Mapping[str, Iterable[BandAccuracy]]) -> Iterator[tuple[str, BandAccuracy]]:
+    return ((name, band) for name, bands in fields.items() for band in bands)
 
 
-def _compared(report: "FieldReport", job: _Job, args: argparse.Namespace) -> tuple["FieldReport", list[str]]:
-    """The report with the accuracy against all that options name, and the tables of it."""
-    grid, curves = report.grid, {}
-    found: dict[str, Any] = {}
-    lines: list[str] = []
-    if args.truth is not None:
-        forms = probabilities(job.baker.spheres, job.config.field, threads=args.threads)
-        compared = compare_with_truth(grid, job.source, args.truth, args.seen_by, seed=args.seed, probabilities=forms)
-        found["truth"], curves = compared.as_dict(), dict(compared.reliability)
-        lines += ["", *accuracy_lines(compared)]
-    if args.reference_mesh is not None:
-        mesh = compare_with_mesh(grid, args.reference_mesh, seed=args.seed)
-        found["reference_mesh"] = {"file": args.reference_mesh.name, **mesh.as_dict()}
-        lines += ["", *reference_lines(mesh.accuracy, "mesh")]
-    if args.held_out is not None:
-        held_out = compare_with_held_out(grid, job.source, args)
-        found["held_out_depth"] = held_out.as_dict()
-        lines += ["", *held_out_lines(held_out)]
-    return replace(report, accuracy=found or None, reliability=curves), lines
+def _band(band: BandAccuracy) -> str:
+    return f"{band.lower * 100:g}-{band.upper * 100:g}"
 
 
-def _middle(job: _Job) -> list[float]:
-    """Where slices are shown: in the middle of the splats in the grid but for the outermost, or of the grid [m]."""
-    box = job.baker.layout.box
-    inside = job.chosen.centers[box.contains(job.chosen.centers)]
-    lower, upper = np.percentile(inside, (5, 95), axis=0) if len(inside) else (box.lower, box.upper)
-    middle = 0.5 * (lower + upper)
-    return [float(value) for value in middle]
+def _errors(band: BandAccuracy, figures: Sequence[str] = ERRORS) -> list[object]:
+    """The count, and the errors [mm]."""
+    values = (getattr(band, name) for name in figures)
+    return [band.count, *("-" if value is None else f"{value * 1e3:.1f}" for value in values)]
 
 
-def _remove(folder: Path) -> None:
-    shutil.rmtree(folder)
+def _shown(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return " x ".join(map(str, value)) if isinstance(value, list) else str(value)

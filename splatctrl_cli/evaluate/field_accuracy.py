@@ -62,6 +62,18 @@ class FieldAccuracy:
         """Plain values, as written to ``field.json``."""
         return {**asdict(self), "holds": self.over_estimate.holds}
 
+    def figures(self) -> dict[str, float | None]:
+        """The numbers by their `metric_names`."""
+        found = {
+            f"{where}.{name}.{band_name(band.lower, band.upper)}.{figure}": value
+            for where, fields_ in (("everywhere", self.everywhere), ("seen", self.seen))
+            for name, bands in fields_.items()
+            for band in bands
+            for figure, value in vars(band).items()
+            if figure not in {"lower", "upper"}
+        }
+        return found | {f"over_estimate.{name}": value for name, value in vars(self.over_estimate).items()}
+
 
 def metric_names(field_names: Sequence[str]) -> tuple[str, ...]:
     """Flat names of the numbers in a FieldAccuracy: ``seen.hard.0_2cm.rmse``, ``over_estimate.count``."""

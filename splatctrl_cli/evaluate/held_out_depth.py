@@ -35,6 +35,7 @@ EDGE_STEP = 0.03  # of its depth: a pixel that differs more from a neighbour may
 FREE_TOLERANCE = 0.005  # [m] behind the measured depth that still counts as seen free: the noise of a depth camera
 PROBES = (0.3, 0.6, 0.9)  # of the ball's radius; an object thinner than the gaps between them may be missed
 NUM_DIRECTIONS = 96  # of each
+ROBOT_MARGIN = 0.03  # [m] about the robot's spheres in which a pixel does not count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +116,21 @@ def compare_with_held_out_depth(
         num_outside=len(drawn) - len(is_known),
         num_unknown=int(np.count_nonzero(~is_known)),
     )
+
+
+def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float64, Float64] | None) -> Bool:
+    """(H, W) False where a pixel's point lies outside the scene's box, or in one of the robot's spheres or near it.
+
+    spheres: their centres (S, 3) and radii (S,) [m], world.
+    """
+    is_deep = frame.depth > 0
+    points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_deep])
+    is_wanted = np.ones(len(points), np.bool_) if workspace is None else workspace.contains(points)
+    for center, radius in () if spheres is None else zip(*spheres, strict=True):
+        is_wanted &= np.square(points - center).sum(axis=1) > (radius + ROBOT_MARGIN) ** 2
+    counted = np.ones(frame.depth.shape, np.bool_)
+    counted[is_deep] = is_wanted
+    return counted
 
 
 def _measured(frames: Sequence[RgbdFrame], counted: Sequence[Bool] | None, box: Box) -> tuple[Float64, Float64, int]:

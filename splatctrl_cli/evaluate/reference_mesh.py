@@ -17,7 +17,7 @@ REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
 @dataclass(frozen=True, kw_only=True)
 class MeshComparison:
-    """The accuracy, and how many cells went into it.
+    """The accuracy against the mesh of `file`, and how many cells went into it.
 
     num_in_reach of the grid's cells lie in the box of the mesh widened by 20 cm; num_drawn of those were drawn,
     num_unknown of those have no distance (NaN, by the policy for unknown space), num_inside lie inside the mesh near
@@ -25,6 +25,7 @@ class MeshComparison:
     inside.
     """
 
+    file: str
     accuracy: FieldAccuracy
     is_closed: bool
     num_faces: int
@@ -67,6 +68,7 @@ def compare_with_mesh(grid: DistanceGrid, mesh_path: Path, *, seed: int, max_poi
             remedy="give the mesh in the frame of the grid (world), in metres",
         )
     return MeshComparison(
+        file=mesh_path.name,
         accuracy=field_accuracy(
             {name: values.at(known[is_near]) for name, values in distances.items()},
             distance[is_near],

@@ -1,6 +1,6 @@
 """Which points of the world a camera saw."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from splatctrl_cli.records import Bool, Float64, RgbdFrame
 MIN_Z = 1e-6  # [m] in front of the camera
 
 
-def seen_by(points_world: NDArray[np.floating], frames: Sequence[RgbdFrame], tolerance: float = 0.02) -> Bool:
+def seen_by(points_world: NDArray[np.floating], frames: Iterable[RgbdFrame], tolerance: float = 0.02) -> Bool:
     """(Q,) True where a point (Q, 3) [m] is on a surface that one of the frames measured.
 
     The point falls on a pixel of the frame (the nearest), and that pixel has a depth within `tolerance` [m] of the

@@ -88,6 +88,15 @@ def check_memory(layout: GridLayout, bytes_per_cell: int) -> None:
         )
 
 
+def check_room(what: str, needed: int, remedy: str) -> None:
+    """Raise UsageError where `what` needs more memory [bytes] than is free."""
+    free = available_memory()
+    if needed > free:
+        raise UsageError(
+            f"{what} needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free", remedy=remedy
+        )
+
+
 def available_memory() -> int:
     """Bytes that can be had without swapping, by the kernel's own estimate and the limit on this process's group."""
     for line in (PROC / "meminfo").read_text(encoding="ascii").splitlines():

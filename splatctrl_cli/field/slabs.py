@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
-from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.field.baker import CHANNELS, Baker, Planes
-from splatctrl_cli.field.layout import GridLayout, available_memory
+from splatctrl_cli.field.layout import GridLayout, check_room
 from splatctrl_cli.field.observed import observed_planes
 from splatctrl_cli.field.unknown import BOUND, Cubes, blank
 from splatctrl_cli.kernels.field import BLOCK
@@ -45,14 +45,11 @@ def slabs(layout: GridLayout, channels: Collection[str], begin: int = 0) -> Iter
 def check_slab_memory(layout: GridLayout, channels: Collection[str]) -> None:
     """Raise UsageError where not even the planes of one block fit the memory."""
     planes = min(BLOCK, layout.shape[0])
-    needed = planes * layout.shape[1] * layout.shape[2] * (bytes_per_cell(channels) + _BESIDE)
-    free = available_memory()
-    if needed > free:
-        size = " x ".join(str(n) for n in (planes, *layout.shape[1:]))
-        raise UsageError(
-            f"slab of {size} cells: needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free",
-            remedy="give a larger --voxel, fewer --channels, or a --box that is shorter along y and z",
-        )
+    check_room(
+        f"slab of {' x '.join(map(str, (planes, *layout.shape[1:])))} cells:",
+        planes * layout.shape[1] * layout.shape[2] * (bytes_per_cell(channels) + _BESIDE),
+        "give a larger --voxel, fewer --channels, or a --box that is shorter along y and z",
+    )
 
 
 class UnknownSpace:
@@ -80,12 +77,8 @@ class UnknownSpace:
             )
         self._cubes: Cubes | None = None
         if self.policy == "obstacle" and self._is_unknown.any():
-            needed, free = _CUBES * layout.num_cells / 2**30, available_memory() / 2**30
-            if needed > free:
-                raise UsageError(
-                    f"field.unknown = obstacle: needs {needed:.1f} GiB of memory, {free:.1f} GiB is free",
-                    remedy="give a larger --voxel, a smaller --box, or --unknown nan, which needs less",
-                )
+            remedy = "give a larger --voxel, a smaller --box, or --unknown nan, which needs less"
+            check_room("field.unknown = obstacle:", _CUBES * layout.num_cells, remedy)
             self._cubes = Cubes.of(self._is_unknown, layout.voxel)
 
     def apply(self, planes: Planes, first: int, last: int, bound_margin: float) -> Planes:

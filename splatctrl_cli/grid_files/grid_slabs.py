@@ -39,15 +39,20 @@ class SlabPlan:
 
 
 class GridSlabs:
-    """The channels of a `SlabPlan` in `folder`; `num_layers` of x are on disk."""
+    """The channels of a `SlabPlan` in `folder`; `num_layers` of x are on disk, and what was counted up to there."""
 
-    def __init__(self, folder: Path, plan: SlabPlan, num_layers: int) -> None:
+    def __init__(
+        self, folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int] | None = None
+    ) -> None:
         self.folder = folder
         self.plan = plan
         self.num_layers = num_layers
+        self.counts = counts or {}
 
-    def write(self, slab: Mapping[str, NDArray[np.generic]]) -> None:
+    def write(self, slab: Mapping[str, NDArray[np.generic]], counts: Mapping[str, int] | None = None) -> None:
         """Put the next layers of x, ``(L, Y, Z[, 3])`` of every channel, on disk, and count them when they are there.
+
+        counts: what the maker of the slabs counted up to the end of this one.
 
         Raises InputError for channels or shapes that are not those of the plan.
         """
@@ -64,7 +69,8 @@ class GridSlabs:
                 )
             self._write_channel(name, values)
         self.num_layers += num
-        _write_progress(self.folder, self.plan, self.num_layers)
+        self.counts = counts or {}
+        _write_progress(self.folder, self.plan, self.num_layers, self.counts)
 
     def is_whole(self) -> bool:
         """Whether every layer is on disk."""
@@ -82,12 +88,6 @@ class GridSlabs:
         }
         origin = np.array(self.plan.origin, np.float64)
         return DistanceGrid(origin=origin, voxel=self.plan.voxel, channels=channels, header=dict(header))
-
-    def remove(self) -> None:
-        """Delete the files and the folder."""
-        for path in (self.folder / PROGRESS, *(self._path(name) for name in self.plan.channels)):
-            path.unlink(missing_ok=True)
-        self.folder.rmdir()
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npy"
@@ -115,7 +115,7 @@ def start_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
         np.lib.format.open_memmap(path, "w+", np.dtype(CHANNELS[name].dtype), CHANNELS[name].shape(plan.shape))
         with path.open("r+b") as stream:
             os.posix_fallocate(stream.fileno(), 0, path.stat().st_size)
-    _write_progress(folder, plan, 0)
+    _write_progress(folder, plan, 0, {})
     return GridSlabs(folder, plan, 0)
 
 
@@ -126,7 +126,7 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
     """
     try:
         progress = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
-        left, num_layers = dict(progress["plan"]), int(progress["num_layers"])
+        left, num_layers, counts = dict(progress["plan"]), int(progress["num_layers"]), dict(progress["counts"])
     except FileNotFoundError:
         return start_slabs(folder, plan)
     except (ValueError, KeyError, TypeError) as error:
@@ -145,7 +145,7 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
             found = ()
         if found != size:
             raise InputError(f"{path}: expected {size}, got no such array", remedy="bake without --resume")
-    return GridSlabs(folder, plan, num_layers)
+    return GridSlabs(folder, plan, num_layers, counts)
 
 
 def _difference(key: str, left: object, wanted: object) -> str:
@@ -155,6 +155,6 @@ def _difference(key: str, left: object, wanted: object) -> str:
     return f"{key} was {left!r}, is {wanted!r}"
 
 
-def _write_progress(folder: Path, plan: SlabPlan, num_layers: int) -> None:
-    progress = {"plan": plan.as_dict(), "num_layers": num_layers}
+def _write_progress(folder: Path, plan: SlabPlan, num_layers: int, counts: Mapping[str, int]) -> None:
+    progress = {"plan": plan.as_dict(), "num_layers": num_layers, "counts": counts}
     write_durably(folder / PROGRESS, lambda path: write_json(path, progress))

@@ -1,15 +1,6 @@
 """What the figures of the commands that judge files rest on."""
 
-from splatctrl_cli.cli import bake_report
 from splatctrl_cli.evaluate import score_report
-
-
-def test_a_figure_of_a_band_rests_on_the_cells_of_that_band() -> None:
-    figures = {"num_cells": 1000, "voxel": 0.02, "seen.hard.0_2cm.count": 0, "seen.hard.0_2cm.rmse": None}
-    figures |= {"over_estimate.count": 7, "over_estimate.count_beyond": 0}
-    counts = bake_report.counts_of(figures)
-    assert counts["seen.hard.0_2cm.rmse"] == 0 and counts["over_estimate.count_beyond"] == 7
-    assert counts["voxel"] == counts["seen.hard.0_2cm.count"] == 1000
 
 
 def test_a_figure_of_views_rests_on_the_views_that_have_it() -> None:

@@ -5,19 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
-from splatctrl_cli.cli import bake_options
-from splatctrl_cli.cli.bake_report import SUMMARY_METRICS
-from splatctrl_cli.cli.field_truth import FIELDS
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.numbers import words
+from splatctrl_cli.cli.sdf_bake import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import metric_names
-from splatctrl_cli.field import baker, distance, probability, weights
+from splatctrl_cli.evaluate.field_truth import FIELDS
+from splatctrl_cli.field import distance, probability, weights
+from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid import exact_channel
-from splatctrl_cli.grid_files import grid_formats
 from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.jobs.bake import SUMMARY_METRICS
 from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
@@ -162,11 +163,13 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     surface = surface[np.abs(distance) < 0.1]
     write_ply(tmp_path / "true.ply", splat_set(surface, np.full(len(surface), 0.002)), {})
     corners = ",".join(f"{value}" for value in box.ravel())
+    trimesh.creation.box(bounds=box).export(tmp_path / "box.ply")
     result = here.splatctrl(
         "sdf-bake",
         tmp_path / "true.ply",
         *("-o", tmp_path / "field", f"--box={corners}", "--voxel", 0.03, *COARSE, "--formats", "npz"),
         *("--truth", folder / "truth.json", "--seen-by", folder / "log.mcap"),
+        *("--held-out", f"{folder / 'log.mcap'}:cam3", "--reference-mesh", tmp_path / "box.ply"),
         *("--require", "over_estimate.count_beyond<=0", "--require", "seen.hard.0_2cm.rmse<0.006"),
     )
     assert result.returncode == 0, result.stderr
@@ -179,6 +182,13 @@ def test_a_field_of_splats_on_the_true_surface_is_within_the_allowance(tmp_path:
     rows = [line.split()[:2] for line in result.stdout.splitlines() if line.startswith(("seen  ", "all   "))]
     assert rows == [[where, name] for where in ("seen", "all") for name in FIELDS for _ in range(4)]
     assert "all: also those before backs that none saw" in result.stdout
+    assert "probability, calibrated: calibration error" in result.stdout
+    assert f"--set field.error_mean={accuracy['error_mean']:.4f}" in result.stdout
+    assert "held-out depth of 1 frames" in result.stdout
+    assert [line.split()[:2] for line in result.stdout.splitlines() if "  on it " in line] == [
+        [name, "on"] for name in ("sdf", "hard")
+    ]
+    assert "from mesh cm" in result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -249,6 +259,53 @@ def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(weights.METHODS) == words(FieldConfig, "weights")
     assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
-    assert tuple(baker.CHANNELS) == bake_options.CHANNELS
-    assert baker.DEFAULT_CHANNELS == bake_options.DEFAULT_CHANNELS
-    assert tuple(grid_formats.FORMATS) == bake_options.FORMATS
+
+
+def test_options_and_configuration_say_the_same(tmp_path: Path, splats: Path) -> None:
+    options = ["--distance", "safe_gpdf", "--weights", "voxel", "--length-scale", 0.03, "--unknown", "free"]
+    keys = ["distance=safe_gpdf", "weights=voxel", "length_scale=0.03", "unknown=free"]
+    settings = [part for key in keys for part in ("--set", f"field.{key}")]
+    same = ["--box=-0.2,-0.2,-0.2,0.2,0.2,0.2", "--voxel", 0.05, *COARSE, "--no-report"]
+    for name, given in (("a", options), ("b", settings)):
+        assert here.splatctrl("sdf-bake", splats, "-o", tmp_path / name, *same, *given).returncode == 0
+    first, second = ((tmp_path / name / "field.npz").read_bytes() for name in "ab")
+    assert first == second
+
+
+def test_cameras_that_were_held_out_follow_the_log(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    assert split_cameras(f"{log}") == (log, ())
+    assert split_cameras(f"{log}:cam0, cam1") == (log, ("cam0", "cam1"))
+    odd = tmp_path / "a:b.mcap"
+    odd.touch()
+    assert split_cameras(f"{odd}") == (odd, ())
+
+
+def test_the_field_that_is_updated_is_not_replaced(tmp_path: Path, splats: Path) -> None:
+    field = tmp_path / "field"
+    given = ["sdf-bake", splats, "-o", field, "--voxel", 0.1, *COARSE, "--formats", "npz", "--no-report"]
+    assert here.splatctrl(*given).returncode == 0
+    again = here.splatctrl(*given, "--update", field, "--force")
+    assert again.returncode == 2
+    assert "would replace the input" in again.stderr
+    updated = here.splatctrl(*given, "--update", field, "-o", tmp_path / "same")
+    assert updated.returncode == 0
+    assert "blocks baked" in updated.stdout
+    assert (tmp_path / "same" / "field.npz").read_bytes() == (field / "field.npz").read_bytes()
+
+
+def test_resume_goes_on_with_what_is_left(tmp_path: Path, splats: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = ["sdf-bake", splats, "-o", tmp_path / "field", "--voxel", 0.1, *COARSE, "--formats", "npz"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("splatctrl_cli.field.header.label_counts", interrupt)
+        stopped = here.splatctrl(*given)
+    assert stopped.returncode == 130
+    assert "go on with the same command and --resume" in stopped.stderr
+    monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake
+    resumed = here.splatctrl(*given, "--resume")
+    assert resumed.returncode == 0
+    assert "goes on after" in resumed.stderr
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt

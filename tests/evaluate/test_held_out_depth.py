@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.evaluate.held_out_depth import compare_with_held_out_depth
+from splatctrl_cli.evaluate.held_out_depth import ROBOT_MARGIN, compare_with_held_out_depth, counted_pixels
+from splatctrl_cli.evaluate.visibility import surface_points
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.records import DistanceGrid, Intrinsics, RgbdFrame
+from splatctrl_cli.records import Box, DistanceGrid, Intrinsics, RgbdFrame
 
 CAMERA = Intrinsics(fx=200.0, fy=200.0, cx=99.5, cy=79.5, width=200, height=160)
 
@@ -130,3 +131,16 @@ def test_frames_that_see_nothing_or_masks_that_do_not_fit_are_refused() -> None:
         compare_with_held_out_depth(height_grid(), [away], seed=0)
     with pytest.raises(InputError, match="expected a mask of the size of each of 3 frames, got 1 masks"):
         compare_with_held_out_depth(height_grid(), frames(), seed=0, counted=[np.ones((160, 200), dtype=bool)])
+
+
+def test_pixels_of_the_robot_and_outside_the_workspace_do_not_count() -> None:
+    frame = frames()[0]
+    points, is_deep = surface_points(frame)
+    counted = counted_pixels(frame, None, None)
+    assert counted.all(), "a pixel without depth measures nothing, and need not be left out"
+    middle = points[len(points) // 2]
+    away = np.linalg.norm(points - middle, axis=1)
+    spheres = (middle[None], np.array([0.1]))
+    np.testing.assert_array_equal(counted_pixels(frame, None, spheres)[is_deep], away > 0.1 + ROBOT_MARGIN)
+    box = Box(lower=middle - 0.2, upper=middle + 0.2)
+    np.testing.assert_array_equal(counted_pixels(frame, box, None)[is_deep], box.contains(points))

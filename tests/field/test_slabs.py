@@ -5,6 +5,7 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.field import layout as layout_module
 from splatctrl_cli.field import slabs as slabs_module
 from splatctrl_cli.field.baker import CHANNELS, Baker
 from splatctrl_cli.field.layout import GridLayout
@@ -36,10 +37,10 @@ def test_slabs_are_whole_blocks_that_cover_every_plane(monkeypatch: pytest.Monke
 
 def test_a_slab_beyond_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     check_slab_memory(LAYOUT, ["sdf"])
-    monkeypatch.setattr(slabs_module, "available_memory", lambda: 8 * 40 * 21 * 68 - 1)
+    monkeypatch.setattr(layout_module, "available_memory", lambda: 8 * 40 * 21 * 68 - 1)
     with pytest.raises(UsageError, match=r"slab of 8 x 40 x 21 cells: needs .* larger --voxel"):
         check_slab_memory(LAYOUT, ["sdf"])
-    monkeypatch.setattr(slabs_module, "available_memory", lambda: 8 * 40 * 21 * 68)
+    monkeypatch.setattr(layout_module, "available_memory", lambda: 8 * 40 * 21 * 68)
     check_slab_memory(LAYOUT, ["sdf"])
 
 
@@ -133,6 +134,6 @@ def test_unknown_space_needs_somebody_who_looked_and_memory(monkeypatch: pytest.
     config = FieldConfig(unknown="obstacle")
     with pytest.raises(NotEvaluableError, match="expected a cell that a camera saw, got none of 42840"):
         UnknownSpace(LAYOUT, config, None, OccupancyConfig())
-    monkeypatch.setattr(slabs_module, "available_memory", lambda: 10**6)
+    monkeypatch.setattr(layout_module, "available_memory", lambda: 10**6)
     with pytest.raises(UsageError, match=r"obstacle: needs 0.0 GiB of memory, .* --unknown nan"):
         UnknownSpace(LAYOUT, config, half_seen(), OccupancyConfig())

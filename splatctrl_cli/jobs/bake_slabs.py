@@ -1,25 +1,22 @@
 """The bake itself: slab by slab onto the disk, so that it can be larger than memory, and be gone on with."""
 
-import json
 import shutil
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from splatctrl_cli.cli.common import Console
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.layout import GridLayout, available_memory
+from splatctrl_cli.field.layout import GridLayout, check_room
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
-from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
+from splatctrl_cli.jobs.progress import Progress
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
-COUNTS = "counts.json"
 SPARE = 1 << 26  # [bytes] for what is small
 VDB_COPIES = 7  # of the channels, in memory: 454 MiB were measured for one of 64 MiB
 WHOLE_FORMATS = ("npz", "vti", "nrrd", "vdb")  # hold every channel as it is, or less
@@ -31,14 +28,14 @@ class BakeTask:
     `unknown` is what is done with unknown space (None: nothing).
     """
 
-    baker: "Baker"
+    baker: Baker
     settings: Mapping[str, Any]
-    kept: "Kept | None" = None
-    unknown: "UnknownSpace | None" = None
-    formats: tuple[str, ...] = field(default=())
+    kept: Kept | None = None
+    unknown: UnknownSpace | None = None
+    formats: tuple[str, ...] = ()
 
 
-def bake_to_disk(task: BakeTask, partial: Path, console: Console, *, resume: bool) -> "GridSlabs":
+def bake_to_disk(task: BakeTask, partial: Path, progress: Progress, *, resume: bool) -> GridSlabs:
     """The channels in ``partial/channels``; the baker's counts are then those of all that was baked.
 
     With `resume` it goes on after the last slab that an interrupted bake of the same settings left. Raises UsageError
@@ -58,19 +55,16 @@ def bake_to_disk(task: BakeTask, partial: Path, console: Console, *, resume: boo
         check_disk(partial, layout, baker.channels, task.formats)
         check_vdb(layout, baker.channels, task.formats)
     store = resume_slabs(folder, plan) if resume else start_slabs(folder, plan)
-    counts = _counts(folder)
     if store.num_layers:
-        console.log(f"{partial}: goes on after {store.num_layers} of {layout.shape[0]} planes")
-        _set_counts(task, counts[str(store.num_layers)])
-    hidden = True if console.is_quiet else None
+        progress.log(f"{partial}: goes on after {store.num_layers} of {layout.shape[0]} planes")
+        _set_counts(task, store.counts)
+    hidden = True if progress.is_quiet else None
     with tqdm(total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=hidden) as bar:
         for first, last in slabs(layout, baker.channels, store.num_layers):
             planes = baked_planes(baker, first, last, task.kept)
             if task.unknown is not None:
                 planes = task.unknown.apply(planes, first, last, baker.bound_margin)
-            counts[str(last)] = _counts_now(task)
-            _write_counts(folder, counts)
-            store.write(planes)
+            store.write(planes, _counts_now(task))
             bar.update(last - first)
     return store
 
@@ -82,7 +76,7 @@ def clear_leftovers(partial: Path) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def check_disk(folder: Path, layout: "GridLayout", channels: Collection[str], formats: Collection[str]) -> None:
+def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where the channels and the files made of them do not fit the disk."""
     per_cell = bytes_per_cell(channels)
     copies = per_cell * sum(name in WHOLE_FORMATS for name in formats) + 4 * ("curobo" in formats)
@@ -97,14 +91,11 @@ def check_disk(folder: Path, layout: "GridLayout", channels: Collection[str], fo
         )
 
 
-def check_vdb(layout: "GridLayout", channels: Collection[str], formats: Collection[str]) -> None:
+def check_vdb(layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where OpenVDB is asked for and cannot hold the grid in memory, as its library does."""
-    needed, free = VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, available_memory()
-    if "vdb" in formats and needed > free:
-        raise UsageError(
-            f"format vdb: needs {needed / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB is free",
-            remedy="leave it out of --formats (nrrd needs no memory), or give a larger --voxel or fewer --channels",
-        )
+    if "vdb" in formats:
+        remedy = "leave it out of --formats (nrrd needs no memory), or give a larger --voxel or fewer --channels"
+        check_room("format vdb:", VDB_COPIES * bytes_per_cell(channels) * layout.num_cells, remedy)
 
 
 def _counts_now(task: BakeTask) -> dict[str, int]:
@@ -118,14 +109,3 @@ def _set_counts(task: BakeTask, counts: Mapping[str, int]) -> None:
     task.baker.counts = {name: counts[name] for name in task.baker.counts}
     if task.unknown is not None:
         task.unknown.num_never_seen, task.unknown.num_changed = counts["never_seen"], counts["changed"]
-
-
-def _counts(folder: Path) -> dict[str, dict[str, int]]:
-    """What was counted up to each plane where a slab ended."""
-    path = folder / COUNTS
-    counts: dict[str, dict[str, int]] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return counts
-
-
-def _write_counts(folder: Path, counts: Mapping[str, Mapping[str, int]]) -> None:
-    write_durably(folder / COUNTS, lambda path: write_json(path, counts))

@@ -1,0 +1,113 @@
+"""A baked field beside the truth of a simulated log: where cameras looked, how far off is it?"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy
+from splatctrl_cli.evaluate.visibility import seen_by
+from splatctrl_cli.records import Box, Float64, RgbdFrame
+from splatctrl_cli.report.reliability import Reliability, reliability
+
+FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
+NEAR = 0.05  # [m] where a probability is neither 0 nor 1
+_CURVES = ("edges", "predicted", "observed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrueCells:
+    """Q cells drawn of a grid: centres (Q, 3) [m], the grid's `FIELDS` there (Q,) [m], the true distance (Q,) [m] and
+    the surface point (Q, 3) [m] that gives it; world.
+    """
+
+    points: Float64
+    fields: Mapping[str, Float64]
+    distance: Float64
+    surface: Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class TruthComparison:
+    """The accuracy, and how many cells went into it.
+
+    num_drawn of the grid's cells, num_blank of them without a distance (field.unknown = nan), num_near of the others
+    outside the objects and within 20 cm, num_seen of those with a nearest true surface point that a training camera
+    saw inside the workspace; num_outside_workspace more were seen, but their surface lies where the scene keeps no
+    splats. reliability: of each form of the probability, at seen cells within 20 cm of a surface, inside or out.
+    error_mean, error_sigma [m]: of sdf at seen cells within `NEAR` of a surface, None without any.
+    """
+
+    accuracy: FieldAccuracy
+    num_drawn: int
+    num_blank: int
+    num_near: int
+    num_seen: int
+    num_outside_workspace: int
+    reliability: Mapping[str, Reliability]
+    error_mean: float | None
+    error_sigma: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as written to ``field.json``."""
+        counts = {name: value for name, value in vars(self).items() if name.startswith("num_")}
+        error = {"error_mean": self.error_mean, "error_sigma": self.error_sigma}
+        curves = {name: _curve(curve) for name, curve in self.reliability.items()}
+        return {**counts, **self.accuracy.as_dict(), **error, "reliability": curves}
+
+
+def compare_with_truth(
+    cells: TrueCells,
+    frames: Iterable[RgbdFrame],
+    *,
+    name: str,
+    workspace: Box | None,
+    median_radius: float,
+    probabilities: Mapping[str, Callable[[Float64, Float64], Float64]],
+) -> TruthComparison:
+    """The accuracy of `FIELDS`, and the reliability of the probabilities, at cells that `frames` saw the surface of.
+
+    name: of the truth, for errors; workspace: where the scene keeps splats, None where that is not known;
+    median_radius [m] of the splats; probabilities: by name, at points (Q, 3) of sdf (Q,) [m]. Raises
+    NotEvaluableError where no cell is near an object.
+    """
+    sdf, distance = cells.fields["sdf"], cells.distance
+    is_blank = ~np.isfinite(sdf)
+    is_around = (np.abs(distance) < BANDS[-1][1]) & ~is_blank
+    is_near = (distance >= BANDS[0][0]) & is_around
+    if not is_near.any():
+        raise NotEvaluableError(f"{name}: no cell of the grid lies within {BANDS[-1][1]} m outside an object")
+    seen, in_workspace = np.zeros_like(is_near), np.ones_like(is_near)
+    seen[is_around] = seen_by(cells.surface[is_around], frames)
+    if workspace is not None:
+        in_workspace[is_around] = workspace.contains(cells.surface[is_around])
+    is_counted = seen & in_workspace
+    error = (sdf - distance)[is_counted & (np.abs(distance) < NEAR)]
+    return TruthComparison(
+        accuracy=field_accuracy(
+            {name: cells.fields[name][is_near] for name in FIELDS},
+            distance[is_near],
+            is_counted[is_near],
+            median_radius=median_radius,
+        ),
+        num_drawn=len(cells.points),
+        num_blank=int(np.count_nonzero(is_blank)),
+        num_near=int(np.count_nonzero(is_near)),
+        num_seen=int(np.count_nonzero(is_counted & is_near)),
+        num_outside_workspace=int(np.count_nonzero(seen & ~in_workspace & is_near)),
+        reliability={
+            form: reliability(probability(cells.points[is_counted], sdf[is_counted]), distance[is_counted] <= 0)
+            for form, probability in probabilities.items()
+            if is_counted.any()
+        },
+        error_mean=float(error.mean()) if len(error) else None,
+        error_sigma=float(error.std()) if len(error) else None,
+    )
+
+
+def _curve(found: Reliability) -> dict[str, object]:
+    """Plain values; None where a bin is empty."""
+    values = {name: [None if np.isnan(v) else float(v) for v in getattr(found, name)] for name in _CURVES}
+    return {**values, "count": found.count, "calibration_error": found.calibration_error}
