@@ -11,13 +11,14 @@ from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.layout import bounding_box, check_loss
 from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.grid_files import grid_formats
 from splatctrl_cli.records import Box, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 
+FORMATS = tuple(grid_formats.FORMATS)
 # As the rooms have them, which --help does not wait for; a test holds these to those.
 CHANNELS = ("sdf", "gradient", "bound", "observed", "probability", "label", "hard", "se", "gpdf")
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
-FORMATS = ("npz", "vti", "nrrd", "vdb", "curobo", "moveit", "ply", "obj", "stl")
 EXACT = frozenset({"bound", "hard"})
 
 

@@ -18,7 +18,7 @@ from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, Spla
 from splatctrl_cli.splat_files.splats import read_ply, write_ply
 
 LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
-SUFFIXES = ".ply, .splat, .spz, .glb, .usda, .usdc"
+SUFFIXES = ", ".join(FORMATS)
 
 
 def register(subparsers: Subparsers) -> None:

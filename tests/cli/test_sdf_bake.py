@@ -16,7 +16,6 @@ from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.grid import exact_channel
-from splatctrl_cli.grid_files import grid_formats
 from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
@@ -251,4 +250,3 @@ def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
     assert tuple(baker.CHANNELS) == bake_options.CHANNELS
     assert baker.DEFAULT_CHANNELS == bake_options.DEFAULT_CHANNELS
-    assert tuple(grid_formats.FORMATS) == bake_options.FORMATS

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field import slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
@@ -96,7 +98,7 @@ def test_a_bake_stopped_while_it_writes_files_goes_on(
     splats: Path, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splatctrl_cli.grid_files.grid_formats.write_vti", interrupted_write)
+        patch.setitem(FORMATS, "vti", replace(FORMATS["vti"], write=interrupted_write))
         assert bake(splats, tmp_path / "field") == 130
     assert (tmp_path / "field.partial" / "left over").is_file()
     monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.grid_files.grid_formats import FORMATS, GridOptions, check_formats, read_grid, write_grid
+from splatctrl_cli.grid_files.grid_formats import FORMATS, check_formats, read_grid, write_grid
 from splatctrl_cli.grid_files.grid_slabs import SlabPlan, start_slabs
 from splatctrl_cli.records import DistanceGrid
 from splatctrl_cli.sources.describe import describe
@@ -95,20 +95,6 @@ def test_a_curobo_file_whose_list_of_contents_is_damaged_is_refused(tmp_path: Pa
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"field.curobo.npz: not a readable .npz: .*; the file is damaged"):
         describe(path)
-
-
-def test_the_options_reach_the_files(tmp_path: Path) -> None:
-    grid = ball_grid()
-    write_grid(
-        tmp_path,
-        grid,
-        ["stl", "curobo"],
-        GridOptions(level=0.05, curobo_version="0.8", curobo_channel="bound"),
-    )
-    lower, upper = (describe(tmp_path / "field.stl").facts[key] for key in ("lower", "upper"))
-    np.testing.assert_allclose(np.subtract(upper, lower), 0.7, atol=2e-3)
-    facts = describe(tmp_path / "field.curobo.npz").facts
-    assert (facts["curobo"], facts["channel"]) == ("0.8", "bound")
 
 
 def test_a_grid_is_read_back_from_the_files_that_hold_it_whole(tmp_path: Path) -> None:
