@@ -123,9 +123,7 @@ def test_float16_is_rounded_towards_less_distance() -> None:
 
 
 def test_the_file_says_what_it_is_for(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_curobo(tmp_path / name, random_grid())
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    write_curobo(tmp_path / "a", random_grid())
     file = loaded(tmp_path / "a")
     assert (str(file["curobo"]), str(file["channel"])) == ("0.7", "sdf")
     assert json.loads(str(file["header"])) == HEADER
