@@ -162,8 +162,5 @@ ENTRIES = tuple(
         check=_library,
         docs=docs,
     )
-    for order, suffix, docs in (
-        (4, ".usda", _DOCS),
-        (5, ".usdc", ""),
-    )
+    for order, suffix, docs in ((4, ".usda", _DOCS), (5, ".usdc", ""))
 )
