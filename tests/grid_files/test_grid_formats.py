@@ -70,12 +70,13 @@ def test_every_file_is_described_and_refused_in_one_line_where_it_is_cut(tmp_pat
         if kind.read is not None:
             assert summary.grids[0].rows == [[channel, "f4", "m"] for channel in grid.channels]
         content = file.read_bytes()
-        for length in (60, 100):
+        for length, read in ((60, describe), (100, describe), (100, kind.read), (len(content) // 2, kind.read)):
             file.write_bytes(content[:length])
-            with pytest.raises(InputError) as refused:
-                describe(file)
-            assert refused.value.remedy
-            assert "\n" not in str(refused.value)
+            if read is not None:
+                with pytest.raises(InputError) as refused:
+                    read(file)
+                assert refused.value.remedy
+                assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("channels", [(), ("sdf",), ("label", "sdf", "gradient")])

@@ -1,7 +1,7 @@
 """3D-GS PLY files of anisotropic Gaussians: the 62 properties, both ways, and what is refused."""
 
 import struct
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import GaussianSet
+from splatctrl_cli.records import GaussianSet, SplatSet
 from splatctrl_cli.splat_files.gaussian_ply import NAMES, read_gaussian_ply, write_gaussian_ply
 from splatctrl_cli.splat_files.splats import read_ply
 
@@ -33,11 +33,11 @@ def ascii_ply(path: Path, names: list[str], rows: list[list[object]]) -> Path:
     return path
 
 
-def assert_equal_bits(a: GaussianSet, b: GaussianSet) -> None:
-    for name in ("centers", "scales", "quats_wxyz", "opacities", "harmonics", "labels"):
-        left, right = getattr(a, name), getattr(b, name)
-        assert left.dtype == right.dtype, name
-        assert np.array_equal(left, right), name
+def assert_equal_bits(a: GaussianSet | SplatSet, b: GaussianSet | SplatSet) -> None:
+    for field in fields(a):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        assert left.dtype == right.dtype, field.name
+        assert np.array_equal(left, right), field.name
 
 
 def test_one_gaussian_has_the_bytes_of_the_reference_layout(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import trimesh
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.splat_files.splats import DTYPE, read_ply, write_ply
+from tests.splat_files.test_gaussian_ply import ascii_ply, assert_equal_bits
 
 MINIMAL = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
 STANDARD = [*MINIMAL[:3], "nx", "ny", "nz", *MINIMAL[3:], "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -29,22 +30,8 @@ def splat_set(num: int = 50, seed: int = 0) -> SplatSet:
     )
 
 
-def assert_equal_bits(a: SplatSet, b: SplatSet) -> None:
-    for name in ("centers", "radii", "colors", "opacities", "labels", "density"):
-        left, right = getattr(a, name), getattr(b, name)
-        assert left.dtype == right.dtype, name
-        assert np.array_equal(left, right), name
-
-
 def header_of(path: Path) -> list[str]:
     return path.read_bytes().split(b"end_header\n")[0].decode("ascii").splitlines()
-
-
-def ascii_ply(path: Path, names: list[str], rows: list[list[object]], extra: str = "") -> Path:
-    lines = ["ply", "format ascii 1.0", *([extra] if extra else []), f"element vertex {len(rows)}"]
-    lines += [f"property float {name}" for name in names] + ["end_header"]
-    path.write_text("\n".join(lines + [" ".join(map(str, row)) for row in rows]) + "\n")
-    return path
 
 
 def test_what_is_written_reads_back_within_float32_and_then_bit_for_bit(tmp_path: Path) -> None:
@@ -188,7 +175,9 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
 def test_ascii_in_any_order_with_extra_properties_reads_the_same(tmp_path: Path) -> None:
     names = ["confidence", *reversed(MINIMAL)]
     row: list[object] = [0.25, -4, -4, -4, 0, 0.1, 0.2, 0.3, 3, 2, 1]
-    splats, comments = read_ply(ascii_ply(tmp_path / "a.ply", names, [row, row], "comment made by hand"))
+    path = ascii_ply(tmp_path / "a.ply", names, [row, row])
+    path.write_text(path.read_text().replace("ascii 1.0\n", "ascii 1.0\ncomment made by hand\n"))
+    splats, comments = read_ply(path)
     np.testing.assert_allclose(splats.centers, [[1, 2, 3]] * 2)
     np.testing.assert_allclose(splats.radii, np.exp(-4), rtol=1e-6)
     np.testing.assert_allclose(splats.colors[0], 0.5 + 0.28209479 * np.array([0.3, 0.2, 0.1]), rtol=1e-6)
