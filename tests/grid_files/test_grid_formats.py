@@ -58,6 +58,14 @@ def test_memory_maps_are_written_as_arrays_are(tmp_path: Path, kind: GridFormat)
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
 
 
+def test_the_files_are_as_large_as_the_format_says(tmp_path: Path, kind: GridFormat) -> None:
+    grid = ball_grid()
+    size = grid.channels["sdf"].size * kind.size_per_cell(4 * len(grid.channels))
+    total = sum(file.stat().st_size for file in write_grid(tmp_path, grid, [kind.name]))
+    assert size == 0 or total <= size + 2**14
+    assert kind.name == "vdb" or total >= 0.5 * size, "only OpenVDB's are packed"
+
+
 def test_every_file_is_described_and_refused_in_one_line_where_it_is_cut(tmp_path: Path, kind: GridFormat) -> None:
     grid = ball_grid()
     name, facts = DESCRIBED[kind.name]
