@@ -36,14 +36,10 @@ from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.rvl import decode_rvl
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
-from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply
-from splatctrl_cli.splat_files.gltf import read_gltf
-from splatctrl_cli.splat_files.splat_file import read_splat
 from splatctrl_cli.splat_files.splat_formats import FORMATS
-from splatctrl_cli.splat_files.spz import read_spz
 from tests.containers.test_bag_log import as_ros1_bag, as_ros2_folder
 from tests.containers.test_foxglove import descriptor_set
-from tests.datasets.test_layouts import make_nerfstudio, make_redwood, make_tum
+from tests.datasets.make_layout import make_nerfstudio, make_redwood, make_tum
 from tests.grid_files.make_grid import random_grid
 from tests.logs.make_log import LogRecipe, make_log
 from tests.logs.test_rvl import encoded_rvl
@@ -185,13 +181,19 @@ def _arrays(made: Path, folder: Path) -> list[Reader]:
 
 
 def _splats(made: Path, folder: Path) -> list[Reader]:
-    kinds = {".ply": read_gaussian_ply, ".spz": read_spz, ".glb": read_gltf, ".splat": read_splat}
     found = []
-    for suffix, read in kinds.items():
+    for suffix in splat_suffixes():
         path = made / f"splats{suffix}"
         FORMATS[suffix].write(path, gaussian_set(4), {"a": "b"})
-        found.append(Reader(name=suffix[1:], read=_file(folder, f"x{suffix}", read), seeds=_bytes(path)))
+        found.append(
+            Reader(name=suffix[1:], read=_file(folder, f"x{suffix}", FORMATS[suffix].read), seeds=_bytes(path))
+        )
     return found
+
+
+def splat_suffixes() -> list[str]:
+    """Of the formats whose bytes are read here, and not in a library of theirs."""
+    return [suffix for suffix in FORMATS if not suffix.startswith(".usd")]
 
 
 def _texts(made: Path, folder: Path) -> list[Reader]:

@@ -1,4 +1,5 @@
-"""Writes docs/cli.md from the parser and docs/config.md from what the configuration declares, for `make docs`.
+"""Writes docs/cli.md from the parser, docs/config.md from what the configuration declares, and the tables that the
+registries of formats and layouts make in other pages, for `make docs`.
 
 The pages are made from the parser itself and not from its printed help, whose wrapping depends on the terminal and on
 the version of Python.
@@ -17,22 +18,44 @@ from splatctrl_cli import config
 from splatctrl_cli.cli.main import EXIT_CODES, build_parser
 from splatctrl_cli.config.declared import OneOf, Section
 from splatctrl_cli.config.load import type_name
+from splatctrl_cli.datasets.layout import Layout
+from splatctrl_cli.datasets.layouts import LAYOUTS
+from splatctrl_cli.grid_files.grid_format import GridFormat
+from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
+from splatctrl_cli.splat_files.splat_format import SplatFormat
+from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
 
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
 SHARED_BY = 3  # commands with the same option, in the same words, from which on it is explained once
 SIMPLE = ("int", "float", "str")  # types that a default shows
+TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:\|.*\n)*)")
+REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout]]] = {
+    "splat_files": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
+    "grid_files": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
+    "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
+}
 
 
 def main() -> None:
-    """Write both pages."""
+    """Write the pages."""
     for name, text in pages().items():
         (DOCS / name).write_text(text, encoding="utf-8")
 
 
 def pages() -> dict[str, str]:
     """The text of each generated page, by file name."""
-    return {"cli.md": cli_page(), "config.md": config_page()}
+    tabled = {name: (DOCS / name).read_text(encoding="utf-8") for name in ("artefacts.md", "input.md")}
+    filled = {name: TABLE.sub(_filled, text) for name, text in tabled.items()}
+    return {"cli.md": cli_page(), "config.md": config_page(), **filled}
+
+
+def _filled(found: re.Match[str]) -> str:
+    """A mark in a page, and the table of the registry that it names."""
+    header, entries = REGISTRIES[found[2]]
+    texts = [text for entry in entries for text in entry.docs.split("\n\n") if text]
+    rows = [tuple(cell.strip() for cell in " ".join(text.split()).split("|")) for text in texts]
+    return found[1] + "\n".join(_table(header, rows)) + "\n"
 
 
 def cli_page() -> str:

@@ -8,8 +8,9 @@ from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_outpu
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.records import Label
+from splatctrl_cli.splat_files.splat_formats import FORMATS
 
-SUFFIXES = ".ply, .splat, .spz, .glb, .usda, .usdc"
+SUFFIXES = ", ".join(FORMATS)
 SHOWN = {  # of Differences: what the table calls it, and the unit it is shown in
     "center": ("centre mm", 1e3),
     "sigma": ("sigma %", 1e2),

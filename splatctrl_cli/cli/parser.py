@@ -15,7 +15,7 @@ COMMANDS = {
     "info": "describe a log, capture, scene, grid, robot or other file",
     "check": "say what is wrong with a log, capture or image folder",
     "reconstruct": "fit splats to a log, a capture or a DTU scan",
-    "export": "write splats as PLY, .splat, .spz, glTF or USD, and check what reads back",
+    "export": "write splats as a file that viewers open, and check what reads back",
     "sdf-bake": "bake a scene's splats into a distance grid with gradient",
     "score": "compare renders of a scene with recorded views (by default of the cameras that did not train it): "
     "PSNR, SSIM, depth error, by a named protocol; or fit scans first (--fit)",

@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,21 @@ CAMERA = "camera"  # the name of a layout's only lens
 MILLIMETRE = 1e-3
 SAME = 1e-6  # largest entry of a matrix that is the identity
 _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """A layout, in the ``ENTRIES`` of its module: its name, whether a folder has it, and the folder as a description.
+
+    Of layouts that a folder has, that of the lowest `order` counts. `docs` are its rows in docs/input.md, cells
+    between bars, an empty line between rows: layout, what it is known by, poses, depth, intrinsics.
+    """
+
+    name: str
+    order: int
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, SourceOptions], Description]
+    docs: str = ""
 
 
 class Lenses:

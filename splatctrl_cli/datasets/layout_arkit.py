@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import Lenses, described, images_of
+from splatctrl_cli.datasets.layout import Layout, Lenses, described, images_of
 from splatctrl_cli.datasets.layout_tum import paired_views
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_rows, stamp_of_text
 from splatctrl_cli.errors import InputError
@@ -105,3 +105,10 @@ def _lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
         )
     width, height, fx, fy, cx, cy = values
     return CameraTable(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+_DOCS = """
+ARKitScenes | `lowres_wide.traj`, `lowres_depth/`, also in `*_frames/` | world to camera, interpolated | 1 mm, of
+    another size: nearest pixels | a `.pincam` per image
+"""
+ENTRIES = (Layout(name="ARKitScenes", order=7, matches=matches, read=read, docs=_DOCS),)

@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import CAMERA, MILLIMETRE, Lenses, described, image_size, images_of, read_json
+from splatctrl_cli.datasets.layout import (
+    CAMERA,
+    MILLIMETRE,
+    Layout,
+    Lenses,
+    described,
+    image_size,
+    images_of,
+    read_json,
+)
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -102,3 +111,10 @@ def _pose(entry: dict[str, Any]) -> Float64 | None:
     T[:3, :3] = np.array(entry["cam_R_w2c"], dtype=np.float64).reshape(3, 3)
     T[:3, 3] = np.array(entry["cam_t_w2c"], dtype=np.float64) * MILLIMETRE
     return T
+
+
+_DOCS = """
+BOP scene | `scene_camera.json`, `depth/`; of several sensors `scene_camera_cam1.json`, `depth_cam1/` |
+    `cam_R_w2c`, `cam_t_w2c`; else `--camera-pose` | `depth_scale` of each image | `cam_K` of each image
+"""
+ENTRIES = (Layout(name="BOP scene", order=1, matches=matches, read=read, docs=_DOCS),)

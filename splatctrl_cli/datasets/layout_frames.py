@@ -18,6 +18,7 @@ import numpy as np
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ListedView, PosesTable
 from splatctrl_cli.datasets.layout import (
     MILLIMETRE,
+    Layout,
     by_numbers,
     described,
     given_lens,
@@ -144,3 +145,18 @@ def _published(folder: Path) -> tuple[float, ...] | None:
                 )
             return values[0], values[4], values[2], values[5]
     return None
+
+
+_DOCS = """
+7-Scenes | `frame-*.pose.txt`, also in `seq-*/` | a file a frame, of the depth camera; moved to colour | 1 mm,
+    65535 = none, registered to colour | depth 585, 585, 320, 240; colour 525, 525, 320, 240 with another Kinect's
+    extrinsics; `--intrinsics` takes both as one
+
+3DMatch | the same, `camera-intrinsics.txt` | a file a frame | as above, not registered | that file; 585, 585,
+    320, 240 in it counts as 7-Scenes
+
+12-Scenes, BundleFusion, 3RScan | the same, also in `data/`, `sequence/`, and `info.txt` or `_info.txt` | a file a
+    frame, INF = none | `m_depthShift`; PNG or PGM, registered to colour | `m_calibrationColorIntrinsic`,
+    `m_calibrationDepthIntrinsic`, extrinsics
+"""
+ENTRIES = (Layout(name="7-Scenes", order=3, matches=matches, read=read, docs=_DOCS),)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import DepthTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import described, given_lens, images_of, pinhole
+from splatctrl_cli.datasets.layout import Layout, described, given_lens, images_of, pinhole
 from splatctrl_cli.datasets.layout_tum import SCALE
 from splatctrl_cli.datasets.poses import read_tum
 from splatctrl_cli.logs.options import SourceOptions
@@ -58,3 +58,10 @@ def _number(name: str) -> int:
         return int(float(name))
     except (ValueError, OverflowError):
         return -1
+
+
+_DOCS = """
+ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by number; mirrored to right-handed | 1/5000 m |
+    481.2, 480, 319.5, 239.5
+"""
+ENTRIES = (Layout(name="ICL-NUIM", order=5, matches=matches, read=read, docs=_DOCS),)

@@ -24,7 +24,7 @@ from splatctrl_cli.datasets.folder_description import (
     SplitTable,
     StampsTable,
 )
-from splatctrl_cli.datasets.layout import Lenses, image_size
+from splatctrl_cli.datasets.layout import Layout, Lenses, image_size
 from splatctrl_cli.datasets.poses import read_nerfstudio
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
@@ -165,3 +165,11 @@ def _short(views: list[ListedView]) -> list[ListedView]:
     if len(set(stems)) == len(stems):
         return [replace(view, name=stem) for view, stem in zip(views, stems, strict=True)]
     return [replace(view, name=str(Path(view.name).with_suffix(""))) for view in views]
+
+
+_DOCS = """
+nerfstudio, instant-ngp | `transforms.json` with `depth_file_path` or `depth_path` | `transform_matrix`, without
+    `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest pixels | of the file or
+    each frame; `mask_path` leaves pixels out
+"""
+ENTRIES = (Layout(name="nerfstudio", order=4, matches=matches, read=read, docs=_DOCS),)

@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import described, given_lens, images_of, read_json
+from splatctrl_cli.datasets.layout import Layout, described, given_lens, images_of, read_json
 from splatctrl_cli.datasets.poses import read_trajectory_log
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
@@ -108,3 +108,11 @@ def _lens(folder: Path, options: SourceOptions, image: Path) -> CameraTable:
         f"{folder}: no {INTRINSICS[0]} in it or above it",
         remedy="give --intrinsics camera=FX,FY,CX,CY (Redwood's default: 525,525,319.5,239.5)",
     )
+
+
+_DOCS = """
+Open3D, Redwood | `color/` (`colors/`, `image/`, `rgb/`), `depth/`, `trajectory.log` (`*_trajectory.log`,
+    `*-traj.txt`, ...) | by order; by number where there are more poses than images | 1 mm |
+    `camera_intrinsic.json` in the folder or above it, else `--intrinsics`
+"""
+ENTRIES = (Layout(name="Open3D scene", order=9, matches=matches, read=read, docs=_DOCS),)

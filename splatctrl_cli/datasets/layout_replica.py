@@ -14,6 +14,7 @@ from typing import Any
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ListedView, PosesTable
 from splatctrl_cli.datasets.layout import (
     MILLIMETRE,
+    Layout,
     by_numbers,
     described,
     given_lens,
@@ -99,3 +100,13 @@ def _lens(folder: Path, trajectory: str, image: Path, options: SourceOptions) ->
             remedy="give --intrinsics camera=FX,FY,CX,CY and --depth-scale",
         )
     return given or pinhole(lens, image), scale
+
+
+_DOCS = """
+Replica of NICE-SLAM | `traj.txt`, `results/frame*`, `results/depth*` | a matrix a line, by number | `scale` of
+    `cam_params.json`, else 1/6553.5 m | `cam_params.json`, else 600, 600, 599.5, 339.5
+
+Replica of Semantic-NeRF | `traj_w_c.txt`, `rgb/rgb_*`, `depth/depth_*` | a matrix a line, by number | 1 mm | a
+    field of view of 90°
+"""
+ENTRIES = (Layout(name="Replica", order=6, matches=matches, read=read, docs=_DOCS),)

@@ -8,7 +8,7 @@ lost (SensReader/python/SensorData.py). The subset scannet_frames_25k has ``intr
 from pathlib import Path
 
 from splatctrl_cli.datasets.folder_description import DepthTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import described, images_of, pose_or_none
+from splatctrl_cli.datasets.layout import Layout, described, images_of, pose_or_none
 from splatctrl_cli.datasets.layout_sens import read_text_files
 from splatctrl_cli.datasets.poses import read_matrix_file
 from splatctrl_cli.logs.options import SourceOptions
@@ -54,3 +54,10 @@ def _pose(path: Path, T_base_color: Float64) -> Float64 | None:
     """T_world_color, None where the frame has no pose."""
     matrix = pose_or_none(read_matrix_file(path)) if path.is_file() else None
     return None if matrix is None else matrix @ T_base_color
+
+
+_DOCS = """
+ScanNet export | `color/`, `depth/`, `pose/`, `intrinsic/` (or `intrinsics_color.txt`) | a file a frame, -inf =
+    none | 1 mm, registered to colour | `intrinsic_color.txt`, `intrinsic_depth.txt`, extrinsics
+"""
+ENTRIES = (Layout(name="ScanNet export", order=2, matches=matches, read=read, docs=_DOCS),)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
-from splatctrl_cli.datasets.layout import described, given_lens, image_size, images_of, pose_or_none
+from splatctrl_cli.datasets.layout import Layout, described, given_lens, image_size, images_of, pose_or_none
 from splatctrl_cli.datasets.layout_tum import paired_views
 from splatctrl_cli.datasets.poses import read_numbers, stamp_of_text
 from splatctrl_cli.errors import InputError
@@ -69,3 +69,10 @@ def _lens(folder: Path, image: Path) -> CameraTable:
     width, height = image_size(image)
     fx, _, cx, _, fy, cy = values[:6]
     return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, pixel_center=1.0)
+
+
+_DOCS = """
+SUN3D | `image/`, `depth/`, `extrinsics/`, `intrinsics.txt` | the newest file of `extrinsics/`, by order | 1 mm,
+    bits rotated by three, paired within 20 ms | `intrinsics.txt`, the first pixel's centre at 1
+"""
+ENTRIES = (Layout(name="SUN3D", order=8, matches=matches, read=read, docs=_DOCS),)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import described, given_lens, pinhole
+from splatctrl_cli.datasets.layout import Layout, described, given_lens, pinhole
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
@@ -175,3 +175,16 @@ def marker_to_camera(T_ground_truth: Float64) -> Float64:
     """T_world_camera (4, 4) of a pose in Bonn's groundtruth.txt."""
     T_world_camera: Float64 = _BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m")
     return T_world_camera
+
+
+_DOCS = """
+TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
+    within 20 ms | by freiburg1, 2 or 3 (fr1, ...) in the folder's name or the heads of its lists, else
+    `--intrinsics`
+
+Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to the camera | as TUM; the published
+    transform's scale of 1.059 is left out | of its page
+
+ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
+"""
+ENTRIES = (Layout(name="TUM RGB-D", order=0, matches=matches, read=read, docs=_DOCS),)

@@ -1,56 +1,19 @@
 """The dataset layouts that are known by their own files, so that their folders need no description."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli.captures.capture_journal import check_not_partial
-from splatctrl_cli.datasets import (
-    layout_arkit,
-    layout_bop,
-    layout_frames,
-    layout_icl,
-    layout_nerfstudio,
-    layout_redwood,
-    layout_replica,
-    layout_scannet,
-    layout_sun3d,
-    layout_tum,
-)
-from splatctrl_cli.datasets.folder_description import Description
 from splatctrl_cli.datasets.image_folder import ImageFolderSource
+from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import names_in
+from splatctrl_cli.files.registry import entries_of
 from splatctrl_cli.logs.options import SourceOptions
 
 _LOGS = (".mcap", ".bag", ".db3")
 _MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is none itself
 
-
-@dataclass(frozen=True, kw_only=True)
-class Layout:
-    """A layout: its name, whether a folder has it, and the folder as a description."""
-
-    name: str
-    matches: Callable[[Path], bool]
-    read: Callable[[Path, SourceOptions], Description]
-
-
-LAYOUTS = tuple(
-    Layout(name=name, matches=module.matches, read=module.read)
-    for name, module in (
-        ("TUM RGB-D", layout_tum),
-        ("BOP scene", layout_bop),
-        ("ScanNet export", layout_scannet),
-        ("7-Scenes", layout_frames),
-        ("nerfstudio", layout_nerfstudio),
-        ("ICL-NUIM", layout_icl),
-        ("Replica", layout_replica),
-        ("ARKitScenes", layout_arkit),
-        ("SUN3D", layout_sun3d),
-        ("Open3D scene", layout_redwood),
-    )
-)
+LAYOUTS = entries_of(__package__, Layout)
 
 
 def layout_of(folder: Path) -> Layout | None:

@@ -65,6 +65,17 @@ def read_arrays(path: Path, names: Collection[str] | None = None, *, most: int) 
     return found
 
 
+def has_arrays(path: Path, head: bytes, names: Collection[str]) -> bool:
+    """Whether a file, whose first bytes are `head`, is a ``.npz`` with all of these arrays."""
+    if not head.startswith(b"PK\x03\x04"):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in names} <= set(archive.namelist())
+    except (*DAMAGE, OSError):
+        return False
+
+
 def npy_head(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Shape, whether by columns, and type of the array whose ``.npy`` begins here; the stream is left behind it.
 

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.arrays import DAMAGE, check_numbers, npy_head, savez
+from splatctrl_cli.files.arrays import DAMAGE, check_numbers, has_arrays, npy_head, savez
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.grid_channels import (
     GridHead,
     check_finite,
@@ -25,10 +26,8 @@ from splatctrl_cli.grid_files.grid_channels import (
     header_text,
     parse_header,
 )
-from splatctrl_cli.grid_files.vti import write_vti
+from splatctrl_cli.grid_files.grid_format import GridFormat, summary_of
 from splatctrl_cli.records import DistanceGrid
-
-__all__ = ["is_grid_npz", "read_npz", "read_npz_head", "write_npz", "write_vti"]
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}
 
@@ -74,13 +73,11 @@ def read_npz_head(path: Path) -> GridHead:
         return _head(path, archive, _members(archive))
 
 
-def is_grid_npz(path: Path) -> bool:
-    """Whether the file is a ``.npz`` with the members that every distance grid has."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {"origin.npy", "voxel.npy", "header.npy", "sdf.npy"} <= set(archive.namelist())
-    except (*DAMAGE, OSError):
-        return False
+def describe_npz(path: Path, head: bytes) -> Summary | None:
+    """A ``field.npz``. Raises InputError for one that is damaged or of another version."""
+    if not has_arrays(path, head, {*PLACE, "header", "sdf"}):
+        return None
+    return summary_of(path, "distance grid", read_npz_head(path))
 
 
 @contextmanager
@@ -162,3 +159,12 @@ def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.generic]:
         if stream.read(1):  # reading to the end is what checks the sum
             raise ValueError(f"{name}.npy goes on after its array")
     return np.asarray(array, order="C")
+
+
+_DOCS = """
+`npz` | `field.npz`: `origin` (3,) and `voxel` () float64, `header` (JSON text), an array a channel, (X, Y, Z) or
+    (X, Y, Z, 3), z fastest | this tool, `numpy.load` | NumPy 2.4.6, every value | 1.7 s, 16 MiB
+"""
+ENTRIES = (
+    GridFormat(name="npz", order=0, suffix=".npz", write=write_npz, describe=describe_npz, read=read_npz, docs=_DOCS),
+)

@@ -1,46 +1,14 @@
 """The files in which a baked distance grid can be written, by the name that ``sdf-bake --formats`` takes."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.grid_files.curobo_grid import VERSIONS as CUROBO_VERSIONS
-from splatctrl_cli.grid_files.curobo_grid import write_curobo
-from splatctrl_cli.grid_files.grid import read_npz, write_npz
-from splatctrl_cli.grid_files.iso_surface import iso_surface, write_surface
-from splatctrl_cli.grid_files.moveit_field import write_moveit
-from splatctrl_cli.grid_files.nrrd import write_nrrd
-from splatctrl_cli.grid_files.vdb import openvdb, write_vdb
-from splatctrl_cli.grid_files.vti import read_vti, write_vti
+from splatctrl_cli.files.registry import entries_of
+from splatctrl_cli.grid_files.grid_format import STEM, GridFormat
 from splatctrl_cli.records import DistanceGrid
 
-STEM = "field"
-
-
-@dataclass(frozen=True, kw_only=True)
-class GridOptions:
-    """What some formats leave open: level [m] of the surface, the cuRobo that reads, the distance that it gets."""
-
-    level: float = 0.0
-    curobo_version: str = CUROBO_VERSIONS[0]
-    curobo_channel: str = "sdf"
-
-
-@dataclass(frozen=True, kw_only=True)
-class GridFormat:
-    """One kind of file: `files` names those it writes of some channels, `write` writes them into a folder.
-
-    `needs` are channels of which the grid must have one; `holds_unknown` is whether cells that are NaN can be told;
-    `check` raises UsageError where what writes it is not installed.
-    """
-
-    title: str
-    files: Callable[[Collection[str]], tuple[str, ...]]
-    write: Callable[[Path, DistanceGrid, GridOptions], None]
-    needs: frozenset[str] = frozenset({"sdf"})
-    holds_unknown: bool = True
-    check: Callable[[], object] = lambda: None
+FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__package__, GridFormat)}
 
 
 def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: str = "free") -> None:
@@ -67,86 +35,25 @@ def check_formats(names: Sequence[str], channels: Collection[str], *, unknown: s
         kind.check()
 
 
-def write_grid(
-    folder: Path, grid: DistanceGrid, names: Sequence[str], options: GridOptions | None = None
-) -> tuple[Path, ...]:
+def write_grid(folder: Path, grid: DistanceGrid, names: Sequence[str]) -> tuple[Path, ...]:
     """Write the grid in each of the formats `names` into `folder`, and return the files.
 
     Channels may be memory maps: none is held in memory whole (but for vdb). Raises as `check_formats`
     does, and NotEvaluableError where a surface is asked for that the grid does not have.
     """
     check_formats(names, grid.channels)
-    written: list[Path] = []
-    for name in dict.fromkeys(names):
-        FORMATS[name].write(folder, grid, options or GridOptions())
-        written += [folder / file for file in FORMATS[name].files(grid.channels)]
-    return tuple(written)
+    kinds = [FORMATS[name] for name in dict.fromkeys(names)]
+    for kind in kinds:
+        kind.write(folder / f"{STEM}{kind.suffix}", grid)
+    return tuple(folder / file for kind in kinds for file in kind.files(grid.channels))
 
 
 def read_grid(path: Path) -> DistanceGrid:
     """The grid of a ``.npz`` or ``.vti`` that `write_grid` wrote. Raises InputError for any other file."""
-    readers = {".npz": read_npz, ".vti": read_vti}
+    readers = {kind.suffix: kind.read for kind in FORMATS.values() if kind.read is not None}
     if path.suffix not in readers:
         raise InputError(
             f"{path}: expected a distance grid to read, {' or '.join(readers)}, got {path.suffix or 'no suffix'}",
             remedy="give the field.npz of the bake",
         )
     return readers[path.suffix](path)
-
-
-def _one(suffix: str) -> Callable[[Collection[str]], tuple[str, ...]]:
-    return lambda _: (STEM + suffix,)
-
-
-def _surface(suffix: str) -> GridFormat:
-    def write(folder: Path, grid: DistanceGrid, options: GridOptions) -> None:
-        write_surface(folder / f"{STEM}{suffix}", iso_surface(grid, options.level))
-
-    return GridFormat(title=f"surface of sdf, {suffix}", files=_one(suffix), write=write)
-
-
-def _write_nrrd(folder: Path, grid: DistanceGrid, _options: GridOptions) -> None:
-    for channel in grid.channels:
-        write_nrrd(folder / f"{STEM}.{channel}.nrrd", grid, channel)
-
-
-def _write_curobo(folder: Path, grid: DistanceGrid, options: GridOptions) -> None:
-    path = folder / f"{STEM}.curobo.npz"
-    write_curobo(path, grid, version=options.curobo_version, channel=options.curobo_channel)
-
-
-FORMATS: Mapping[str, GridFormat] = {
-    "npz": GridFormat(
-        title="arrays of NumPy",
-        files=_one(".npz"),
-        write=lambda folder, grid, _: write_npz(folder / "field.npz", grid),
-    ),
-    "vti": GridFormat(
-        title="ParaView image data",
-        files=_one(".vti"),
-        write=lambda folder, grid, _: write_vti(folder / "field.vti", grid),
-    ),
-    "nrrd": GridFormat(
-        title="NRRD, a file a channel",
-        files=lambda channels: tuple(f"{STEM}.{channel}.nrrd" for channel in channels),
-        write=_write_nrrd,
-    ),
-    "vdb": GridFormat(
-        title="OpenVDB",
-        files=_one(".vdb"),
-        write=lambda folder, grid, _: write_vdb(folder / "field.vdb", grid),
-        check=openvdb,
-    ),
-    "curobo": GridFormat(
-        title="cuRobo voxel grid", files=_one(".curobo.npz"), write=_write_curobo, holds_unknown=False
-    ),
-    "moveit": GridFormat(
-        title="MoveIt distance field stream",
-        files=_one(".moveit"),
-        write=lambda folder, grid, _: write_moveit(folder / "field.moveit", grid),
-        needs=frozenset({"bound", "hard"}),
-    ),
-    "ply": _surface(".ply"),
-    "obj": _surface(".obj"),
-    "stl": _surface(".stl"),
-}

@@ -5,6 +5,7 @@ and voxel_grid.h. Seven lines of text, then a zlib stream of bits: x slowest, ea
 first. The reader takes ``int(size * (1 / resolution))`` cells a side, and puts the centre of cell 0 at the origin.
 """
 
+import re
 import zlib
 from pathlib import Path
 
@@ -12,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.grid_channels import CHUNK, check_grid
+from splatctrl_cli.grid_files.grid_format import GridFormat, covers
 from splatctrl_cli.records import Bool, DistanceGrid
 
 FIELDS = ("resolution", "size_x", "size_y", "size_z", "origin_x", "origin_y", "origin_z")
@@ -71,3 +74,32 @@ def read_moveit_head(path: Path) -> tuple[dict[str, float], int]:
         if key != name or not np.isfinite(numbers[name]):
             raise InputError(f"{path}: expected '{name}: NUMBER', got {line!r}", remedy="the file is damaged")
     return numbers, start
+
+
+def describe_moveit(path: Path, head: bytes) -> Summary | None:
+    """A stream of MoveIt's distance field."""
+    if re.match(rb"resolution: \S+\nsize_x: ", head) is None:
+        return None
+    numbers, start = read_moveit_head(path)
+    cells = [int(numbers[f"size_{axis}"] * (1.0 / numbers["resolution"])) for axis in "xyz"]
+    place = covers([numbers[f"origin_{axis}"] for axis in "xyz"], numbers["resolution"], cells)
+    facts = {**place, "packed_bytes": path.stat().st_size - start}
+    return Summary(path=str(path), kind="MoveIt distance field", facts=facts)
+
+
+_DOCS = """
+`moveit` | `field.moveit`: occupied cells | `PropagationDistanceField(stream, max_distance)` of MoveIt 1 and 2 | a
+    reader that follows its source; MoveIt not tried | 0.4 s, 16 MiB (one channel)
+"""
+ENTRIES = (
+    GridFormat(
+        name="moveit",
+        order=5,
+        suffix=".moveit",
+        write=write_moveit,
+        describe=describe_moveit,
+        needs=frozenset({"bound", "hard"}),
+        bytes_per_cell=0,
+        docs=_DOCS,
+    ),
+)

@@ -10,7 +10,9 @@ import json
 from pathlib import Path
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.grid_channels import CHANNELS, check_grid, file_header, x_fastest
+from splatctrl_cli.grid_files.grid_format import GridFormat, header_facts, json_value
 from splatctrl_cli.records import DistanceGrid
 
 PREFIX = "splatctrl."
@@ -74,3 +76,36 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
             key, _, value = line.partition(": ")
             fields[key] = value
     return fields, pairs
+
+
+def describe_nrrd(path: Path, head: bytes) -> Summary | None:
+    """Any NRRD file: its fields, and the header of the bake where it is ours."""
+    if not head.startswith(b"NRRD000"):
+        return None
+    fields, pairs = read_nrrd_head(path)
+    header = {key.removeprefix(PREFIX): json_value(value) for key, value in pairs.items() if key.startswith(PREFIX)}
+    others = {key: value for key, value in pairs.items() if not key.startswith(PREFIX)}
+    return Summary(path=str(path), kind="NRRD", facts={**fields, **header_facts(header), **others})
+
+
+def _write_all(path: Path, grid: DistanceGrid) -> None:
+    for channel in grid.channels:
+        write_nrrd(path.with_suffix(f".{channel}.nrrd"), grid, channel)
+
+
+_DOCS = """
+`nrrd` | `field.CHANNEL.nrrd`: `data[x, y, z]`, a gradient `data[component, x, y, z]`; header entries are
+    `splatctrl.KEY`, JSON texts | 3D Slicer, ITK, `nrrd.read` | pynrrd 1.1.3, every value; Slicer, ITK not tried |
+    4.7 s, 48 MiB
+"""
+ENTRIES = (
+    GridFormat(
+        name="nrrd",
+        order=2,
+        suffix=".nrrd",
+        write=_write_all,
+        describe=describe_nrrd,
+        is_per_channel=True,
+        docs=_DOCS,
+    ),
+)

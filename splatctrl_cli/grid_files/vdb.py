@@ -16,7 +16,9 @@ import numpy as np
 
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.grid_files.grid_channels import CHANNELS, check_grid, file_header, slabs
+from splatctrl_cli.files.summary import Grid, Summary
+from splatctrl_cli.grid_files.grid_channels import CHANNELS, FORMAT, check_grid, file_header, slabs
+from splatctrl_cli.grid_files.grid_format import GridFormat, header_facts, json_value
 from splatctrl_cli.records import DistanceGrid
 
 MAGIC = b" BDV\0\0\0\0"
@@ -147,3 +149,29 @@ def _metadata(stream: BinaryIO) -> dict[str, object]:
             text = _text(stream)
             found[name] = text if kind == "string" else f"{kind} of {len(text)} bytes"
     return found
+
+
+def describe_vdb(path: Path, head: bytes) -> Summary | None:
+    """Any OpenVDB file: its grids, and the header of the bake where it is ours."""
+    if not head.startswith(MAGIC):
+        return None
+    grids = read_vdb_head(path)
+    rows = [
+        [g.name, g.type, g.metadata.get("class", "-"), g.metadata.get("file_voxel_count", "-")]
+        for g in sorted(grids, key=lambda g: g.name)
+    ]
+    header = {key: json_value(value) for key, value in grids[0].metadata.items()} if grids else {}
+    facts: dict[str, object] = {"grids": len(grids)}
+    if header.get("format") == FORMAT:
+        facts |= header_facts(header)
+    table = Grid(name="grid_table", header=("grid", "type", "class", "active voxels"), rows=rows)
+    return Summary(path=str(path), kind="OpenVDB", facts=facts, grids=(table,))
+
+
+_DOCS = """
+`vdb` | `field.vdb`: a FloatGrid or Vec3SGrid a channel; header entries are metadata | Houdini, Blender, OpenVDB |
+    OpenVDB 10.0.1, every value; others not tried | 0.8 s, 454 MiB (256³, one channel)
+"""
+ENTRIES = (
+    GridFormat(name="vdb", order=3, suffix=".vdb", write=write_vdb, describe=describe_vdb, check=openvdb, docs=_DOCS),
+)

@@ -12,6 +12,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.layout import GridLayout, check_room
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
+from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
 from splatctrl_cli.jobs.progress import Progress
 
@@ -19,7 +20,6 @@ FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
 SPARE = 1 << 26  # [bytes] for what is small
 VDB_COPIES = 7  # of the channels, in memory: 454 MiB were measured for one of 64 MiB
-WHOLE_FORMATS = ("npz", "vti", "nrrd", "vdb")  # hold every channel as it is, or less
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ def clear_leftovers(partial: Path) -> None:
 def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], formats: Collection[str]) -> None:
     """Raise UsageError where the channels and the files made of them do not fit the disk."""
     per_cell = bytes_per_cell(channels)
-    copies = per_cell * sum(name in WHOLE_FORMATS for name in formats) + 4 * ("curobo" in formats)
+    copies = sum(FORMATS[name].size_per_cell(per_cell) for name in formats)
     needed = (per_cell + copies) * layout.num_cells + SPARE
     free = shutil.disk_usage(folder).free
     if needed > free:

@@ -16,8 +16,8 @@ from splatctrl_cli.datasets.rig_folder import RigFolderSource, open_image_folder
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import files_below, names_in
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.grid_files.describe_grid import covers, header_facts
 from splatctrl_cli.grid_files.grid_channels import FORMAT
+from splatctrl_cli.grid_files.grid_format import covers, header_facts
 from splatctrl_cli.logs.large_log import survey_to_describe
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.rig import camera_topics, missing

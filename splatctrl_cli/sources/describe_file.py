@@ -16,21 +16,10 @@ from defusedxml.common import DefusedXmlException
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.grid_files.curobo_grid import is_curobo_npz
-from splatctrl_cli.grid_files.describe_grid import (
-    describe_curobo,
-    describe_grid_npz,
-    describe_mesh,
-    describe_moveit,
-    describe_nrrd,
-    describe_vdb,
-    describe_vti,
-    is_moveit,
-)
-from splatctrl_cli.grid_files.grid import is_grid_npz
-from splatctrl_cli.grid_files.vdb import MAGIC
+from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.logs.messages import decode_file
-from splatctrl_cli.splat_files.describe_splats import describe_splats
+from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
+from splatctrl_cli.splat_files.splat_formats import describe_splats
 
 _HEAD = 1 << 16  # bytes in which a text header must end
 _MOST_SHOWN = 1 << 24  # bytes of texts and short lists
@@ -43,14 +32,13 @@ def describe_file(path: Path) -> Summary:
         raise InputError(f"{path}: the file is empty (0 bytes)", remedy="write or copy it again")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
-    for matches, describe in _KINDS:
-        if matches(path, head):
-            return describe(path, head)
-    raise InputError(
-        f"{path}: unknown kind of file",
-        remedy="known: .mcap .bag .db3 .toml .ply .splat .spz .glb .usda .usdc .npz .npy .vti .nrrd .vdb .moveit "
-        ".obj .stl .urdf .json .jsonl .csv .yaml .png .jpg",
-    )
+    for describe in _KINDS:
+        if (summary := describe(path, head)) is not None:
+            return summary
+    grids = [Path(f"x{kind.suffix}").suffix for kind in GRID_FORMATS.values()]
+    known = [*(".mcap", ".bag", ".db3", ".toml"), *SPLAT_FORMATS, *(".npz", ".npy"), *grids]
+    known += [".urdf", ".json", ".jsonl", ".csv", ".yaml", ".png", ".jpg"]
+    raise InputError(f"{path}: unknown kind of file", remedy=f"known: {' '.join(dict.fromkeys(known))}")
 
 
 def _ply(path: Path, head: bytes) -> Summary:
@@ -73,10 +61,6 @@ def _ply(path: Path, head: bytes) -> Summary:
 
 
 def _npz(path: Path, _head: bytes) -> Summary:
-    if is_curobo_npz(path):
-        return describe_curobo(path)
-    if is_grid_npz(path):
-        return describe_grid_npz(path)
     try:
         with zipfile.ZipFile(path) as archive:
             arrays = {n: _npy_header(archive, n) for n in archive.namelist() if n.endswith(".npy")}
@@ -223,23 +207,23 @@ def _short(value: object) -> object:
     return value
 
 
-def _suffix(*suffixes: str) -> Callable[[Path, bytes], bool]:
-    return lambda path, _: path.suffix.lower() in suffixes
+def _suffix(describe: Callable[[Path, bytes], Summary], *suffixes: str) -> Callable[[Path, bytes], Summary | None]:
+    return lambda path, head: describe(path, head) if path.suffix.lower() in suffixes else None
 
 
-_KINDS: tuple[tuple[Callable[[Path, bytes], bool], Callable[[Path, bytes], Summary]], ...] = (
-    (lambda _, head: head.startswith((b"ply\n", b"ply\r\n")), _ply),
-    (lambda _, head: head.startswith(b"PK\x03\x04"), _npz),
-    (lambda _, head: head.startswith(b"\x93NUMPY"), _npy),
-    (lambda _, head: head.startswith((b"\x89PNG", b"\xff\xd8\xff")), _image),
-    (lambda path, head: path.suffix == ".vti" or b'type="ImageData"' in head[:512], describe_vti),
-    (lambda _, head: head.startswith(b"NRRD000"), describe_nrrd),
-    (lambda _, head: head.startswith(MAGIC), describe_vdb),
-    (is_moveit, describe_moveit),
-    (_suffix(".splat", ".spz", ".glb", ".usda", ".usdc"), describe_splats),
-    (_suffix(".obj", ".stl"), describe_mesh),
-    (_suffix(".urdf", ".xacro"), _urdf),
-    (_suffix(".json"), _json),
-    (_suffix(".jsonl", ".csv"), _rows),
-    (_suffix(".yaml", ".yml"), _yaml),
+def _start(describe: Callable[[Path, bytes], Summary], *magics: bytes) -> Callable[[Path, bytes], Summary | None]:
+    return lambda path, head: describe(path, head) if head.startswith(magics) else None
+
+
+_KINDS: tuple[Callable[[Path, bytes], Summary | None], ...] = (
+    _start(_ply, b"ply\n", b"ply\r\n"),
+    _start(_npy, b"\x93NUMPY"),
+    _start(_image, b"\x89PNG", b"\xff\xd8\xff"),
+    *(kind.describe for kind in GRID_FORMATS.values()),
+    _start(_npz, b"PK\x03\x04"),
+    _suffix(describe_splats, *(suffix for suffix in SPLAT_FORMATS if suffix != ".ply")),
+    _suffix(_urdf, ".urdf", ".xacro"),
+    _suffix(_json, ".json"),
+    _suffix(_rows, ".jsonl", ".csv"),
+    _suffix(_yaml, ".yaml", ".yml"),
 )

@@ -7,6 +7,7 @@ Gaussian is no object, so that readers of a fixed stride can read every other fi
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.ply import PlyFile, check_properties, read_table, write_table
 from splatctrl_cli.records import Float32, GaussianSet, Label, UInt8
+from splatctrl_cli.splat_files.splat_format import SplatFormat, without_labels
 from splatctrl_cli.splat_files.splat_values import (
     check_finite,
     logit,
@@ -137,3 +139,20 @@ def _harmonics(ply: PlyFile) -> Float32:
         for index in range(num_rest // 3):
             harmonics[:, 1 + index, channel] = ply.column(names[channel * (num_rest // 3) + index])
     return harmonics
+
+
+def _write_reference_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
+    write_gaussian_ply(path, without_labels(gaussians), comments)
+
+
+_DOCS = """
+`.ply`, short | 3D-GS PLY with `label` and `density`, for isotropic splats | float32 | view-dependent colour
+
+`.ply`, full | 3D-GS PLY, the reference's 62 properties | float32 | density; labels (kept as a 63rd property
+    unless `--layout full`)
+"""
+_PLY = SplatFormat(
+    name="3D-GS PLY", order=0, suffix=".ply", write=write_gaussian_ply, read=read_gaussian_ply, docs=_DOCS
+)
+REFERENCE_PLY = replace(_PLY, name="3D-GS PLY, 62 properties", write=_write_reference_ply, held=without_labels)
+ENTRIES = (_PLY,)

@@ -16,6 +16,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import GaussianSet, Label
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
 from splatctrl_cli.splat_files.glb import Accessors, GlbWriter, read_glb
+from splatctrl_cli.splat_files.splat_format import SplatFormat
 from splatctrl_cli.splat_files.splat_values import SH_C0, refuse, unit_quaternions
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -133,3 +134,15 @@ def _gaussians(path: Path, attributes: Mapping[str, int], accessors: Accessors) 
         harmonics=np.stack([accessors.table(attributes[coefficient_name(k)], 3) for k in range(num)], axis=1),
         labels=labels.astype(np.uint8),
     )
+
+
+_DOCS = """
+`.glb` | glTF 2.0 with
+    [KHR_gaussian_splatting](https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting)
+    | float32 | density
+"""
+ENTRIES = (
+    SplatFormat(
+        name="glTF with KHR_gaussian_splatting", order=3, suffix=".glb", write=write_glb, read=read_gltf, docs=_DOCS
+    ),
+)

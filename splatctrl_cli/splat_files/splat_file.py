@@ -14,6 +14,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import GaussianSet
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
 from splatctrl_cli.splat_files.splat_differences import Differences
+from splatctrl_cli.splat_files.splat_format import SplatFormat, without_labels
 from splatctrl_cli.splat_files.splat_values import SH_C0, check_finite, unit_quaternions
 
 ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
@@ -64,11 +65,7 @@ def read_splat(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 def held_by_splat(gaussians: GaussianSet) -> GaussianSet:
     """`gaussians` with colours of degree 0 alone, inside 0 to 1, and no labels: what a byte can be rounded from."""
     limit = 0.5 / SH_C0
-    return replace(
-        gaussians,
-        harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit),
-        labels=np.zeros_like(gaussians.labels),
-    )
+    return replace(without_labels(gaussians), harmonics=np.clip(gaussians.harmonics[:, :1], -limit, limit))
 
 
 def splat_bound(gaussians: GaussianSet) -> Differences:
@@ -77,3 +74,21 @@ def splat_bound(gaussians: GaussianSet) -> Differences:
     Four components of 1/256 move a unit quaternion by at most 2/256, which turns by twice that angle: 0.9 degrees.
     """
     return Differences(center=0.0, sigma=0.0, rotation=0.9, color=0.5001 / 255, opacity=0.5001 / 255, harmonics=0.0)
+
+
+_DOCS = """
+`.splat` | 32 bytes per Gaussian, no header | colour, opacity 1/510; rotation 0.9 degrees | labels, density,
+    comments, view-dependent colour, colours outside 0 to 1
+"""
+ENTRIES = (
+    SplatFormat(
+        name=".splat, 32 bytes each",
+        order=1,
+        suffix=".splat",
+        write=write_splat,
+        read=read_splat,
+        held=held_by_splat,
+        bound=splat_bound,
+        docs=_DOCS,
+    ),
+)

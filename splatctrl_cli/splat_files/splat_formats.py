@@ -1,94 +1,24 @@
-"""The files that hold splats: how each suffix is written and read, and how exact it is."""
+"""The files that hold splats, by suffix: what any of them holds, read or described."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.ply import read_table
-from splatctrl_cli.records import GaussianSet, SplatSet
-from splatctrl_cli.splat_files import gaussian_ply, gltf, splat_file, splats, spz, usd
-from splatctrl_cli.splat_files.isotropic import as_splats, is_isotropic
-from splatctrl_cli.splat_files.splat_differences import Differences, float32_bound
+from splatctrl_cli.files.registry import entries_of
+from splatctrl_cli.files.summary import Summary
+from splatctrl_cli.records import GaussianSet, Label, SplatSet
+from splatctrl_cli.splat_files import splats
+from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY, gaussians_of
+from splatctrl_cli.splat_files.isotropic import as_gaussians, as_splats, is_isotropic
+from splatctrl_cli.splat_files.splat_format import Comments, SplatFormat
 
-Comments = dict[str, str]
+__all__ = ["FORMATS", "REFERENCE_PLY", "SplatFormat", "describe_splats", "format_of", "read_splats"]
 
-
-@dataclass(frozen=True, kw_only=True)
-class SplatFormat:
-    """One kind of file. `held` is what of a set it can hold, before rounding; `bound` is how far it may round."""
-
-    name: str
-    write: Callable[[Path, GaussianSet, Mapping[str, str]], None]
-    read: Callable[[Path], tuple[GaussianSet, Comments]]
-    held: Callable[[GaussianSet], GaussianSet]
-    bound: Callable[[GaussianSet], Differences]
-    is_rounded: bool
-
-
-def _all(gaussians: GaussianSet) -> GaussianSet:
-    return gaussians
-
-
-def _without_labels(gaussians: GaussianSet) -> GaussianSet:
-    return replace(gaussians, labels=np.zeros_like(gaussians.labels))
-
-
-def _usd(suffix: str) -> SplatFormat:
-    return SplatFormat(
-        name="OpenUSD particle field",
-        write=partial(usd.write_usd, suffix=suffix),
-        read=partial(usd.read_usd, suffix=suffix),
-        held=_all,
-        bound=float32_bound,
-        is_rounded=False,
-    )
-
-
-def _write_reference_ply(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
-    gaussian_ply.write_gaussian_ply(path, _without_labels(gaussians), comments)
-
-
-REFERENCE_PLY = SplatFormat(
-    name="3D-GS PLY, 62 properties",
-    write=_write_reference_ply,
-    read=gaussian_ply.read_gaussian_ply,
-    held=_without_labels,
-    bound=float32_bound,
-    is_rounded=False,
-)
-FORMATS = {
-    ".ply": replace(REFERENCE_PLY, name="3D-GS PLY", write=gaussian_ply.write_gaussian_ply, held=_all),
-    ".splat": SplatFormat(
-        name=".splat, 32 bytes each",
-        write=splat_file.write_splat,
-        read=splat_file.read_splat,
-        held=splat_file.held_by_splat,
-        bound=splat_file.splat_bound,
-        is_rounded=True,
-    ),
-    ".spz": SplatFormat(
-        name=".spz version 3",
-        write=spz.write_spz,
-        read=spz.read_spz,
-        held=spz.held_by_spz,
-        bound=spz.spz_bound,
-        is_rounded=True,
-    ),
-    ".glb": SplatFormat(
-        name="glTF with KHR_gaussian_splatting",
-        write=gltf.write_glb,
-        read=gltf.read_gltf,
-        held=_all,
-        bound=float32_bound,
-        is_rounded=False,
-    ),
-    ".usda": _usd(".usda"),
-    ".usdc": _usd(".usdc"),
-}
+FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(__package__, SplatFormat)}
 
 
 def format_of(path: Path) -> SplatFormat:
@@ -115,4 +45,29 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
     has_rest = any(name.startswith("f_rest_") and ply.column(name).any() for name in ply.names)
     if splats.num_stretched(ply) == 0 and not has_rest:
         return splats.splats_of(ply), ply.pairs()
-    return gaussian_ply.gaussians_of(ply), ply.pairs()
+    return gaussians_of(ply), ply.pairs()
+
+
+def describe_splats(path: Path, _head: bytes) -> Summary:
+    """Number, shape, box and ranges of the splats of a file. Raises InputError for one that is none."""
+    found, comments = read_splats(path)
+    gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
+    facts: dict[str, object] = {
+        "format": format_of(path).name,
+        "splats": len(gaussians),
+        "shape": "isotropic" if isinstance(found, SplatSet) else "anisotropic",
+        "degree_of_harmonics": int(np.sqrt(gaussians.harmonics.shape[1])) - 1,
+    }
+    if (gaussians.labels != Label.OBJECT).any():
+        facts["labels"] = {label.name.lower(): int(np.count_nonzero(gaussians.labels == label)) for label in Label}
+    if len(gaussians):
+        facts["lower_m"] = _rounded(gaussians.centers.min(axis=0))
+        facts["upper_m"] = _rounded(gaussians.centers.max(axis=0))
+        facts["sigma_m"] = _rounded(np.percentile(gaussians.scales, [0, 50, 100]))
+        facts["opacity"] = _rounded(np.percentile(gaussians.opacities, [0, 50, 100]))
+    facts["comments"] = comments
+    return Summary(path=str(path), kind="splats", facts=facts)
+
+
+def _rounded(values: NDArray[np.floating]) -> list[float]:
+    return [float(f"{value:.4g}") for value in values]

@@ -8,6 +8,7 @@ import errno
 import os
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Float32, GaussianSet, Label
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
+from splatctrl_cli.splat_files.splat_format import SplatFormat
 from splatctrl_cli.splat_files.splat_values import unit_quaternions
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
@@ -145,3 +147,20 @@ def _array(path: Path, prim: Any, name: str, width: int) -> Float32:
             if table.shape[1] == width:
                 return table.astype(np.float32)
     raise InputError(f"{path}: its {PRIM_TYPE} has no {name}")
+
+
+_DOCS = """
+`.usda`, `.usdc` | OpenUSD, one `ParticleField3DGaussianSplat` | float32 | density
+"""
+ENTRIES = tuple(
+    SplatFormat(
+        name="OpenUSD particle field",
+        order=order,
+        suffix=suffix,
+        write=partial(write_usd, suffix=suffix),
+        read=partial(read_usd, suffix=suffix),
+        check=_library,
+        docs=docs,
+    )
+    for order, suffix, docs in ((4, ".usda", _DOCS), (5, ".usdc", ""))
+)

@@ -10,7 +10,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.splat_files.splat_formats import FORMATS
-from tests.datasets.test_layouts import make_tum
+from tests.datasets.make_layout import make_tum
 from tests.logs.make_log import LogRecipe, make_log
 from tests.splat_files.test_gaussian_ply import gaussian_set
 

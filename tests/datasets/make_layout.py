@@ -1,6 +1,8 @@
 """Small trees laid out as public datasets are, with known poses and depth."""
 
 import json
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +60,7 @@ def check(frames: list[RgbdFrame], unit: float = 1e-3, k: tuple[float, ...] = K)
         assert np.array_equal(frame.color, color_of(index))
         assert np.array_equal(frame.depth, counts_of(index, unit).astype(np.float32) * np.float32(unit))
         assert frame.depth[0, 0] == 0
-        assert frame.T_world_camera == pytest.approx(POSES[index], abs=1e-12)
+        assert frame.T_world_camera == pytest.approx(POSES[index], abs=1e-9)
         i = frame.intrinsics
         assert (i.fx, i.fy, i.cx, i.cy, i.width, i.height) == (*k, WIDTH, HEIGHT)
 
@@ -201,7 +203,7 @@ def make_sun3d(folder: Path) -> Path:
 
 
 def make_arkit(folder: Path) -> Path:
-    """Depth of half the size; the lens' file is named a millisecond off, poses lie half a period to either side."""
+    """The lens' file is named a millisecond off, poses lie half a period to either side."""
     root = folder / "41069021_frames"
     (root / "lowres_wide_intrinsics").mkdir(parents=True)
     lines = []
@@ -209,7 +211,6 @@ def make_arkit(folder: Path) -> Path:
         stamp = 305.367 + 0.1 * index
         name = f"41069021_{stamp:.3f}.png"
         write_pair(root / "lowres_wide" / name, root / "lowres_depth" / name, index)
-        cv2.imwrite(str(root / "lowres_depth" / name), counts_of(index)[::2, ::2])
         lens = f"{WIDTH} {HEIGHT} {K[0]} {K[1]} {K[2]} {K[3]}"
         (root / f"lowres_wide_intrinsics/41069021_{stamp + 0.001:.3f}.pincam").write_text(lens)
         for step in (-0.05, 0.05):
@@ -220,3 +221,32 @@ def make_arkit(folder: Path) -> Path:
             lines.append(f"{stamp + step * 0.5:.6f} " + " ".join(repr(float(v)) for v in row) + "\n")
     (root / "lowres_wide.traj").write_text("".join(lines))
     return folder
+
+
+GIVEN = SourceOptions(intrinsics={"camera": K})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Example:
+    """A tree of a layout whose values `check` knows: how it is made and opened, metres a count, first stamp, step."""
+
+    make: Callable[[Path], Path]
+    options: SourceOptions | None = None
+    unit: float = 1e-3
+    stamps_ns: tuple[int, int] | None = None
+
+
+EXAMPLES = {  # by the layout's name
+    "TUM RGB-D": Example(
+        make=make_tum, options=GIVEN, unit=1 / 5000, stamps_ns=(1_305_031_102_000_000_000, 100_000_000)
+    ),
+    "BOP scene": Example(make=make_bop, unit=1e-4),
+    "ScanNet export": Example(make=make_scannet),
+    "7-Scenes": Example(make=make_frames, options=GIVEN),
+    "nerfstudio": Example(make=make_nerfstudio),
+    "ICL-NUIM": Example(make=make_icl, options=GIVEN, unit=1 / 5000),
+    "Replica": Example(make=make_replica, unit=1 / 6553.5),
+    "ARKitScenes": Example(make=make_arkit, stamps_ns=(305_367_000_000, 100_000_000)),
+    "SUN3D": Example(make=make_sun3d, stamps_ns=(0, 33_000_000)),
+    "Open3D scene": Example(make=make_redwood),
+}

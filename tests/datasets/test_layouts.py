@@ -1,13 +1,13 @@
 """Folders of public datasets, opened by their own files: small trees with a known pose and depth."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.captures.capture_writer import write_capture
+from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.datasets.layouts import LAYOUTS, layout_of
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
@@ -15,40 +15,64 @@ from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.datasets.make_layout import (
+    EXAMPLES,
+    GIVEN,
     HEIGHT,
     WIDTH,
     K,
     check,
     color_of,
     frames_of,
-    make_arkit,
     make_bop,
     make_frames,
-    make_icl,
     make_nerfstudio,
     make_redwood,
-    make_replica,
     make_scannet,
-    make_sun3d,
     make_tum,
     matrix_text,
 )
 
-TEXTS = {".txt", ".json", ".log", ".freiburg", ".traj", ".pincam"}
-ALL = [
-    *(make_tum, make_bop, make_scannet, make_frames, make_nerfstudio),
-    *(make_icl, make_replica, make_arkit, make_sun3d, make_redwood),
-]
-INTRINSICS = SourceOptions(intrinsics={"camera": K})
+
+@pytest.fixture(params=LAYOUTS, ids=lambda layout: layout.name)
+def layout(request: pytest.FixtureRequest) -> Layout:
+    """Each layout; tests of one of its own are below, and in test_layout_forms.py."""
+    found: Layout = request.param
+    return found
 
 
-def test_a_tum_folder_is_paired_by_stamp_and_posed_between_its_samples(tmp_path: Path) -> None:
-    folder = make_tum(tmp_path / "rgbd_dataset_freiburg3_x")
-    source = open_source(folder, INTRINSICS)
+def test_a_layout_is_known_by_its_files_described_and_read_to_the_value(tmp_path: Path, layout: Layout) -> None:
+    example = EXAMPLES[layout.name]
+    folder = example.make(tmp_path / "freiburg3")
+    assert layout_of(folder) is layout
+    summary = describe(folder)
+    assert (summary.kind, summary.grids[0].rows) == (layout.name, [["camera", 3]])
+    source = open_source(folder, example.options)
     frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
-    check(frames, 1 / 5000)
-    assert source.has_clock
-    assert [frame.stamp_ns for frame in frames] == [1_305_031_102_000_000_000 + i * 100_000_000 for i in range(3)]
+    check(frames, example.unit)
+    assert source.has_clock == (example.stamps_ns is not None)
+    if example.stamps_ns is not None:
+        first, step = example.stamps_ns
+        assert [frame.stamp_ns for frame in frames] == [first + i * step for i in range(3)]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b"[]", b"null", b"1 2 3\n", b"\xff\xfe nonsense \x00", b'{"0": 3, "frames": [1]}']
+)
+def test_a_damaged_text_of_a_layout_is_refused_in_one_line_or_read_around(
+    tmp_path: Path, layout: Layout, content: bytes
+) -> None:
+    make = EXAMPLES[layout.name].make
+    names = [p.relative_to(tmp_path / "whole") for p in make(tmp_path / "whole").rglob("*") if p.suffix != ".png"]
+    names = [name for name in names if name.suffix]
+    assert names
+    for number, name in enumerate(names):
+        folder = make(tmp_path / f"freiburg3_{number}")
+        (folder / name).write_bytes(content)
+        try:
+            source = open_source(folder, SourceOptions())
+            list(source.records())
+        except InputError as error:
+            assert "\n" not in str(error) and error.remedy
 
 
 def test_the_camera_of_a_tum_folder_is_known_by_its_name(tmp_path: Path) -> None:
@@ -65,13 +89,9 @@ def test_tum_images_without_partner_or_pose_are_counted(tmp_path: Path) -> None:
     (folder / "depth.txt").write_text("\n".join(lines[1:]) + "\n")
     rows = (folder / "groundtruth.txt").read_text().splitlines()
     (folder / "groundtruth.txt").write_text("\n".join(rows[:5]) + "\n")
-    source = open_source(folder, INTRINSICS)
+    source = open_source(folder, GIVEN)
     assert len(list(source.records())) == 1
     assert (source.loss.unpaired_color, source.loss.unpaired_depth, source.loss.without_pose) == (1, 0, 1)
-
-
-def test_an_open3d_scene_goes_by_place_where_there_are_as_many_poses(tmp_path: Path) -> None:
-    check(frames_of(make_redwood(tmp_path)))
 
 
 def test_an_open3d_scene_goes_by_number_where_there_are_more_poses(tmp_path: Path) -> None:
@@ -88,12 +108,12 @@ def test_an_open3d_scene_without_intrinsics_asks_for_them(tmp_path: Path) -> Non
     (folder / "camera_intrinsic.json").unlink()
     with pytest.raises(InputError, match=r"no camera_intrinsic.json in it or above it; give --intrinsics"):
         open_source(folder)
-    check(frames_of(folder, INTRINSICS))
+    check(frames_of(folder, GIVEN))
 
 
 @pytest.mark.parametrize("sequence", ["seq-01", "", "data"])
 def test_seven_scenes_take_65535_for_no_depth(tmp_path: Path, sequence: str) -> None:
-    source = open_source(make_frames(tmp_path, sequence), INTRINSICS)
+    source = open_source(make_frames(tmp_path, sequence), GIVEN)
     check([r for r in source.records() if isinstance(r, RgbdFrame)])
     assert source.loss.notes == []
     assert not source.has_clock
@@ -106,10 +126,6 @@ def test_frames_with_their_own_intrinsics_need_no_default(tmp_path: Path) -> Non
     source = open_source(folder)
     check([r for r in source.records() if isinstance(r, RgbdFrame)])
     assert source.loss.notes == []
-
-
-def test_a_scannet_export_is_read_in_the_order_of_its_numbers(tmp_path: Path) -> None:
-    check(frames_of(make_scannet(tmp_path)))
 
 
 def test_a_lost_pose_of_scannet_is_counted_not_refused(tmp_path: Path) -> None:
@@ -126,10 +142,6 @@ def test_scannet_depth_of_another_size_is_registered_to_colour(tmp_path: Path) -
     assert frame.depth[1:-1, 1:-1] == pytest.approx(1.5)
 
 
-def test_a_bop_scene_has_poses_in_millimetres_and_a_depth_unit_of_its_own(tmp_path: Path) -> None:
-    check(frames_of(make_bop(tmp_path)), 1e-4)
-
-
 def test_a_bop_scene_without_poses_needs_a_camera_that_stands_still(tmp_path: Path) -> None:
     folder = make_bop(tmp_path, with_poses=False)
     with pytest.raises(InputError, match=r"scene_camera.json has no pose for any image.*give --camera-pose"):
@@ -137,10 +149,6 @@ def test_a_bop_scene_without_poses_needs_a_camera_that_stands_still(tmp_path: Pa
     still = SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)})
     assert [frame.T_world_camera[:3, 3].tolist() for frame in frames_of(folder, still)] == [[1.0, 2.0, 3.0]] * 3
     assert "camera camera: stands still where --camera-pose puts it" in open_source(folder, still).loss.notes[0]
-
-
-def test_a_nerfstudio_folder_needs_no_description(tmp_path: Path) -> None:
-    check(frames_of(make_nerfstudio(tmp_path)))
 
 
 def test_frames_with_a_lens_of_their_own_become_a_camera_of_their_own(tmp_path: Path) -> None:
@@ -169,15 +177,6 @@ def test_a_nerfstudio_frame_without_depth_is_named(tmp_path: Path) -> None:
         open_source(folder)
 
 
-def test_each_layout_is_known_by_its_files_and_described(tmp_path: Path) -> None:
-    for layout, make in zip(LAYOUTS, ALL, strict=True):
-        folder = make(tmp_path / f"{make.__name__}_freiburg3")
-        found = layout_of(folder)
-        assert found is not None and found.name == layout.name
-        summary = describe(folder)
-        assert (summary.kind, summary.grids[0].rows) == (layout.name, [["camera", 3]])
-
-
 def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
     make_redwood(tmp_path / "kitchen")
     make_scannet(tmp_path / "scene0000_00")
@@ -192,33 +191,14 @@ def test_a_folder_of_scenes_names_them(tmp_path: Path) -> None:
 def test_files_that_are_named_but_not_there_are_counted(tmp_path: Path) -> None:
     folder = make_tum(tmp_path / "freiburg3")
     next((folder / "depth").iterdir()).unlink()
-    source = open_source(folder, INTRINSICS)
+    source = open_source(folder, GIVEN)
     assert len(list(source.records())) == 2
     assert (source.loss.unpaired_color, source.loss.unpaired_depth) == (1, 0)
     assert "1 of 3 views lack a file" in source.loss.notes[0]
     (folder / "rgb").rename(tmp_path / "rgb")
     (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text().replace("rgb/", "../rgb/"))
     with pytest.raises(InputError, match="is not in"):
-        open_source(folder, INTRINSICS)
-
-
-@pytest.mark.parametrize("make", ALL)
-@pytest.mark.parametrize(
-    "content", [b"", b"{}", b"[]", b"null", b"1 2 3\n", b"\xff\xfe nonsense \x00", b'{"0": 3, "frames": [1]}']
-)
-def test_a_damaged_text_of_a_layout_is_refused_in_one_line_or_read_around(
-    tmp_path: Path, make: Callable[[Path], Path], content: bytes
-) -> None:
-    names = [p.relative_to(tmp_path / "whole") for p in make(tmp_path / "whole").rglob("*") if p.suffix in TEXTS]
-    assert names
-    for number, name in enumerate(names):
-        folder = make(tmp_path / f"freiburg3_{number}")
-        (folder / name).write_bytes(content)
-        try:
-            source = open_source(folder, SourceOptions())
-            list(source.records())
-        except InputError as error:
-            assert "\n" not in str(error) and error.remedy
+        open_source(folder, GIVEN)
 
 
 def test_a_name_that_no_camera_has_is_refused(tmp_path: Path) -> None:
@@ -226,7 +206,7 @@ def test_a_name_that_no_camera_has_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no camera 'cam0'; use one of: camera"):
         open_source(folder, SourceOptions(camera_poses={"cam0": (0, 0, 0, 0, 0, 0, 1)}))
     with pytest.raises(InputError, match="--intrinsics does not apply to a BOP scene"):
-        open_source(make_bop(tmp_path / "bop"), INTRINSICS)
+        open_source(make_bop(tmp_path / "bop"), GIVEN)
 
 
 def test_frames_can_be_held_out_of_a_layout(tmp_path: Path) -> None:

@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.fuzz_mutate import mutated
-from benchmarks.readers import Reader, all_readers
+from benchmarks.readers import Reader, all_readers, splat_suffixes
 from tests.properties import few
 
 NAMES = (
     *("mcap", "bag", "db3", "capture.json", "frames.csv", "joints.npz", "compressed image", "image", "image head"),
-    *("rvl", "protobuf", "arrays", "npy", "grid.npz", "vti", "nrrd", "pfm", "ply", "spz", "glb", "splat"),
+    *("rvl", "protobuf", "arrays", "npy", "grid.npz", "vti", "nrrd", "pfm"),
+    *(suffix[1:] for suffix in splat_suffixes()),
     *("x.urdf", "x.yaml", "x.toml", "x.tum", "x.log", "transforms.json"),
 )
 

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.grid_files.curobo_grid import is_curobo_npz, round_down, write_curobo
+from splatctrl_cli.grid_files.curobo_grid import round_down, write_curobo
 from splatctrl_cli.records import DistanceGrid
 from tests.grid_files.make_grid import HEADER, centers, random_grid, with_unknown
 
@@ -123,10 +123,7 @@ def test_float16_is_rounded_towards_less_distance() -> None:
 
 
 def test_the_file_says_what_it_is_for(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_curobo(tmp_path / name, random_grid())
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    assert is_curobo_npz(tmp_path / "a")
+    write_curobo(tmp_path / "a", random_grid())
     file = loaded(tmp_path / "a")
     assert (str(file["curobo"]), str(file["channel"])) == ("0.7", "sdf")
     assert json.loads(str(file["header"])) == HEADER

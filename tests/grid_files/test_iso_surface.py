@@ -66,8 +66,6 @@ def test_every_suffix_reads_back_as_the_same_triangles(tmp_path: Path) -> None:
     surface = iso_surface(ball_grid())
     for suffix in (".ply", ".obj", ".stl"):
         write_surface(tmp_path / f"field{suffix}", surface)
-        write_surface(tmp_path / f"again{suffix}", surface)
-        assert (tmp_path / f"field{suffix}").read_bytes() == (tmp_path / f"again{suffix}").read_bytes()
         read = trimesh.load_mesh(tmp_path / f"field{suffix}", process=False)
         np.testing.assert_allclose(read.triangles, surface.vertices[surface.faces], atol=1e-6)
     normals = trimesh.load_mesh(tmp_path / "field.ply", process=False).vertex_normals

@@ -53,12 +53,6 @@ def test_it_reads_back_whatever_the_pieces_it_is_written_in(
     assert (head.shape, head.channels) == (SHAPE, tuple(grid.channels))
 
 
-def test_same_grid_same_bytes(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_vti(tmp_path / name, random_grid())
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

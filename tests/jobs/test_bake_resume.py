@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.field import layout, slabs
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 from splatctrl_cli.jobs import bake_slabs
 from splatctrl_cli.jobs.bake import BakeResult
@@ -107,7 +109,7 @@ def test_a_bake_stopped_while_it_writes_files_goes_on(
     splats: Path, whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr("splatctrl_cli.grid_files.grid_formats.write_vti", interrupted_write)
+        patch.setitem(FORMATS, "vti", replace(FORMATS["vti"], write=interrupted_write))
         bake(splats, tmp_path / "field")
     assert (tmp_path / "field.partial" / "left over").is_file()
     monkeypatch.setattr(Baker, "bake", None)  # nothing is left to bake

@@ -13,11 +13,9 @@ from splatctrl_cli.records import SWEPT, Label, OccupancyGrid, SplatSet
 from splatctrl_cli.scene_files.voxel_file import write_occupancy
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import SourceOptions, open_source
-from splatctrl_cli.splat_files.splat_formats import FORMATS
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.known_voxels import known
 from tests.logs.make_log import LogRecipe, make_log
-from tests.splat_files.test_gaussian_ply import gaussian_set
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
@@ -155,17 +153,6 @@ def test_a_field_folder_is_described_by_what_its_grid_covers(tmp_path: Path) -> 
     assert {key: summary.facts[key] for key in expected} == expected
 
 
-@pytest.mark.parametrize("suffix", [".splat", ".spz", ".glb"])
-def test_a_splat_file_of_a_binary_format_is_described_by_its_content(tmp_path: Path, suffix: str) -> None:
-    gaussians = gaussian_set(30, degree=0)
-    FORMATS[suffix].write(tmp_path / f"a{suffix}", gaussians, {})
-    summary = describe(tmp_path / f"a{suffix}")
-    assert summary.kind == "splats"
-    assert (summary.facts["splats"], summary.facts["shape"]) == (30, "anisotropic")
-    assert summary.facts["degree_of_harmonics"] == 0
-    np.testing.assert_allclose(np.array(summary.facts["lower_m"]), gaussians.centers.min(axis=0), atol=1e-3)
-
-
 def test_a_folder_with_anothers_field_json_is_a_run_folder(tmp_path: Path) -> None:
     (tmp_path / "field.json").write_text('{"shape": 3}')
     (tmp_path / "run.json").write_text('{"command": "replay", "config": {"scene": {"noise": 1}}, "seed": 0}')
@@ -218,11 +205,7 @@ def test_what_is_not_there_is_refused(tmp_path: Path, name: str) -> None:
         ("a.json", b"{"),
         ("a.urdf", b"<robot"),
         ("a.vti", b"<nothing/>"),
-        ("a.nrrd", b"NRRD0005\ntype: float\n"),
         ("a.vdb", b" BDV\0\0\0\0\xe0\0\0\0"),
-        ("a.moveit", b"resolution: 0.1\nsize_x: one\n"),
-        ("a.obj", b"v 1\nf 1 2 x\n"),
-        ("a.stl", b"solid"),
         ("a.png", b"\x89PNG\r\n\x1a\n"),
         ("a.mcap", b"hello"),
         ("a.db3", b"SQLite format 3\x00garbage"),

@@ -1,6 +1,7 @@
 """3D-GS PLY files: what is written, what is read back, what is refused."""
 
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import trimesh
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.splat_files.splats import DTYPE, read_ply, write_ply
+from tests.splat_files.test_gaussian_ply import ascii_ply, assert_equal_bits
 
 MINIMAL = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
 STANDARD = [*MINIMAL[:3], "nx", "ny", "nz", *MINIMAL[3:], "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -28,22 +30,8 @@ def splat_set(num: int = 50, seed: int = 0) -> SplatSet:
     )
 
 
-def assert_equal_bits(a: SplatSet, b: SplatSet) -> None:
-    for name in ("centers", "radii", "colors", "opacities", "labels", "density"):
-        left, right = getattr(a, name), getattr(b, name)
-        assert left.dtype == right.dtype, name
-        assert np.array_equal(left, right), name
-
-
 def header_of(path: Path) -> list[str]:
     return path.read_bytes().split(b"end_header\n")[0].decode("ascii").splitlines()
-
-
-def ascii_ply(path: Path, names: list[str], rows: list[list[object]], extra: str = "") -> Path:
-    lines = ["ply", "format ascii 1.0", *([extra] if extra else []), f"element vertex {len(rows)}"]
-    lines += [f"property float {name}" for name in names] + ["end_header"]
-    path.write_text("\n".join(lines + [" ".join(map(str, row)) for row in rows]) + "\n")
-    return path
 
 
 def test_what_is_written_reads_back_within_float32_and_then_bit_for_bit(tmp_path: Path) -> None:
@@ -90,12 +78,6 @@ def test_one_splat_has_the_bytes_a_stock_viewer_expects(tmp_path: Path) -> None:
     half = 0.5 / 0.28209479177387814
     expected = [1, 2, 3, 0, 0, 0, 0, half, -half, 0, *[np.log(0.01)] * 3, 1, 0, 0, 0, 2, 7]
     np.testing.assert_allclose(values, expected, rtol=1e-6)
-
-
-def test_the_same_set_gives_the_same_bytes(tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", splat_set(), {"k": "v"})
-    write_ply(tmp_path / "b.ply", splat_set(), {"k": "v"})
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_colours_outside_0_to_1_are_kept(tmp_path: Path) -> None:
@@ -155,39 +137,34 @@ def test_a_set_that_the_format_cannot_hold_is_refused(
     assert not (tmp_path / "a.ply").exists()
 
 
-@pytest.mark.parametrize("cut", [1, 73, 300])
-def test_a_truncated_file_is_refused_with_expected_and_got(tmp_path: Path, cut: int) -> None:
+LABEL = b"property uchar label"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda whole: whole[:-1], r"cut short: expected \d+ bytes .* got \d+"),
+        (lambda whole: whole[:-300], "cut short: expected"),
+        (lambda whole: whole + b"\0", "longer than its header says"),
+        (lambda whole: whole[:100], "no end_header line"),
+        (lambda _: b"", "no PLY file"),
+        (lambda _: b"plywood\n", "no PLY file"),
+        (
+            lambda whole: whole.replace(LABEL, b"property quaternion q"),
+            "line not understood: 'property quaternion q'",
+        ),
+        (lambda whole: whole.replace(LABEL, b"element vertex many"), "header line not understood"),
+        (lambda whole: whole.replace(LABEL, b"property float x"), "names property x twice"),
+    ],
+)
+def test_a_file_that_is_damaged_or_no_ply_is_refused(
+    tmp_path: Path, change: Callable[[bytes], bytes], message: str
+) -> None:
     path = tmp_path / "a.ply"
     write_ply(path, splat_set(20), {})
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-cut])
-    with pytest.raises(
-        InputError, match=rf"a\.ply: cut short: expected {len(whole)} bytes .* got {len(whole) - cut}"
-    ):
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(InputError, match=rf"a\.ply: .*{message}"):
         read_ply(path)
-
-
-def test_a_file_with_bytes_to_spare_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    write_ply(path, splat_set(2), {})
-    path.write_bytes(path.read_bytes() + b"\0")
-    with pytest.raises(InputError, match="longer than its header says"):
-        read_ply(path)
-
-
-def test_a_header_that_is_cut_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    write_ply(path, splat_set(2), {})
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(InputError, match="no end_header line"):
-        read_ply(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n", b"plywood\n"])
-def test_what_is_no_ply_is_refused(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "a.ply").write_bytes(content)
-    with pytest.raises(InputError, match="no PLY file"):
-        read_ply(tmp_path / "a.ply")
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
@@ -195,26 +172,12 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         read_ply(tmp_path / "none.ply")
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("property quaternion q", "header line not understood: 'property quaternion q'"),
-        ("element vertex many", "header line not understood"),
-        ("property float x", "names property x twice"),
-    ],
-)
-def test_a_header_that_makes_no_sense_is_refused(tmp_path: Path, line: str, message: str) -> None:
-    path = tmp_path / "a.ply"
-    write_ply(path, splat_set(2), {})
-    path.write_bytes(path.read_bytes().replace(b"property uchar label", line.encode()))
-    with pytest.raises(InputError, match=message):
-        read_ply(path)
-
-
 def test_ascii_in_any_order_with_extra_properties_reads_the_same(tmp_path: Path) -> None:
     names = ["confidence", *reversed(MINIMAL)]
     row: list[object] = [0.25, -4, -4, -4, 0, 0.1, 0.2, 0.3, 3, 2, 1]
-    splats, comments = read_ply(ascii_ply(tmp_path / "a.ply", names, [row, row], "comment made by hand"))
+    path = ascii_ply(tmp_path / "a.ply", names, [row, row])
+    path.write_text(path.read_text().replace("ascii 1.0\n", "ascii 1.0\ncomment made by hand\n"))
+    splats, comments = read_ply(path)
     np.testing.assert_allclose(splats.centers, [[1, 2, 3]] * 2)
     np.testing.assert_allclose(splats.radii, np.exp(-4), rtol=1e-6)
     np.testing.assert_allclose(splats.colors[0], 0.5 + 0.28209479 * np.array([0.3, 0.2, 0.1]), rtol=1e-6)
@@ -232,52 +195,32 @@ def test_big_endian_doubles_and_other_elements_read_the_same(tmp_path: Path) -> 
     assert read_ply(tmp_path / "a.ply")[0].centers.tolist() == [[1, 2, 3]]
 
 
-def test_missing_properties_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"missing properties opacity scale_0 scale_1 scale_2 \(it has x y z f_dc_0"):
-        read_ply(ascii_ply(tmp_path / "a.ply", MINIMAL[:6], [[0] * 6]))
-
-
-def test_anisotropic_sets_are_refused_with_how_many_differ(tmp_path: Path) -> None:
-    round_splat: list[object] = [0, 0, 0, 0, 0, 0, 0, -4, -4, -4]
-    flat_splat: list[object] = [0, 0, 0, 0, 0, 0, 0, -4, -4, -6]
-    with pytest.raises(InputError, match=r"expected isotropic splats .* got 2 of 3 whose scales differ"):
-        read_ply(ascii_ply(tmp_path / "a.ply", MINIMAL, [round_splat, flat_splat, flat_splat]))
-
-
-@pytest.mark.parametrize(("index", "name"), [(0, "x"), (4, "f_dc_1"), (6, "opacity"), (8, "scale_1")])
-def test_a_nan_is_named_with_its_index(tmp_path: Path, index: int, name: str) -> None:
-    good: list[object] = [0, 0, 0, 0, 0, 0, 0, -4, -4, -4]
-    bad = good.copy()
-    bad[index] = "nan"
-    with pytest.raises(InputError, match=rf"splat 1: {name}: expected a finite number, got nan"):
-        read_ply(ascii_ply(tmp_path / "a.ply", MINIMAL, [good, bad]))
-
-
-@pytest.mark.parametrize("scale", [-200, 200, 1e6])
-def test_a_scale_that_is_no_radius_is_refused(tmp_path: Path, scale: float) -> None:
-    with pytest.raises(InputError, match=r"splat 0: scale_0: expected a radius that float32 holds"):
-        read_ply(ascii_ply(tmp_path / "a.ply", MINIMAL, [[0, 0, 0, 0, 0, 0, 0, scale, scale, scale]]))
-
-
-def test_a_label_that_is_no_byte_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"splat 0: label: expected a whole number 0 to 255, got 1.5"):
-        read_ply(ascii_ply(tmp_path / "a.ply", [*MINIMAL, "label"], [[0, 0, 0, 0, 0, 0, 0, -4, -4, -4, 1.5]]))
+GOOD: list[object] = [0, 0, 0, 0, 0, 0, 0, -4, -4, -4]
 
 
 @pytest.mark.parametrize(
-    ("rows", "message"),
+    ("names", "rows", "message"),
     [
-        ([[0, 0, 0, 0, 0, 0, 0, -4, -4]], "vertex 0: expected 10 numbers, got 9"),
-        ([[0, 0, 0, 0, 0, 0, 0, -4, -4, "four"]], "property scale_2: could not convert"),
+        (MINIMAL[:6], [[0] * 6], r"missing properties opacity scale_0 scale_1 scale_2 \(it has x y z f_dc_0"),
+        (MINIMAL, [GOOD, *[[*GOOD[:9], -6]] * 2], r"expected isotropic splats .* got 2 of 3 whose scales differ"),
+        (MINIMAL, [GOOD, ["nan", *GOOD[1:]]], "splat 1: x: expected a finite number, got nan"),
+        (MINIMAL, [GOOD, [*GOOD[:8], "nan", -4]], "splat 1: scale_1: expected a finite number, got nan"),
+        (MINIMAL, [[*GOOD[:7], *[-200] * 3]], "splat 0: scale_0: expected a radius that float32 holds"),
+        (MINIMAL, [[*GOOD[:7], *[200] * 3]], "splat 0: scale_0: expected a radius that float32 holds"),
+        ([*MINIMAL, "label"], [[*GOOD, 1.5]], "splat 0: label: expected a whole number 0 to 255, got 1.5"),
+        (MINIMAL, [GOOD[:9]], "vertex 0: expected 10 numbers, got 9"),
+        (MINIMAL, [[*GOOD[:9], "four"]], "property scale_2: could not convert"),
     ],
 )
-def test_ascii_data_that_is_not_numbers_is_refused(tmp_path: Path, rows: list[list[object]], message: str) -> None:
+def test_values_that_are_no_round_splats_are_refused(
+    tmp_path: Path, names: list[str], rows: list[list[object]], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
-        read_ply(ascii_ply(tmp_path / "a.ply", MINIMAL, rows))
+        read_ply(ascii_ply(tmp_path / "a.ply", names, rows))
 
 
 def test_ascii_with_a_line_missing_is_refused(tmp_path: Path) -> None:
-    path = ascii_ply(tmp_path / "a.ply", MINIMAL, [[0, 0, 0, 0, 0, 0, 0, -4, -4, -4]] * 3)
+    path = ascii_ply(tmp_path / "a.ply", MINIMAL, [GOOD] * 3)
     path.write_text(path.read_text().replace("element vertex 3", "element vertex 4"))
     with pytest.raises(InputError, match="expected 4 lines of data, got 3"):
         read_ply(path)
