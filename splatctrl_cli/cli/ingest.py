@@ -36,7 +36,7 @@ def register(subparsers: Subparsers) -> None:
     )
     add_output(parser, default="NAME.capture in this folder, NAME that of SOURCE", what="capture folder")
     parser.add_argument(
-        "--resume", action="store_true", help="go on with an interrupted run (to the same bytes) if it left one"
+        "--resume", action="store_true", help="continue an interrupted run, if there is one, to the same bytes"
     )
     add_source(parser)
 

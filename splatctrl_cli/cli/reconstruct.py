@@ -68,9 +68,7 @@ def register(subparsers: Subparsers) -> None:
     )
     add_declare(parser)
     add_disagreement(parser)
-    parser.add_argument(
-        "--resume", action="store_true", help="go on with a run that was interrupted, to the same bytes"
-    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted run, to the same bytes")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     add_config(parser)
     add_gates(parser)
@@ -87,7 +85,7 @@ def add_declare(parser: argparse.ArgumentParser) -> None:
 
 
 def add_disagreement(parser: argparse._ActionsContainer) -> None:
-    """``--max-pose-jump`` and ``--allow-disagreement``: what a log is let off with."""
+    """``--max-pose-jump`` and ``--allow-disagreement``: by how much a log may contradict itself."""
     parser.add_argument(
         "--max-pose-jump",
         type=real(1e-3, MAX_LENGTH, "m"),
@@ -96,7 +94,7 @@ def add_disagreement(parser: argparse._ActionsContainer) -> None:
         help="how far a camera may move between frames less than a second apart, in metres (default: 1)",
     )
     parser.add_argument(
-        "--allow-disagreement", action="store_true", help="go on where cameras disagree on where the surfaces are"
+        "--allow-disagreement", action="store_true", help="continue although cameras disagree about surfaces"
     )
 
 

@@ -53,7 +53,7 @@ def replay_request(args: argparse.Namespace) -> "ReplayRequest":
 
 
 def add_lockstep(parser: argparse.ArgumentParser, scene: argparse._ActionsContainer) -> None:
-    """``--lockstep`` among the choices of a scene, ``--latency``, and what reconstructing a log is let off with."""
+    """``--lockstep`` among the choices of a scene, ``--latency``, and by how much a log may contradict itself."""
     scene.add_argument(
         "--lockstep",
         action="store_true",
@@ -128,9 +128,9 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
     goal.add_argument(
         "--goal", type=pose, metavar=POSE, help="goal pose in world (default: the logged pose at the end)"
     )
-    goal.add_argument("--goal-joints", type=numbers, metavar="Q1,Q2,...", help="goal posture [rad]")
+    goal.add_argument("--goal-joints", type=numbers, metavar="Q1,Q2,...", help="goal configuration [rad]")
     goal.add_argument(
-        "--waypoints", type=Path, metavar="FILE", help="goals one after the other, poses or postures (.toml or .csv)"
+        "--waypoints", type=Path, metavar="FILE", help="goals in order, poses or configurations (.toml or .csv)"
     )
     goal.add_argument(
         "--follow",
@@ -148,7 +148,7 @@ def add_goal(parser: argparse.ArgumentParser) -> None:
         "--re-anchor",
         type=real(1e-3, MAX_SECONDS, "s"),
         metavar="S",
-        help="put the arm back into the logged posture every S seconds",
+        help="put the arm back into the logged configuration every S seconds",
     )
 
 

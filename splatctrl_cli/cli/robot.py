@@ -99,12 +99,12 @@ def _register_pairs(actions: Subparsers) -> None:
         type=whole(1, 10_000_000),
         default=2000,
         metavar="N",
-        help="without --srdf: postures sampled (default: 2000)",
+        help="without --srdf: joint configurations sampled (default: 2000)",
     )
     parser.add_argument(
         "--drop-never", action="store_true", help="leave out what never comes near in the sample (a guess, no proof)"
     )
-    parser.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of the postures (default: 0)")
+    parser.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of the sampling (default: 0)")
 
 
 def _register_info(actions: Subparsers) -> None:

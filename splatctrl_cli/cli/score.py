@@ -52,7 +52,7 @@ def register(subparsers: Subparsers) -> None:
     add(
         "--allow-other-recording",
         action="store_true",
-        help="go on where this is not the recording that made the scene",
+        help="continue although this is not the recording that made the scene",
     )
     add(
         "--images",
@@ -60,7 +60,7 @@ def register(subparsers: Subparsers) -> None:
         default="best-worst",
         help="with -o: pictures of every view, of each camera's best and worst, or of none (default: best-worst)",
     )
-    add("--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none come along")
+    add("--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none are included")
     _add_cloud(parser.add_argument_group("surface"))
     add(
         "--baseline",

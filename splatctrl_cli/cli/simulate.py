@@ -46,7 +46,7 @@ def register(subparsers: Subparsers) -> None:
         "--noise", choices=("none", "realsense"), default="realsense", help="depth noise (default: realsense)"
     )
     parser.add_argument(
-        "--person", action="store_true", help="a person with masks walks by, instead of the visitor that stands still"
+        "--person", action="store_true", help="a walking person with masks, instead of the standing cylinder"
     )
     parser.add_argument(
         "--human-arm",
@@ -56,7 +56,7 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--dtu",
         action="store_true",
-        help="write PATH/dtu and PATH/idr too: a DTU scan of a scene that stands still, in MVSNet's layout and in"
+        help="write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in"
         " IDR's, with masks of its things",
     )
 

@@ -34,7 +34,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=FX,FY,CX,CY",
-        help="lens of a camera in pixels, without distortion, instead of the recorded one (repeatable)",
+        help="intrinsics of a camera in pixels, without distortion, instead of the recorded ones (repeatable)",
     )
     group.add_argument(
         "--human-topic",

@@ -135,7 +135,7 @@ def resume_slabs(folder: Path, plan: SlabPlan) -> GridSlabs:
     differs = [key for key in wanted if left.get(key) != wanted[key]]
     if differs:
         told = ", ".join(_difference(key, left.get(key), wanted[key]) for key in differs)
-        raise UsageError(f"{folder}: cannot be gone on with: {told}", remedy="bake without --resume")
+        raise UsageError(f"{folder}: cannot be continued: {told}", remedy="bake without --resume")
     for name in plan.channels:
         path = folder / f"{name}.npy"
         size = CHANNELS[name].shape(plan.shape)

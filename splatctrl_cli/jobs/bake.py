@@ -127,7 +127,7 @@ def _tell_of_partial(request: BakeRequest, checkpoint: Path, progress: Progress)
     if request.resume and not checkpoint.is_file():
         progress.log(f"{partial}: nothing to go on from; starts at the beginning")
     elif checkpoint.is_file() and not request.resume:
-        progress.log(f"warning: {partial}: an interrupted bake is replaced; --resume would have gone on with it")
+        progress.log(f"warning: {partial}: an interrupted bake is replaced; --resume would have continued it")
 
 
 @dataclass(frozen=True, kw_only=True)

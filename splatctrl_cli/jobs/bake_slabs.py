@@ -1,4 +1,4 @@
-"""The bake itself: slab by slab onto the disk, so that it can be larger than memory, and be gone on with."""
+"""The bake itself: slab by slab onto the disk, so that it can be larger than memory, and be continued."""
 
 import shutil
 from collections.abc import Collection, Mapping

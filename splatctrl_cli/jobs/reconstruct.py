@@ -161,7 +161,7 @@ def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progr
     if request.resume and not checkpoint_file.is_file():
         progress.log(f"{partial}: has no checkpoint to go on from; starts at the beginning")
     elif checkpoint_file.is_file() and not request.resume:
-        progress.log(f"warning: {partial}: an interrupted run is replaced; --resume would have gone on with it")
+        progress.log(f"warning: {partial}: an interrupted run is replaced; --resume would have continued it")
     return request.resume and checkpoint_file.is_file()
 
 

@@ -29,7 +29,7 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 class RecordingOptions:
     """What to record: duration [s], frames per second of each camera, image size [px], depth noise, its seed.
 
-    with_person: a person with masks walks by, instead of the visitor that stands still. human_arm: one of
+    with_person: a walking person with masks, instead of the standing cylinder. human_arm: one of
     `shared_workspace.PLACES`, instead of both: the table shared with a person's arm, whose visit the seed draws.
     color_rays: 0 to 4 rays for a pixel's colour beside the one for its depth.
     """

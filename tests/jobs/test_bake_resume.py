@@ -1,4 +1,4 @@
-"""Bakes that are gone on with: whatever stops a bake, the rest of it ends in the same bytes."""
+"""Bakes that are continued: whatever stops a bake, the rest of it ends in the same bytes."""
 
 import json
 import re
@@ -197,7 +197,7 @@ def test_without_resume_an_interrupted_bake_is_replaced_with_a_warning(
     interrupted(splats, tmp_path / "field", 1)
     said = Said()
     bake(splats, tmp_path / "field", progress=said)
-    assert "an interrupted bake is replaced; --resume would have gone on with it" in said.lines[0]
+    assert "an interrupted bake is replaced; --resume would have continued it" in said.lines[0]
     assert contents(tmp_path / "field") == whole
 
 
