@@ -203,6 +203,8 @@ def _reconstruct(
         source = open_to_train(replace(scoring.recording, options=options, masks=None))
         config, seed, threads = _config(request), request.seed, request.threads
         made = run(ReconstructRequest(source=source, out=out, config=config, seed=seed, threads=threads))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt from None  # it would say to go on with --resume, which scoring has not
     except SplatCtrlError as error:
         raise InputError(f"{scan}: reconstruct ended with {error.exit_code}: {error}") from error
     if made.verdict.exit_code:

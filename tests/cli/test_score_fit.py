@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.datasets.dtu import read_dtu
 from splatctrl_cli.datasets.idr import write_idr
-from splatctrl_cli.evaluate.verdict import verdict_of
+from splatctrl_cli.evaluate.verdict import noted, verdict_of
 from splatctrl_cli.jobs import score_fit
 from splatctrl_cli.jobs.reconstruct import ReconstructResult
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult
@@ -121,3 +121,26 @@ def test_what_reconstruct_refuses_is_passed_on(
     said = capsys.readouterr().err
     assert "scan1: reconstruct ended with 4: " in said
     assert "no view 9-12" in said
+
+
+def test_an_interrupted_fit_does_not_promise_to_go_on(
+    sample_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(request: Any) -> Any:
+        raise KeyboardInterrupt("go on with the same command and --resume")
+
+    monkeypatch.setattr(score_fit, "reconstruct_gaussians", interrupted)
+    assert main(["score", "--dtu", str(sample_data / "dtu"), *QUICK, "--protocol", "holdout:0", "-q"]) == 130
+    assert capsys.readouterr().err == "splatctrl: interrupted\n"
+
+
+def test_a_fit_whose_verdict_does_not_pass_is_not_scored(
+    sample_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def damaged(request: Any) -> ReconstructResult:
+        verdict = verdict_of("reconstruct", [noted("x", "y")], scope="7 views", is_damaged=True)
+        return ReconstructResult(out=request.out, metrics={}, verdict=verdict, removed={}, seconds={})
+
+    monkeypatch.setattr(score_fit, "reconstruct_gaussians", damaged)
+    assert main(["score", "--dtu", str(sample_data / "dtu"), *QUICK, "--protocol", "holdout:0", "-q"]) == 4
+    assert "scan1: reconstruct ended with 3: reconstruct: PASSED (7 views)" in capsys.readouterr().err
