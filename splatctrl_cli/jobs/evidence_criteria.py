@@ -11,6 +11,7 @@ from splatctrl_cli.jobs.replay_judged import SLOW, Judged, counted, events_of, h
 
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
 AHEAD = 0.02  # [s] that the frames of one time step may lie apart
+BLIND = 0.09  # of the moving spheres: without a fault up to 4 of 49 came to space never seen
 UNSEEN = 0.5  # of the points about the arm: three cameras about a table leave 0.02 to 0.3
 MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a calibrated rig
 
@@ -33,6 +34,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
     elif near is not None:
         words = f"{100 * near[0]:.0f} % of the space about the arm that the motion comes to never seen"
         yield held("known space", words, near[0], UNSEEN, "", near[2])
+    yield from _blind(judged)
     yield from _unanswered(judged)
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
@@ -61,6 +63,24 @@ def known_space(judged: Judged) -> Iterator[Reason]:
         time_s=seconds_at(judged, first),
         remedy="add a camera, or give a larger --max-unknown",
         count=judged.num_states,
+    )
+
+
+def _blind(judged: Judged) -> Iterator[Reason]:
+    """Parts of the arm that come to space that nobody saw, however much is seen about the rest of it."""
+    near = nearby(judged, "blind")
+    if near is None or near[0] <= BLIND:
+        return
+    yield Reason(
+        criterion="known space",
+        outcome=Outcome.NOT_EVALUABLE,
+        sentence=f"{100 * near[0]:.0f} % of the moving spheres come to space of which a camera never saw more than a "
+        f"tenth, allowed {100 * BLIND:g} %",
+        value=near[0],
+        threshold=BLIND,
+        time_s=near[1],
+        remedy="add a camera that sees where the arm goes",
+        count=near[2],
     )
 
 

@@ -89,6 +89,7 @@ def _of_states(replay: "Replay", config: ControlConfig) -> Counts:
         "min_clearance_splats": _known(replay.between["represented"]),
         "unjudged_s": len(stamps) - 1,
         "max_unseen_share": _known(replay.near["unseen"]),
+        "max_blind_share": _known(replay.near["blind"]),
         "max_evidence_age_s": _known(replay.near["age"]),
         "unknown_share": _known(audit.unknown_share),
         "max_map_age_s": _known(np.asarray(replay.map_age_s)),

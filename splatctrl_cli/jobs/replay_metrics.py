@@ -30,7 +30,7 @@ _HEAD = (
 _TAIL = (
     *("min_clearance_true", "num_below_margin", "num_in_collision", "min_self_clearance", "min_limit_margin"),
     *("max_velocity_share", "max_acceleration_share", "min_clearance_surface", "min_clearance_between", "unjudged_s"),
-    *("min_clearance_splats", "max_unseen_share", "min_unanswered", "max_evidence_age_s"),
+    *("min_clearance_splats", "max_unseen_share", "max_blind_share", "min_unanswered", "max_evidence_age_s"),
     *("unknown_share", "num_without_distance", "num_static_violations", "max_map_age_s"),
     *("map_error_bound", "map_error_blocks", "map_error_confidence"),
 )
@@ -96,6 +96,7 @@ def metrics_of(replay: "Replay") -> Metrics:
         "min_clearance_between": least(replay.between["lower"]),
         "min_clearance_splats": least(replay.between["represented"]),
         "max_unseen_share": _largest(replay.near["unseen"]),
+        "max_blind_share": _largest(replay.near["blind"]),
         "min_unanswered": least(replay.near["unanswered"]),
         "max_evidence_age_s": _largest(replay.near["age"]),
         "unjudged_s": float(replay.between["unbounded"].sum()) + replay.lead_in_s,

@@ -195,17 +195,18 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states."""
         num = len(part.stamp_ns)
-        unseen, age, ahead, unanswered = np.full((4, num), np.nan)
+        unseen, blind, age, ahead, unanswered = np.full((5, num), np.nan)
         place = np.full((num, 3), np.nan)
         for at in self._near.due(part.stamp_ns):
             stamp = int(part.stamp_ns[at])
             known = self._scene.seen_at(stamp)
             if known is not None:
                 figures = self._near.look(stamp, part.position[at], known)
-                unseen[at], unanswered[at], place[at] = figures.unseen, figures.unanswered, figures.place
+                unseen[at], blind[at] = figures.unseen, figures.blind
+                unanswered[at], place[at] = figures.unanswered, figures.place
                 if self._scene.has_seen_times:
                     age[at], ahead[at] = figures.age, figures.ahead
-        self.near.append(unseen=unseen, age=age, ahead=ahead, unanswered=unanswered, place=place)
+        self.near.append(unseen=unseen, blind=blind, age=age, ahead=ahead, unanswered=unanswered, place=place)
 
     def _tell_represented(self, part: AuditTrace) -> None:
         """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.control.near_space import EVERY_NS, NearSpace, Seen
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
-from tests.reference.intervals import near_figures
+from tests.reference.intervals import blind_share, near_figures
 
 SECOND = 1_000_000_000
 FIRST, LATER = np.array([0.0, 0.0]), np.array([1.2, 0.6])
@@ -94,3 +94,16 @@ def test_the_nearest_place_without_an_answer_is_told_with_its_distance() -> None
     assert (found.unanswered, found.place.tolist()) == (pytest.approx(want), place.tolist())
     nothing = NearSpace(arm, 0.03).look(0, LATER, Seen(last_ns=half_seen, unanswered=far[None]))
     assert nothing.unanswered == np.inf and np.isnan(nothing.place).all()
+
+
+def test_the_share_of_blind_spheres_is_that_of_the_reference() -> None:
+    arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
+    space.look(0, FIRST, Seen(last_ns=half_seen))
+    for height in (-1.0, 0.02, 0.5):
+
+        def seen_above(points: Float64, height: float = height) -> NDArray[np.int64]:
+            return np.where(points[:, 2] > height, 0, -1)
+
+        found = space.look(SECOND, LATER, Seen(last_ns=seen_above)).blind
+        assert found == pytest.approx(blind_share(arm, LATER, FIRST, 0.03, seen_above))
+    assert found == 1.0

@@ -16,7 +16,7 @@ from splatctrl_cli.jobs.motion_criteria import controller, surface_clearance
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)
-NOTHING_NEAR = dict.fromkeys(("unseen", "age", "ahead", "unanswered"), UNKNOWN)
+NOTHING_NEAR = dict.fromkeys(("unseen", "blind", "age", "ahead", "unanswered"), UNKNOWN)
 
 
 def judged(**replay: Any) -> Any:

@@ -1,6 +1,6 @@
 """Float64 references of what the verdict takes from motions: one formula, one plain loop each."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,23 +45,44 @@ def near_figures(
     """Share of the points on the shells in new space that were never seen, the age [s] within which three quarters of
     the seen ones were seen, and how many points there are.
     """
-    steps = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
     never, ages, num = [], [], 0
+    for _, point in _shells(arm, q, margin):
+        num += 1
+        last = int(last_seen(point[None])[0])
+        if min(_gaps(arm, q_first, point)) > 0.05:
+            never.append(last < 0)
+        if last >= 0:
+            ages.append((now_ns - last) * 1e-9)
+    return float(np.mean(never)), float(np.quantile(ages, 0.75)), num
+
+
+def blind_share(
+    arm: ArmModel,
+    q: Float64,
+    q_first: Float64,
+    margin: float,
+    last_seen: Callable[[Float64], NDArray[np.int64]],
+) -> float:
+    """Share of the moving spheres with at least five points on their shell in new space, 90 % of them never seen."""
+    moving = np.flatnonzero(arm.moving_spheres).tolist()
+    never: dict[int, list[bool]] = {s: [] for s in moving}
+    for s, point in _shells(arm, q, margin):
+        if min(_gaps(arm, q_first, point)) > 0.05:
+            never[s].append(int(last_seen(point[None])[0]) < 0)
+    return sum(len(found) >= 5 and np.mean(found) >= 0.9 for found in never.values()) / len(moving)
+
+
+def _shells(arm: ArmModel, q: Float64, margin: float) -> Iterator[tuple[int, Float64]]:
+    """Points of the moving spheres' shells outside of all other spheres, and whose they are."""
+    steps = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
     for s in np.flatnonzero(arm.moving_spheres):
         for step in steps:
             away = np.array(step) / np.linalg.norm(step)
             point = arm.sphere_centers(q)[s] + (arm.sphere_set.radii[s] + margin) * away
             others = _gaps(arm, q, point)
             others[s] = np.inf
-            if min(others) <= 0.01:
-                continue
-            num += 1
-            last = int(last_seen(point[None])[0])
-            if min(_gaps(arm, q_first, point)) > 0.05:
-                never.append(last < 0)
-            if last >= 0:
-                ages.append((now_ns - last) * 1e-9)
-    return float(np.mean(never)), float(np.quantile(ages, 0.75)), num
+            if min(others) > 0.01:
+                yield int(s), point
 
 
 def _gaps(arm: ArmModel, q: Float64, point: Float64) -> list[float]:
