@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.records import Bool, Float64
@@ -103,8 +104,9 @@ class NearSpace:
         points = points[np.all((points > moving.min(axis=0) - reach) & (points < moving.max(axis=0) + reach), axis=1)]
         if not len(points):
             return np.inf, np.full(3, np.nan)
-        distance = np.min(np.linalg.norm(points[:, None] - moving, axis=2) - radii, axis=1)
-        return float(distance.min()), points[distance.argmin()]
+        away, nearest = (np.asarray(found) for found in cKDTree(points).query(moving))
+        sphere = int(np.argmin(away - radii))
+        return float(away[sphere] - radii[sphere]), points[nearest[sphere]]
 
 
 def _is_outside(points: Float64, centers: Float64, radii: Float64, owners: NDArray[np.integer] | None = None) -> Bool:

@@ -18,23 +18,24 @@ MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
     """Space that no camera ever saw: where the arm's spheres are, and about them where the motion newly comes."""
-    near = nearby(judged, "unseen")
-    if near is not None and near[0] > UNSEEN:
-        yield Reason(
-            criterion="known space",
-            outcome=Outcome.NOT_EVALUABLE,
-            sentence=f"{100 * near[0]:.0f} % of the space about the arm that the motion comes to was never seen by a "
-            f"camera, allowed {100 * UNSEEN:g} %",
-            value=near[0],
-            threshold=UNSEEN,
-            time_s=near[1],
-            remedy="add a camera that sees where the arm goes",
-            count=near[2],
-        )
-    elif near is not None:
-        words = f"{100 * near[0]:.0f} % of the space about the arm that the motion comes to never seen"
-        yield held("known space", words, near[0], UNSEEN, "", near[2])
-    yield from _blind(judged)
+    for column, allowed, words in (
+        ("unseen", UNSEEN, "of the space about the arm that the motion comes to was never seen by a camera"),
+        ("blind", BLIND, "of the moving spheres come to space of which a camera never saw more than a tenth"),
+    ):
+        near = nearby(judged, column)
+        if near is not None and near[0] > allowed:
+            yield Reason(
+                criterion="known space",
+                outcome=Outcome.NOT_EVALUABLE,
+                sentence=f"{100 * near[0]:.0f} % {words}, allowed {100 * allowed:g} %",
+                value=near[0],
+                threshold=allowed,
+                time_s=near[1],
+                remedy="add a camera that sees where the arm goes",
+                count=near[2],
+            )
+        elif near is not None:
+            yield held("known space", f"{100 * near[0]:.0f} % {words}", near[0], allowed, "", near[2])
     yield from _unanswered(judged)
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
@@ -63,24 +64,6 @@ def known_space(judged: Judged) -> Iterator[Reason]:
         time_s=seconds_at(judged, first),
         remedy="add a camera, or give a larger --max-unknown",
         count=judged.num_states,
-    )
-
-
-def _blind(judged: Judged) -> Iterator[Reason]:
-    """Parts of the arm that come to space that nobody saw, however much is seen about the rest of it."""
-    near = nearby(judged, "blind")
-    if near is None or near[0] <= BLIND:
-        return
-    yield Reason(
-        criterion="known space",
-        outcome=Outcome.NOT_EVALUABLE,
-        sentence=f"{100 * near[0]:.0f} % of the moving spheres come to space of which a camera never saw more than a "
-        f"tenth, allowed {100 * BLIND:g} %",
-        value=near[0],
-        threshold=BLIND,
-        time_s=near[1],
-        remedy="add a camera that sees where the arm goes",
-        count=near[2],
     )
 
 

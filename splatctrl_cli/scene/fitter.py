@@ -125,7 +125,8 @@ class SceneFitter:
             self.background = self._behind(views)
         self.people.take_in(self.occupancy, frames)
         for frame, mask in seen:
-            self.occupancy.mark_unanswered(unanswered_points(frame, mask.robot_depth, self.occupancy.config))
+            for points in unanswered_points(frame, mask.robot_depth, self.occupancy.config):
+                self.occupancy.mark_unanswered(points)
         self._carry(robot)
         if robot is not None:
             pixels = [(f, m.kinds == PixelKind.ROBOT, m.kinds == PixelKind.OBJECT) for f, m in seen]

@@ -5,6 +5,8 @@ before what is seen beside it. Other cameras and later images that see through t
 where the thing may be.
 """
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 
@@ -14,9 +16,11 @@ from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
 NARROW = 2.0  # voxels: holes that are not wider are common beside edges
 
+MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundred million
 
-def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Float64:
-    """Points (K, 3) [m], world, on the rays of a frame's holes, half a voxel [m] apart along each.
+
+def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
+    """Points (K, 3) [m], world, on the rays of a frame's holes, half a voxel [m] apart along each; some at a time.
 
     From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
     holes up to `NARROW` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none; a gap
@@ -24,7 +28,7 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     """
     blank = _holes(frame, robot_depth)
     if not blank.any():
-        return np.empty((0, 3))
+        return
     voxel = config.voxel
     behind = _nearest_depth(frame.depth)
     width = voxel * frame.intrinsics.fx / float(np.median(behind[blank]))  # pixels
@@ -34,9 +38,10 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     v, u = v * apart, u * apart
     depths = np.arange(config.min_range, behind[v, u].max(initial=config.min_range), 0.5 * voxel)
     rays = back_project_pixels(frame.intrinsics, u, v, np.ones(len(u)))
-    is_before = depths < behind[v, u][:, None]
-    points = (rays[:, None] * depths[:, None])[is_before]
-    return transform_points(frame.T_world_camera, points)
+    num = max(MOST_POINTS // max(len(depths), 1), 1)  # rays at a time
+    for some in (slice(first, first + num) for first in range(0, len(u), num)):
+        is_before = depths < behind[v[some], u[some]][:, None]
+        yield transform_points(frame.T_world_camera, (rays[some, None] * depths[:, None])[is_before])
 
 
 def _holes(frame: RgbdFrame, robot_depth: Float32) -> Bool:

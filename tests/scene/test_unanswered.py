@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.records import UNANSWERED, Bool, Float32, RgbdFrame
+from splatctrl_cli.records import UNANSWERED, Bool, Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.unanswered import unanswered_points
@@ -31,16 +31,20 @@ def dark_block(x: float) -> RgbdFrame:
     return seen
 
 
+def points_of(seen: RgbdFrame, robot: Float32 = NOBODY) -> Float64:
+    return np.concatenate([np.empty((0, 3)), *unanswered_points(seen, robot, CONFIG)])
+
+
 def unanswered(*frames: RgbdFrame) -> OccupancyMap:
     grid = OccupancyMap(WORKSPACE, CONFIG, 1)
     grid.take_in(frames)
     for seen in frames:
-        grid.mark_unanswered(unanswered_points(seen, NOBODY, CONFIG))
+        grid.mark_unanswered(points_of(seen))
     return grid
 
 
 def test_points_lie_on_the_rays_of_the_hole_and_before_the_floor() -> None:
-    points = unanswered_points(dark(), NOBODY, CONFIG)
+    points = points_of(dark())
     depth = HEIGHT - points[:, 2]
     u = INTRINSICS.fx * points[:, 0] / depth + INTRINSICS.cx
     v = -INTRINSICS.fy * points[:, 1] / depth + INTRINSICS.cy
@@ -48,6 +52,14 @@ def test_points_lie_on_the_rays_of_the_hole_and_before_the_floor() -> None:
     assert depth.min() == pytest.approx(CONFIG.min_range) and HEIGHT - CONFIG.voxel < depth.max() < HEIGHT
     rays = np.unique(np.round([u, v], 3), axis=1)
     assert rays.shape[1] == 20 * 20  # a pixel is 12.5 mm, less than a voxel
+
+
+def test_a_large_hole_is_taken_a_piece_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = points_of(dark())
+    monkeypatch.setattr("splatctrl_cli.scene.unanswered.MOST_POINTS", 1000)
+    pieces = list(unanswered_points(dark(), NOBODY, CONFIG))
+    assert len(pieces) > 10 and max(map(len, pieces)) <= 1000
+    assert np.concatenate(pieces).tolist() == whole.tolist()
 
 
 def robot_beside() -> Float32:
@@ -71,7 +83,7 @@ def unseen_by_the_lens() -> Bool:
     ],
 )
 def test_other_gaps_are_no_holes(seen: RgbdFrame, robot: Float32) -> None:
-    assert not len(unanswered_points(seen, robot, CONFIG))
+    assert not len(points_of(seen, robot))
 
 
 def test_a_dark_block_is_where_all_cameras_look_in_vain() -> None:
@@ -92,7 +104,7 @@ def test_what_a_later_image_sees_is_answered() -> None:
     assert (grid.last_seen == UNANSWERED).any()
     grid.take_in([frame()])
     assert not (grid.last_seen == UNANSWERED).any()
-    grid.mark_unanswered(unanswered_points(dark(), NOBODY, CONFIG))
+    grid.mark_unanswered(points_of(dark()))
     assert not (grid.last_seen == UNANSWERED).any()  # what was seen once has an age instead
 
 

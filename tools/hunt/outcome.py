@@ -1,6 +1,7 @@
 """The tool's word on a run."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.evaluate.verdict import Outcome, Verdict
@@ -26,6 +27,7 @@ def word_of(verdict: Verdict) -> Word:
     return Word(word="safe" if verdict.outcome is Outcome.PASSED else "not evaluable", reason=reason)
 
 
-def refused(error: SplatCtrlError) -> Word:
-    """What a refusal says."""
-    return Word(word="refused", reason=f"{type(error).__name__}: {error.message}"[:LONGEST])
+def refused(error: SplatCtrlError, folder: Path) -> Word:
+    """What a refusal says, without the scratch folder of the run."""
+    message = error.message.replace(f"{folder}/", "")
+    return Word(word="refused", reason=f"{type(error).__name__}: {message}"[:LONGEST])

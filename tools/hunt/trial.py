@@ -226,7 +226,7 @@ def _judged(trial: Trial, folder: Path) -> tuple[Word, ReplayResult | None]:
             result = replay(request)
         return word_of(result.verdict), result
     except SplatCtrlError as error:
-        return refused(error), None
+        return refused(error, folder), None
 
 
 def _true_clearance(trial: Trial, arm: TrueArm, result: ReplayResult | None) -> float:
