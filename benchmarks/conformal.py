@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.random_tabletop import random_things
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.evaluate.conformal import FEWEST, autocorrelation_time, conformal_rank, stretch_scores, stretches
@@ -37,11 +38,9 @@ from splatctrl_cli.records import Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.random_tabletop import random_things
 from splatctrl_cli.simulate.recording import NOISES, START_NS, Recording, RecordingOptions
-from splatctrl_cli.simulate.tabletop import WAYPOINTS
+from splatctrl_cli.simulate.tabletop import WAYPOINTS, Motion
 from splatctrl_cli.simulate.truth import distance_to
 
 EVIDENCE = "cam3"

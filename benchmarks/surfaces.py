@@ -12,8 +12,7 @@ from splatctrl_cli.evaluate.surface_samples import SurfaceSamples, inscribed_rad
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Box, Float64
-from splatctrl_cli.simulate.primitives import Primitive, closest_point, normals
-from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture, closest_point, normals
 from splatctrl_cli.simulate.truth import distance_to
 
 MESHES = (

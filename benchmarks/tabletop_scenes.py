@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.random_tabletop import random_things
 from benchmarks.scenes import sample_robot
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import pair_distance
@@ -15,10 +16,8 @@ from splatctrl_cli.evaluate.visibility import seen_by
 from splatctrl_cli.records import Box, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import posture_of
-from splatctrl_cli.simulate.noise import DepthNoise
 from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.random_tabletop import random_things
-from splatctrl_cli.simulate.render import Renderer
+from splatctrl_cli.simulate.render import DepthNoise, Renderer
 from splatctrl_cli.simulate.tabletop import arm_solids, cameras, furniture
 from splatctrl_cli.simulate.truth import distance_to
 

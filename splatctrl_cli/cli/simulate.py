@@ -13,11 +13,11 @@ from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.primitives import luminance_std
 from splatctrl_cli.simulate.recording import Recording, RecordingOptions
 from splatctrl_cli.simulate.shared_workspace import DURATION_S
-from splatctrl_cli.simulate.textures import luminance_std
+from splatctrl_cli.simulate.tabletop import object_mask, turntable_views
 from splatctrl_cli.simulate.truth import Truth, truth_document
-from splatctrl_cli.simulate.turntable import object_mask, views
 
 
 def register(subparsers: Subparsers) -> None:
@@ -148,7 +148,7 @@ def _write_scan(folder: Path) -> None:
             T_world_camera=frame.T_world_camera,
             mask=object_mask(frame),
         )
-        for frame in views()
+        for frame in turntable_views()
     ]
     write_dtu(folder / "dtu", "scan1", scan)
     write_idr(folder / "idr", "scan1", scan)

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.arrays import DAMAGE, Pieces, has_arrays, read_arrays, savez
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.grid_channels import check_grid, header_text, slabs
-from splatctrl_cli.grid_files.grid_format import GridFormat, header_facts
+from splatctrl_cli.grid_files.grid_format import GridFormat, check_grid, header_facts, header_text, slabs
 from splatctrl_cli.records import DistanceGrid, Float64
 
 CuroboVersion = Literal["0.7", "0.8"]

@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, check_numbers, has_arrays, npy_head, savez
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.grid_channels import (
+from splatctrl_cli.grid_files.grid_format import (
+    GridFormat,
     GridHead,
     check_finite,
     check_grid,
     check_layout,
     header_text,
     parse_header,
+    summary_of,
 )
-from splatctrl_cli.grid_files.grid_format import GridFormat, summary_of
 from splatctrl_cli.records import DistanceGrid
 
 PLACE: Mapping[str, tuple[str, tuple[int, ...]]] = {"origin": ("<f8", (3,)), "voxel": ("<f8", ())}

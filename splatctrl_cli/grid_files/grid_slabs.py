@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import write_durably, write_json
-from splatctrl_cli.grid_files.grid_channels import CHANNELS, Shape
+from splatctrl_cli.grid_files.grid_format import CHANNELS, Shape
 from splatctrl_cli.records import DistanceGrid
 
 PROGRESS = "progress.json"

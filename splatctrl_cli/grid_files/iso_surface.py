@@ -13,8 +13,7 @@ from skimage.measure import marching_cubes
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.grid_channels import CHUNK, check_grid
-from splatctrl_cli.grid_files.grid_format import GridFormat
+from splatctrl_cli.grid_files.grid_format import CHUNK, GridFormat, check_grid
 from splatctrl_cli.records import DistanceGrid, Float32, Float64
 
 SUFFIXES = (".ply", ".obj", ".stl")

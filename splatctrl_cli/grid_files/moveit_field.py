@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.grid_channels import CHUNK, check_grid
-from splatctrl_cli.grid_files.grid_format import GridFormat, covers
+from splatctrl_cli.grid_files.grid_format import CHUNK, GridFormat, check_grid, covers
 from splatctrl_cli.records import Bool, DistanceGrid
 
 FIELDS = ("resolution", "size_x", "size_y", "size_z", "origin_x", "origin_y", "origin_z")

@@ -11,8 +11,15 @@ from pathlib import Path
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.grid_channels import CHANNELS, check_grid, file_header, x_fastest
-from splatctrl_cli.grid_files.grid_format import GridFormat, header_facts, json_value
+from splatctrl_cli.grid_files.grid_format import (
+    CHANNELS,
+    GridFormat,
+    check_grid,
+    file_header,
+    header_facts,
+    json_value,
+    x_fastest,
+)
 from splatctrl_cli.records import DistanceGrid
 
 PREFIX = "splatctrl."

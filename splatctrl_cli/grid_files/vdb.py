@@ -17,8 +17,16 @@ import numpy as np
 from splatctrl_cli import __version__
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.grid_files.grid_channels import CHANNELS, FORMAT, check_grid, file_header, slabs
-from splatctrl_cli.grid_files.grid_format import GridFormat, header_facts, json_value
+from splatctrl_cli.grid_files.grid_format import (
+    CHANNELS,
+    FORMAT,
+    GridFormat,
+    check_grid,
+    file_header,
+    header_facts,
+    json_value,
+    slabs,
+)
 from splatctrl_cli.records import DistanceGrid
 
 MAGIC = b" BDV\0\0\0\0"

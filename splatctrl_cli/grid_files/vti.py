@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.summary import Grid, Summary
-from splatctrl_cli.grid_files.grid_channels import (
+from splatctrl_cli.grid_files.grid_format import (
     CHANNELS,
     FORMAT,
+    GridFormat,
     GridHead,
     check_finite,
     check_grid,
@@ -28,9 +29,9 @@ from splatctrl_cli.grid_files.grid_channels import (
     from_x_fastest,
     header_text,
     parse_header,
+    summary_of,
     x_fastest,
 )
-from splatctrl_cli.grid_files.grid_format import GridFormat, summary_of
 from splatctrl_cli.records import DistanceGrid
 
 _TYPES = {"<f4": "Float32", "|u1": "UInt8"}

@@ -16,11 +16,9 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
-from splatctrl_cli.splat_files.isotropic import as_gaussians, as_splats, nearest_splats
-from splatctrl_cli.splat_files.splat_differences import Differences, differences
+from splatctrl_cli.splat_files.splat_format import Differences, differences, refuse
 from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, SplatFormat, format_of, read_splats
-from splatctrl_cli.splat_files.splat_values import refuse
-from splatctrl_cli.splat_files.splats import read_ply, write_ply
+from splatctrl_cli.splat_files.splats import as_gaussians, as_splats, nearest_splats, read_ply, write_ply
 
 LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
 MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measured: 107 and more, or the same

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
-from splatctrl_cli.records import UNANSWERED, Balls, KnownVoxels, OccupancyGrid, SeenVoxels, UInt8, VoxelState
+from splatctrl_cli.records import UNANSWERED, Balls, KnownVoxels, Label, OccupancyGrid, SeenVoxels, UInt8, VoxelState
 
 MOST_VOXELS = 400_000_000  # as many as reconstruct makes
 _HEADER = 1 << 22  # bytes
 _SHORT = 0xFF  # `UNANSWERED` in one byte
 _GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
 _EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
-
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -217,3 +217,21 @@ def _voxels(values: NDArray[Any], name: str, kind: type[np.generic], header: Map
     if (values.dtype, values.shape) != wanted or len(values.shape) != 3:
         raise ValueError(f"{name}: expected {wanted[0]} {wanted[1]}, got {values.dtype} {values.shape}")
     return values
+
+
+def known_space(grid: OccupancyGrid, thresholds: OccupancyConfig) -> dict[str, object]:
+    """The size of a grid [m], the share of its voxels in each `VoxelState`, and how many the robot and people are in.
+
+    Names are those of the states, in lower case, as the other commands and files have them.
+    """
+    states = grid.states(thresholds.free_below, thresholds.occupied_above)
+    counts = np.bincount(states.ravel(), minlength=len(VoxelState))
+    shares = {state.name.lower(): round(float(counts[state] / states.size), 6) for state in VoxelState}
+    return {
+        "extent_m": [round(grid.voxel * count, 6) for count in states.shape],
+        "free_below": thresholds.free_below,
+        "occupied_above": thresholds.occupied_above,
+        "share": shares,
+        "robot_voxels": int(np.count_nonzero(grid.entity & Label.ROBOT)),
+        "human_voxels": int(np.count_nonzero(grid.entity & Label.HUMAN)),
+    }

@@ -12,10 +12,8 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.records import Float64
-from splatctrl_cli.simulate.motion import Motion
-from splatctrl_cli.simulate.primitives import Primitive, Track
-from splatctrl_cli.simulate.tabletop import PALETTE
-from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture, Track
+from splatctrl_cli.simulate.tabletop import PALETTE, Motion
 
 PLACES = ("near-pickup", "near-goal")
 

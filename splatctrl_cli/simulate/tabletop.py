@@ -1,19 +1,19 @@
 """The scene: a textured table with things on it, an arm behind them, fixed cameras about it.
 
-World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward.
+World frame: z up, the table's top at z = 0, the arm's base at the origin, x forward. Views of the
+things from a turntable are in the manner of a DTU scan.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.robot.urdf import Shape
-from splatctrl_cli.simulate.motion import Motion
-from splatctrl_cli.simulate.primitives import ALWAYS, Primitive
-from splatctrl_cli.simulate.render import Camera
-from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture
+from splatctrl_cli.simulate.render import Camera, Renderer
 
 PALETTE = {
     "wood": ((0.16, 0.09, 0.05), (0.98, 0.86, 0.66)),
@@ -32,6 +32,29 @@ WAYPOINTS = (
     (-0.10, 0.10, 0.00, -2.00, 0.00, 2.10, 0.69),
     (0.80, 0.30, 0.00, -2.00, 0.00, 2.30, 1.57),
 )
+
+NUM_VIEWS = 8
+VIEW_SIZE = (256, 208)  # width, height [px]
+LEAST_DEPTH = 1e-4  # [m] by which a thing stands before the furniture
+MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Waypoints (W, J) [rad], reached at rest at times (W,) [s], joined by minimum-jerk segments."""
+
+    times: Float64
+    waypoints: Float64
+
+    def at(self, time: float) -> tuple[Float64, Float64]:
+        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest before the first and after the last waypoint."""
+        time = float(np.clip(time, self.times[0], self.times[-1]))
+        index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
+        span = self.times[index + 1] - self.times[index]
+        s = (time - self.times[index]) / span
+        step = self.waypoints[index + 1] - self.waypoints[index]
+        position = self.waypoints[index] + step * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        return position, step * (30 * s**2 - 60 * s**3 + 30 * s**4) / span
 
 
 def furniture() -> list[Primitive]:
@@ -169,3 +192,42 @@ def _cylinder(
 
 def _sphere(name: str, radius: float, position: Sequence[float], texture: Texture) -> Primitive:
     return Primitive(name=name, kind="sphere", size=(radius,), T_world_shape=_placed(position), texture=texture)
+
+
+def turntable_views() -> Iterator[RgbdFrame]:
+    """Exact views of the tabletop's things from an arc of 70 degrees at two heights; the stamp is the number."""
+    width, height = VIEW_SIZE
+    intrinsics = Intrinsics(
+        fx=1.15 * width,
+        fy=1.15 * width,
+        cx=(width - 1) / 2 + 2.4,
+        cy=(height - 1) / 2 + 1.7,
+        width=width,
+        height=height,
+    )
+    scene = furniture() + things()
+    for number in range(NUM_VIEWS):
+        angle = np.deg2rad(-90.0 + 70.0 * number / (NUM_VIEWS - 1))
+        height_above = 0.52 if number % 2 == 0 else 0.68
+        eye = np.array(MIDDLE) + np.array([0.80 * np.cos(angle), 0.80 * np.sin(angle), height_above])
+        camera = Camera(
+            name=f"view{number}", intrinsics=intrinsics, T_world_camera=look_at(eye, MIDDLE), is_training=True
+        )
+        color, depth = Renderer(camera, scene).image([])
+        yield RgbdFrame(
+            stamp_ns=number,
+            camera=camera.name,
+            color=color,
+            depth=depth,
+            intrinsics=intrinsics,
+            T_world_camera=camera.T_world_camera,
+        )
+
+
+def object_mask(frame: RgbdFrame) -> Bool:
+    """(H, W) True where a view shows one of the things, not the furniture."""
+    camera = Camera(
+        name=frame.camera, intrinsics=frame.intrinsics, T_world_camera=frame.T_world_camera, is_training=True
+    )
+    behind = Renderer(camera, furniture(), color_rays=0).depth([])
+    return np.asarray((frame.depth > 0) & ((behind == 0) | (frame.depth < behind - LEAST_DEPTH)))

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64, Intrinsics
-from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Track, closest_point
+from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track, closest_point
 from splatctrl_cli.simulate.render import Camera
-from splatctrl_cli.simulate.textures import Texture
 
 FORMAT = "splatctrl-truth"
 VERSIONS = (1, 2)  # 2 has capsules and solids that move; a file is of the first that can hold it

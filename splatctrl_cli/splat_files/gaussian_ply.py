@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.ply import PlyFile, check_properties, read_table, write_table
 from splatctrl_cli.records import Float32, GaussianSet, Label, UInt8
-from splatctrl_cli.splat_files.splat_format import SplatFormat, without_labels
-from splatctrl_cli.splat_files.splat_values import (
+from splatctrl_cli.splat_files.splat_format import (
+    SplatFormat,
     check_finite,
     logit,
     refuse,
     sigma_of_log,
     sigmoid,
     unit_quaternions,
+    without_labels,
 )
 
 REST = tuple(f"f_rest_{index}" for index in range(45))

@@ -13,9 +13,14 @@ import numpy as np
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import GaussianSet
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
-from splatctrl_cli.splat_files.splat_differences import Differences
-from splatctrl_cli.splat_files.splat_format import SplatFormat, without_labels
-from splatctrl_cli.splat_files.splat_values import SH_C0, check_finite, unit_quaternions
+from splatctrl_cli.splat_files.splat_format import (
+    SH_C0,
+    Differences,
+    SplatFormat,
+    check_finite,
+    unit_quaternions,
+    without_labels,
+)
 
 ROW = np.dtype([("center", "<f4", 3), ("sigma", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 

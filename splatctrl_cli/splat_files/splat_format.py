@@ -1,15 +1,127 @@
-"""What a format of splat files declares: how it is written and read, and how exact it is."""
+"""What a format of splat files declares: how it is written and read, how it holds values, and how exact it is."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from splatctrl_cli.records import GaussianSet
-from splatctrl_cli.splat_files.splat_differences import Differences, float32_bound
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Bool, Float32, Float64, GaussianSet
 
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+UNIT_TOLERANCE = 5e-7  # of a quaternion's length; float32 can do no better
+LOGIT_OF_ONE = 20.0  # finite, and its sigmoid is exactly 1 in float32
+LOGIT_OF_ZERO = -110.0  # finite, and its sigmoid is exactly 0 in float32
 Comments = dict[str, str]
+
+
+def logit(opacities: Float32) -> Float64:
+    """log(p / (1 - p)) of (N,) opacities in [0, 1]; exactly 0 and 1 get finite values whose `sigmoid` they are."""
+    inside = (opacities > 0) & (opacities < 1)
+    p = np.where(inside, opacities, 0.5).astype(np.float64)
+    return np.where(inside, np.log(p) - np.log1p(-p), np.where(opacities > 0.5, LOGIT_OF_ONE, LOGIT_OF_ZERO))
+
+
+def sigmoid(logits: Float64) -> Float32:
+    """1 / (1 + exp(-x)) of (N,) logits."""
+    decay = np.exp(-np.minimum(np.abs(logits), 700.0))
+    return np.asarray(np.where(logits >= 0, 1.0, decay) / (1.0 + decay), dtype=np.float32)
+
+
+def sigma_of_log(where: str, name: str, logs: Float64) -> Float32:
+    """exp(x) as float32 [m]; raises InputError, naming the splat, where that is infinite or zero."""
+    values = np.exp(np.clip(logs, -700.0, 700.0))
+    limits = np.finfo(np.float32)
+    refuse(where, name, values, (values > limits.max) | (values < limits.tiny), "a radius that float32 holds [m]")
+    return values.astype(np.float32)
+
+
+def unit_quaternions(where: str, quats: NDArray[np.floating]) -> Float32:
+    """(N, 4) quaternions scaled to length one, to the bit where they have it; InputError for one of no length."""
+    wide = quats.astype(np.float64)
+    lengths = np.linalg.norm(wide, axis=1, keepdims=True)
+    refuse(where, "rotation", quats, np.asarray(~(lengths[:, 0] > 1e-12)), "a quaternion that is not zero")
+    return np.where(np.abs(lengths - 1.0) <= UNIT_TOLERANCE, wide, wide / lengths).astype(np.float32)
+
+
+def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: str) -> None:
+    """Raise InputError that names the first splat where `is_bad` (N,)."""
+    bad = np.flatnonzero(is_bad)
+    if len(bad):
+        value = values[bad[0]]
+        shown = f"{value:g}" if value.ndim == 0 else str(value)
+        raise InputError(f"{where}: splat {bad[0]}: {name}: expected {expected}, got {shown}")
+
+
+def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> None:
+    """Raise InputError at the first value that is not finite, or an array that has not `num` rows."""
+    for name, values in groups.items():
+        if len(values) != num:
+            raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")
+        is_finite = np.isfinite(values.reshape(num, -1 if num else 1)).all(axis=1)
+        refuse(where, name, values, ~is_finite, "finite")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Differences:
+    """Largest difference of any Gaussian, or the largest that a format may cause.
+
+    center [m]; sigma, relative; rotation [deg]; color and opacity, of 0 to 1; harmonics, coefficients above degree 0.
+    """
+
+    center: float
+    sigma: float
+    rotation: float
+    color: float
+    opacity: float
+    harmonics: float
+
+    def beyond(self, bound: "Differences") -> list[str]:
+        """The names of what exceeds `bound`, each with its value and the bound."""
+        limits = asdict(bound)
+        pairs = ((name, value, limits[name]) for name, value in asdict(self).items())
+        return [f"{name} {value:.3g} (at most {limit:.3g})" for name, value, limit in pairs if not value <= limit]
+
+
+def float32_bound(gaussians: GaussianSet) -> Differences:
+    """What a format of float32 values may cause: centres as they are, one rounding of everything else.
+
+    A sigma's logarithm is at most 88 in size, so half a unit of its last place is 88 * 2^-24 = 5e-6 of the sigma.
+    """
+    largest_color = float(np.abs(gaussians.harmonics[:, 0]).max(initial=1.0))
+    return Differences(center=0.0, sigma=6e-6, rotation=1e-4, color=1e-6 * largest_color, opacity=1e-6, harmonics=0.0)
+
+
+def differences(a: GaussianSet, b: GaussianSet) -> Differences:
+    """The largest differences between two sets of the same Gaussians in the same order."""
+    return Differences(
+        center=_largest(a.centers.astype(np.float64) - b.centers),
+        sigma=_largest(b.scales / a.scales.astype(np.float64) - 1.0),
+        rotation=_largest(_angles(a.quats_wxyz, b.quats_wxyz)),
+        color=SH_C0 * _largest(a.harmonics[:, 0].astype(np.float64) - b.harmonics[:, 0]),
+        opacity=_largest(a.opacities.astype(np.float64) - b.opacities),
+        harmonics=_largest(_padded(a.harmonics)[:, 1:] - _padded(b.harmonics)[:, 1:]),
+    )
+
+
+def _largest(values: Float64) -> float:
+    return float(np.abs(values).max(initial=0.0))
+
+
+def _padded(harmonics: Float32) -> Float64:
+    padded = np.zeros((len(harmonics), 16, 3))
+    padded[:, : harmonics.shape[1]] = harmonics
+    return padded
+
+
+def _angles(a: Float32, b: Float32) -> Float64:
+    """Angle [deg] between rotations of unit quaternions; a chord keeps its digits where a cosine has none."""
+    one, two = a.astype(np.float64), b.astype(np.float64)
+    chord = np.minimum(np.linalg.norm(one - two, axis=1), np.linalg.norm(one + two, axis=1))
+    return np.asarray(np.degrees(4.0 * np.arcsin(np.minimum(chord / 2.0, 1.0))))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float32, Float64, GaussianSet, UInt8
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
-from splatctrl_cli.splat_files.splat_differences import Differences
-from splatctrl_cli.splat_files.splat_format import SplatFormat, without_labels
-from splatctrl_cli.splat_files.splat_values import SH_C0
+from splatctrl_cli.splat_files.splat_format import SH_C0, Differences, SplatFormat, without_labels
 
 MAGIC = 0x5053474E  # NGSP
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, number, degree, fraction bits, flags, reserved

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Float32, GaussianSet, Label
 from splatctrl_cli.splat_files.gaussian_ply import check_gaussians
-from splatctrl_cli.splat_files.splat_format import SplatFormat
-from splatctrl_cli.splat_files.splat_values import unit_quaternions
+from splatctrl_cli.splat_files.splat_format import SplatFormat, unit_quaternions
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"

@@ -4,8 +4,7 @@ import pytest
 from splatctrl_cli.control.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.simulate.primitives import Primitive, signed_distance
-from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture, signed_distance
 
 
 def placed(seed: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from splatctrl_cli.grid_files.grid_channels import CHANNELS, FORMAT, VERSION
+from splatctrl_cli.grid_files.grid_format import CHANNELS, FORMAT, VERSION
 from splatctrl_cli.records import DistanceGrid, Float64
 
 SHAPE = (5, 4, 11)  # no two alike, none a multiple of eight

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.grid_files import grid_channels
+from splatctrl_cli.grid_files import grid_format
 from splatctrl_cli.grid_files.nrrd import PREFIX, read_nrrd_head, write_nrrd
 from tests.grid_files.make_grid import random_grid, with_unknown
 
@@ -39,6 +39,6 @@ def test_the_head_is_read_by_itself(tmp_path: Path) -> None:
 
 def test_same_grid_same_bytes_whatever_the_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, chunk in (("a", 1), ("b", 1 << 24)):
-        monkeypatch.setattr(grid_channels, "CHUNK", chunk)
+        monkeypatch.setattr(grid_format, "CHUNK", chunk)
         write_nrrd(tmp_path / name, random_grid(), "gradient")
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()

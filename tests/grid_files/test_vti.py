@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.grid_files import grid_channels
+from splatctrl_cli.grid_files import grid_format
 from splatctrl_cli.grid_files.vti import read_vti, read_vti_head, write_vti
 from tests.grid_files.make_grid import SHAPE, random_grid, with_unknown
 
@@ -33,15 +33,15 @@ def test_vtk_reads_every_value_at_its_place(tmp_path: Path, channels: tuple[str,
         np.testing.assert_array_equal(array[point], values[4, 1, 10])
     assert data.GetScalars().GetName() == "sdf"
     assert (data.GetVectors() is not None) == ("gradient" in grid.channels)
-    assert grid_channels.parse_header("x", image.GetFieldData().GetAbstractArray("header").GetValue(0)) == grid.header
+    assert grid_format.parse_header("x", image.GetFieldData().GetAbstractArray("header").GetValue(0)) == grid.header
 
 
 @pytest.mark.parametrize("chunk", [1, 500, 1 << 24])
 def test_it_reads_back_whatever_the_pieces_it_is_written_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int
 ) -> None:
-    monkeypatch.setattr(grid_channels, "CHUNK", chunk)
-    monkeypatch.setattr(grid_channels, "TILE", 3)
+    monkeypatch.setattr(grid_format, "CHUNK", chunk)
+    monkeypatch.setattr(grid_format, "TILE", 3)
     grid = with_unknown(random_grid())
     write_vti(tmp_path / "field.vti", grid)
     read = read_vti(tmp_path / "field.vti")

@@ -12,8 +12,7 @@ from splatctrl_cli.files.output import part_digests, write_json
 from splatctrl_cli.records import Balls, Float64, JointState, KnownVoxels, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
-from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import Truth, truth_document
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.known_voxels import known

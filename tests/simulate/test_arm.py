@@ -9,8 +9,7 @@ from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.simulate.arm import JOINTS, arm_spheres_yaml, arm_urdf
-from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import distance_to
 
 

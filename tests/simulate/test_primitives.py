@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.records import Float64
-from splatctrl_cli.simulate.primitives import Primitive, Track, closest_point, hit, normals, signed_distance
-from splatctrl_cli.simulate.textures import Texture
+from splatctrl_cli.simulate.primitives import Primitive, Texture, Track, closest_point, hit, normals, signed_distance
 
 PLAIN = Texture(pattern="noise", feature=0.1, dark=(0, 0, 0), bright=(1, 1, 1))
 TILTED = look_at([0.3, -0.2, 0.5], [1.0, 0.4, 0.1])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.random_tabletop import FREE_OF_BASE, GAP, NUM_THINGS, REGION, random_things
 from splatctrl_cli.simulate.primitives import signed_distance
-from splatctrl_cli.simulate.random_tabletop import FREE_OF_BASE, GAP, NUM_THINGS, REGION, random_things
 
 SEEDS = range(12)
 

@@ -11,8 +11,7 @@ from splatctrl_cli.records import GaussianSet, SplatSet
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.splat_files import usd
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
-from splatctrl_cli.splat_files.isotropic import as_gaussians, as_splats, nearest_splats
-from splatctrl_cli.splat_files.splat_differences import differences
+from splatctrl_cli.splat_files.splat_format import differences
 from splatctrl_cli.splat_files.splat_formats import (
     FORMATS,
     REFERENCE_PLY,
@@ -21,7 +20,7 @@ from splatctrl_cli.splat_files.splat_formats import (
     format_of,
     read_splats,
 )
-from splatctrl_cli.splat_files.splats import write_ply
+from splatctrl_cli.splat_files.splats import as_gaussians, as_splats, nearest_splats, write_ply
 from tests.splat_files.test_gaussian_ply import gaussian_set
 from tests.splat_files.test_splats import splat_set
 

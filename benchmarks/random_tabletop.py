@@ -3,9 +3,8 @@
 import numpy as np
 
 from splatctrl_cli.records import Float64
-from splatctrl_cli.simulate.primitives import Primitive
+from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.tabletop import PALETTE
-from splatctrl_cli.simulate.textures import Texture
 
 NUM_THINGS = (6, 11)  # least and most
 REGION = ((0.28, -0.55), (0.85, 0.55))  # [m] of the table's top, in which they stand
