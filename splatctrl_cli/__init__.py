@@ -1,3 +1,20 @@
-"""SplatCtrl: what a robot's cameras recorded, as splats, distance fields and replayed controllers."""
+"""SplatCtrl: what a robot's cameras recorded, as splats, distance fields and replayed controllers.
+
+The public names are those of `splatctrl_cli.api`, which is imported when the first of them is asked for.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from splatctrl_cli.api import *  # noqa: F403  (the same names, for type checkers)
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> object:
+    if not name.startswith("_"):
+        api = import_module("splatctrl_cli.api")
+        if name in api.__all__:
+            return getattr(api, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

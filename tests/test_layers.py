@@ -14,6 +14,7 @@ ROOMS = [  # a room imports those of the rows above its own
     ["sources"],
     ["states", "checks"],
     ["jobs"],
+    ["api"],
     ["cli"],
 ]
 RANK = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}

@@ -1,0 +1,53 @@
+"""The public Python API in one place (docs/api.md): the jobs, what they take and return, and what they raise.
+
+``import splatctrl_cli`` hands out the same names without loading this module until one of them is asked for.
+"""
+
+from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError, WriteError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
+from splatctrl_cli.jobs.bake import BakeResult, bake
+from splatctrl_cli.jobs.bake_request import BakeRequest
+from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
+from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.records import Box, Label
+
+__all__ = [
+    "BakeRequest",
+    "BakeResult",
+    "Box",
+    "Config",
+    "ExportRequest",
+    "ExportResult",
+    "InputError",
+    "Label",
+    "NotEvaluableError",
+    "Outcome",
+    "Progress",
+    "Reason",
+    "ReconstructRequest",
+    "ReconstructResult",
+    "RecordingRequest",
+    "ReplayRequest",
+    "ReplayResult",
+    "ScoreRequest",
+    "ScoreResult",
+    "SourceOptions",
+    "SplatCtrlError",
+    "UsageError",
+    "Verdict",
+    "WriteError",
+    "bake",
+    "export",
+    "load_config",
+    "open_to_train",
+    "reconstruct",
+    "replay",
+    "score",
+]

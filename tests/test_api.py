@@ -1,0 +1,58 @@
+"""The public Python API: its names cost nothing until asked for, and the examples of docs/api.md run."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import splatctrl_cli
+from splatctrl_cli import api
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "api.md"
+HEAVY = ("numpy", "pinocchio", "cv2", "splatctrl_cli.api")
+
+
+@pytest.mark.parametrize("name", api.__all__)
+def test_every_public_name_comes_from_the_package_and_from_its_api(name: str) -> None:
+    assert getattr(splatctrl_cli, name) is getattr(api, name)
+
+
+@pytest.mark.parametrize("name", ["ReplayInputs", "_bake"])
+def test_a_name_that_is_not_public_is_an_attribute_error(name: str) -> None:
+    with pytest.raises(AttributeError, match=f"'{name}'"):
+        getattr(splatctrl_cli, name)
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = f"import splatctrl_cli, sys; assert not [name for name in {HEAVY} if name in sys.modules]"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_page_lists_every_job_with_its_request_and_result() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \| `(\w+)` \|", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    jobs = {name for name in api.__all__ if f"{name.title()}Request" in api.__all__}
+    assert rows == [(job, f"{job.title()}Request", f"{job.title()}Result") for job, *_ in rows]
+    assert {job for job, *_ in rows} == jobs
+
+
+def test_the_examples_of_the_page_run_on_the_sample_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
+    monkeypatch.chdir(tmp_path)
+    examples = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    scope: dict[str, object] = {}
+    for example in examples:
+        exec(compile(example, PAGE.name, "exec"), scope)
+    made, baked, exported, scored, found = (scope[name] for name in ("made", "baked", "exported", "scored", "found"))
+    assert isinstance(made, api.ReconstructResult)
+    assert isinstance(baked, api.BakeResult)
+    assert isinstance(exported, api.ExportResult)
+    assert isinstance(scored, api.ScoreResult)
+    assert isinstance(found, api.ReplayResult)
+    assert made.verdict.outcome is scored.verdict.outcome is api.Outcome.PASSED
+    assert {path.name for path in (tmp_path / "api_output").iterdir()} == {"scene", "field", "objects.spz", "audit"}
+    assert str(found.verdict.label) in capsys.readouterr().out
