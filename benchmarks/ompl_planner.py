@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.planning_problems import Problem
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.control.advancement import check_edges
-from splatctrl_cli.control.clearance import Clearance
-from splatctrl_cli.control.path import joint_length, resampled
+from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.edges import check_edges
+from splatctrl_cli.planner.path import joint_length, resampled
 from splatctrl_cli.records import Float64
 
 STEP, FINE = 0.05, 0.01  # [rad] of OMPL's edge check, and of the recheck

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from splatctrl_cli.control.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.planner.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 

@@ -21,13 +21,13 @@ from benchmarks.scenes import sample_robot
 from benchmarks.tabletop_scenes import FRAME, STAMP_NS, TableScene, reconstructed, table_scene
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.comparison import Motion, MotionFigures, Yardstick
 from splatctrl_cli.control.ladder import Rung
-from splatctrl_cli.control.planned import planned_detours, planned_path
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.field.distance import SphereField, make_field
 from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.planner.comparison import Motion, MotionFigures, Yardstick
+from splatctrl_cli.planner.planned import planned_detours, planned_path
 from splatctrl_cli.records import DistanceField, Float64
 from splatctrl_cli.robot.coverage import coverage_deficit
 

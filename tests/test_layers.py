@@ -10,7 +10,7 @@ ROOMS = [  # a room imports those of the rows above its own
     ["containers", "splat_files", "grid_files", "report"],
     ["logs", "scene_files"],
     ["captures", "scene", "field", "control", "simulate", "evaluate"],
-    ["datasets"],
+    ["datasets", "planner"],
     ["sources"],
     ["states", "checks"],
     ["jobs"],

@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 
 
@@ -13,8 +14,13 @@ class ArmModel(Protocol):
     """A kinematic chain with collision spheres; `splatctrl_cli.robot.model.RobotModel` is one.
 
     J joints, S spheres; positions [m] and poses in world. sphere_deficit (S,) [m]: how far outside the spheres the
-    surface of a sphere's body may be, NaN where nobody measured it.
+    surface of a sphere's body may be, NaN where nobody measured it. lever_arms (S, J): how far [m] a sphere goes, at
+    most, per radian (or metre) of each joint. chain: its bodies and spheres as the kernels walk them, None where only
+    its methods know.
     """
+
+    @property
+    def chain(self) -> Chain | None: ...
 
     @property
     def joint_names(self) -> Sequence[str]: ...
@@ -52,6 +58,8 @@ class ArmModel(Protocol):
     def frame_pose(self, q: Float64, frame: str) -> Float64: ...
 
     def frame_jacobian(self, q: Float64, frame: str) -> Float64: ...
+
+    def lever_arms(self) -> Float64: ...
 
     def self_pairs(self) -> NDArray[np.integer]: ...
 

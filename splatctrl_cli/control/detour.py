@@ -2,21 +2,34 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.course import guided_goal
-from splatctrl_cli.control.path import TimedPath
 from splatctrl_cli.control.target import Guide
 from splatctrl_cli.records import Float64
+
+
+class Path(Protocol):
+    """A motion with a clock; `planner.path.TimedPath` is one."""
+
+    @property
+    def duration(self) -> float:
+        """Seconds from start to end."""
+        ...
+
+    def at(self, time: float) -> tuple[Float64, Float64]:
+        """Position and velocity (1, J) at a time [s]."""
+        ...
 
 
 @dataclass
 class Detour:
     """A path with a clock that runs on only while the frame is within `wait_distance` [m] of its goal on the path."""
 
-    path: TimedPath
+    path: Path
     wait_distance: float
     clock: float = 0.0
 

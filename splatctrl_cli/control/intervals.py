@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.clearance import PlanningArm
 from splatctrl_cli.records import Bool, Float64
 
 MAX_HALVINGS = 10
@@ -29,7 +29,7 @@ class Reach:
     velocity_limit: Float64
 
     @classmethod
-    def of(cls, model: PlanningArm) -> "Reach":
+    def of(cls, model: ArmModel) -> "Reach":
         """The reach of a model's moving spheres."""
         moving = np.flatnonzero(model.moving_spheres)
         deficit = np.maximum(np.nan_to_num(np.asarray(model.sphere_deficit, np.float64)[moving]), 0.0)
@@ -55,7 +55,7 @@ class Between:
 
 
 def between_states(
-    model: PlanningArm,
+    model: ArmModel,
     reach: Reach,
     stamps: "np.ndarray[tuple[int], np.dtype[np.int64]]",
     positions: Float64,
@@ -103,7 +103,7 @@ def between_states(
 
 
 def _refined(
-    model: PlanningArm,
+    model: ArmModel,
     reach: Reach,
     q_first: Float64,
     q_last: Float64,
@@ -144,7 +144,7 @@ def _refined(
     return least, is_met
 
 
-def clearances(model: PlanningArm, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
+def clearances(model: ArmModel, reach: Reach, positions: Float64, distance_to: DistanceFunction) -> Float64:
     """(T, M) [m] of every moving sphere's surface at postures (T, J)."""
     centers = model.sphere_centers_batch(positions)[:, reach.moving]
     distance = distance_to(np.ascontiguousarray(centers.reshape(-1, 3)))

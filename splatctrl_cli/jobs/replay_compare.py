@@ -10,15 +10,15 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.comparison import Motion, MotionFigures, Yardstick
 from splatctrl_cli.control.detour import PlanDetour
 from splatctrl_cli.control.open_loop import is_shaped
-from splatctrl_cli.control.planned import PlannedPath, planned_detours, planned_path
 from splatctrl_cli.control.replay import ReplayTask
-from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
+from splatctrl_cli.planner.comparison import Motion, MotionFigures, Yardstick
+from splatctrl_cli.planner.planned import PlannedPath, planned_detours, planned_path
+from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.records import Float64
 from splatctrl_cli.report.methods_picture import methods_picture
 

@@ -4,11 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.records import Bool, Float64, SphereSet
 
 
 class PlanarArm:
     """Two unit-ish links in the plane z = 0, about z at the base; spheres along the links and one on the base."""
+
+    chain: Chain | None = None
 
     def __init__(self, lengths: tuple[float, float] = (0.5, 0.4), radius: float = 0.04) -> None:
         self.lengths = lengths
@@ -33,8 +36,19 @@ class PlanarArm:
         rows = [np.zeros(3), *[x * _unit(q[0]) for x in local[1:3]], *[elbow + x * _unit(q.sum()) for x in local[3:]]]
         return np.array(rows)
 
+    def lever_arms(self) -> Float64:
+        x = self.sphere_set.centers[:, 0]
+        is_fore = np.array([link == "fore" for link in self.sphere_set.links])
+        return np.stack([np.where(is_fore, self.lengths[0] + x, x), np.where(is_fore, x, 0.0)], axis=1)
+
     def sphere_centers_batch(self, q: Float64) -> Float64:
-        return np.array([self.sphere_centers(row) for row in q])
+        elbow = np.array([0.0, 0.0, 0.0, self.lengths[0], self.lengths[0]])
+        turn, bent = q[:, :1], q.sum(axis=1)[:, None]
+        along = self.sphere_set.centers[:, 0]
+        upper, fore = np.where(elbow > 0, elbow, along), np.where(elbow > 0, along, 0.0)
+        x = upper * np.cos(turn) + fore * np.cos(bent)
+        y = upper * np.sin(turn) + fore * np.sin(bent)
+        return np.stack([x, y, np.zeros_like(x)], axis=2)
 
     def spheres_at(self, q: Float64) -> tuple[Float64, Float64]:
         return self.sphere_centers(q), self.sphere_jacobians(q)

@@ -7,8 +7,8 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.detour import Detour
-from splatctrl_cli.control.path import timed
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
+from splatctrl_cli.planner.path import timed
 from splatctrl_cli.records import Float64
 from tests.control.fakes import Balls, PlanarArm
 

@@ -9,15 +9,14 @@ import pytest
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from tests.control.fakes import Balls
-from tests.control.walls import LeveredArm
+from tests.control.fakes import Balls, PlanarArm
 from tests.reference.intervals import interval_bound
 
 MARGIN = 0.02
 
 
 def bounds(
-    arm: LeveredArm | RobotModel,
+    arm: PlanarArm | RobotModel,
     balls: Balls,
     states: Float64,
     *,
@@ -41,7 +40,7 @@ def bounds(
     )
 
 
-def least_on_the_way(arm: LeveredArm | RobotModel, balls: Balls, states: Float64, num: int = 400) -> Float64:
+def least_on_the_way(arm: PlanarArm | RobotModel, balls: Balls, states: Float64, num: int = 400) -> Float64:
     """(T - 1,) [m] by `num` samples of each straight motion."""
     reach = Reach.of(arm)
     share = np.linspace(0, 1, num)[:, None]
@@ -50,7 +49,7 @@ def least_on_the_way(arm: LeveredArm | RobotModel, balls: Balls, states: Float64
 
 
 def test_far_away_the_bound_is_that_of_both_ends() -> None:
-    arm, balls = LeveredArm(), Balls([[0.2, 0.9, 0.0]], [0.05])
+    arm, balls = PlanarArm(), Balls([[0.2, 0.9, 0.0]], [0.05])
     states = np.array([[0.0, 0.3], [0.1, 0.25]])
     reach = Reach.of(arm)
     first, last = clearances(arm, reach, states, lambda points: balls.query(points)[0])
@@ -62,7 +61,7 @@ def test_far_away_the_bound_is_that_of_both_ends() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_no_motion_comes_nearer_than_its_bound(seed: int) -> None:
     generator = np.random.default_rng(seed)
-    arm = LeveredArm()
+    arm = PlanarArm()
     balls = Balls(
         np.c_[generator.uniform(-1, 1, (6, 2)), np.zeros(6)].tolist(), generator.uniform(0.01, 0.1, 6).tolist()
     )
@@ -95,7 +94,7 @@ def sample_arm(sample_data: Path) -> RobotModel:
 
 
 def test_a_contact_between_two_free_states_is_found() -> None:
-    arm = LeveredArm()
+    arm = PlanarArm()
     tip = arm.sphere_centers(np.array([0.0, 0.0]))[-1]
     balls, states = Balls([tip.tolist()], [0.005]), np.array([[-0.12, 0.0], [0.12, 0.0]])
     ends = clearances(arm, Reach.of(arm), states, lambda points: balls.query(points)[0])
@@ -110,7 +109,7 @@ def test_a_contact_between_two_free_states_is_found() -> None:
 
 
 def test_a_state_that_breaks_the_margin_settles_both_of_its_intervals() -> None:
-    arm = LeveredArm()
+    arm = PlanarArm()
     balls = Balls([[0.9, 0.06, 0.0]], [0.005])
     states = np.array([[-0.5, 0.0], [0.0, 0.0], [-0.5, 0.0], [-0.55, 0.0]])
     found = bounds(arm, balls, states)
@@ -120,13 +119,13 @@ def test_a_state_that_breaks_the_margin_settles_both_of_its_intervals() -> None:
 
 @pytest.mark.parametrize(("seconds", "is_bounded"), [(0.1, True), (0.1000009, True), (0.12, True), (0.41, False)])
 def test_a_long_gap_is_bounded_only_where_the_arm_cannot_reach(seconds: float, is_bounded: bool) -> None:
-    arm, balls = LeveredArm(), Balls([[0.9, 0.45, 0.0]], [0.05])
+    arm, balls = PlanarArm(), Balls([[0.9, 0.45, 0.0]], [0.05])
     states = np.zeros((2, 2))  # the tip may move 1.3 m/s by both joints
     assert bounds(arm, balls, states, seconds=seconds).is_bounded.tolist() == [is_bounded]
 
 
 def test_a_gap_just_within_reach_of_the_margin_is_not_bounded() -> None:
-    arm, balls = LeveredArm(), Balls([[0.9, 0.45, 0.0]], [0.05])
+    arm, balls = PlanarArm(), Balls([[0.9, 0.45, 0.0]], [0.05])
     reach, states = Reach.of(arm), np.zeros((2, 2))
     gaps = clearances(arm, reach, states[:1], lambda points: balls.query(points)[0])[0]
     speeds = reach.levers @ reach.velocity_limit
@@ -136,7 +135,7 @@ def test_a_gap_just_within_reach_of_the_margin_is_not_bounded() -> None:
 
 
 def test_a_gap_in_which_the_arm_moved_further_than_it_may_is_bounded_by_what_it_moved() -> None:
-    arm, balls = LeveredArm(), Balls([[5.0, 0.0, 0.0]], [0.1])
+    arm, balls = PlanarArm(), Balls([[5.0, 0.0, 0.0]], [0.1])
     states = np.array([[-2.8, 0.0], [2.8, 0.0]])  # 5.6 rad in 0.2 s, limit 1.5 rad/s
     reach = Reach.of(arm)
     first, last = clearances(arm, reach, states, lambda points: balls.query(points)[0])
@@ -145,7 +144,7 @@ def test_a_gap_in_which_the_arm_moved_further_than_it_may_is_bounded_by_what_it_
 
 
 def test_velocities_that_say_more_than_the_states_widen_the_bound() -> None:
-    arm, balls = LeveredArm(), Balls([[0.9, 0.3, 0.0]], [0.05])
+    arm, balls = PlanarArm(), Balls([[0.9, 0.3, 0.0]], [0.05])
     states = np.zeros((2, 2))
     fast = np.array([[1.0, 0.0], [1.0, 0.0]])
     still, moved = (bounds(arm, balls, states, velocities=v).lower[0] for v in (np.zeros((2, 2)), fast))
@@ -155,14 +154,14 @@ def test_velocities_that_say_more_than_the_states_widen_the_bound() -> None:
 
 
 def test_velocities_can_break_a_margin_that_the_straight_motion_keeps() -> None:
-    arm, balls = LeveredArm(), Balls([[0.9, 0.13, 0.0]], [0.05])  # 40 mm from the tip
+    arm, balls = PlanarArm(), Balls([[0.9, 0.13, 0.0]], [0.05])  # 40 mm from the tip
     states, fast = np.zeros((2, 2)), np.full((2, 2), [1.4, 0.0])
     assert bounds(arm, balls, states).lower[0] > MARGIN
     assert bounds(arm, balls, states, velocities=fast).lower[0] < MARGIN
 
 
 def test_what_the_spheres_leave_uncovered_is_taken_off() -> None:
-    arm, balls = LeveredArm(), Balls([[0.9, 0.3, 0.0]], [0.05])
+    arm, balls = PlanarArm(), Balls([[0.9, 0.3, 0.0]], [0.05])
     states = np.zeros((2, 2))
     whole = bounds(arm, balls, states).lower[0]
     arm.sphere_deficit = np.array([0.5, 0.01, 0.01, 0.01, 0.01])  # the base does not move
@@ -170,7 +169,7 @@ def test_what_the_spheres_leave_uncovered_is_taken_off() -> None:
 
 
 def test_where_the_scene_has_no_distance_nothing_is_bounded() -> None:
-    arm, states = LeveredArm(), np.zeros((2, 2))
+    arm, states = PlanarArm(), np.zeros((2, 2))
     reach = Reach.of(arm)
 
     def blank(points: Float64) -> Float64:

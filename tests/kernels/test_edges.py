@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.control.advancement import ROUNDING, STILL, check_edges, check_sampled_edges
-from splatctrl_cli.control.clearance import Clearance
-from splatctrl_cli.control.path import resampled
-from splatctrl_cli.control.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.edges import ROUNDING, STILL, check_edges, check_sampled_edges
+from splatctrl_cli.planner.path import resampled
+from splatctrl_cli.planner.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 

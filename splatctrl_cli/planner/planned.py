@@ -1,4 +1,7 @@
-"""A path planned for a replay's task: from its start to a pose, in the scene known at that time. J joints."""
+"""A path planned for a replay's task: from its start to a pose, in the scene known at that time.
+
+G goal postures, K guesses, J joints.
+"""
 
 import time
 from collections.abc import Callable
@@ -7,19 +10,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.advancement import check_edges
-from splatctrl_cli.control.clearance import Clearance, HasDistance, PlanningArm
+from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.detour import Detour, PlanDetour
-from splatctrl_cli.control.goal_postures import goal_postures
-from splatctrl_cli.control.path import TimedPath, effector_rates, timed
-from splatctrl_cli.control.planner import PlanOutcome, plan
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.control.rows import scene_margin
+from splatctrl_cli.control.target import pose_error
+from splatctrl_cli.planner.birrt import PlanOutcome, plan
+from splatctrl_cli.planner.clearance import Clearance, HasDistance
+from splatctrl_cli.planner.edges import check_edges
+from splatctrl_cli.planner.path import TimedPath, effector_rates, timed
 from splatctrl_cli.records import Float64
 
 NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision", "goal-in-collision"
 ROOM = 1e-3  # [m] left to move in where the start or goal stands within a margin
 GUESSES = 2  # per goal posture that is looked for
+MAX_STEPS = 30  # of a guess: with 100, a fifth more guesses end at the pose, in 2.6 times the time
+DAMPING = 1e-4  # of the squared Jacobian's diagonal, as it begins; grows where a step does not help
+LONGEST = 0.3  # [rad] of a step, in any joint
+SHARE = 0.1  # of the goal's tolerances that a posture keeps to
+DISTINCT = 0.05  # [rad] that two postures differ by at least, in some joint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +50,7 @@ class PlannedPath:
 
 
 def planned_path(
-    model: PlanningArm, scene: HasDistance, task: ReplayTask, planner: PlannerConfig, control: ControlConfig
+    model: ArmModel, scene: HasDistance, task: ReplayTask, planner: PlannerConfig, control: ControlConfig
 ) -> PlannedPath:
     """A path from the task's start to its goal pose, at most as fast as the controller may drive its frame.
 
@@ -103,7 +112,7 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
 
 
 def planned_detours(
-    model: PlanningArm,
+    model: ArmModel,
     scene_at: Callable[[int], HasDistance],
     frame: str,
     planner: PlannerConfig,
@@ -119,3 +128,45 @@ def planned_detours(
         return None if path is None else Detour(path=path, wait_distance=planner.wait_distance)
 
     return detour
+
+
+def goal_postures(
+    model: ArmModel, frame: str, T_world_goal: Float64, guesses: Float64, config: ControlConfig, *, at_most: int
+) -> Float64:
+    """(G, J) postures within the limits that bring `frame` to a pose (4, 4), distinct, in the order of the guesses.
+
+    They keep to a tenth of the goal's tolerances; G is at most `at_most`, and 0 where no guess (K, J) leads there.
+    """
+    found: list[Float64] = []
+    for guess in guesses:
+        q = _solved(model, frame, T_world_goal, guess, config)
+        if q is not None and all(np.max(np.abs(q - other)) > DISTINCT for other in found):
+            found.append(q)
+        if len(found) == at_most:
+            break
+    return np.array(found).reshape(-1, len(model.lower))
+
+
+def _solved(
+    model: ArmModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
+) -> Float64 | None:
+    """Levenberg's method, every step cut off at the limits; None where it comes to no end."""
+    scale = 1.0 / np.repeat([SHARE * config.goal_position, SHARE * config.goal_rotation], 3)
+    q, damping = np.clip(guess, model.lower, model.upper), DAMPING
+    error = scale * pose_error(model.frame_pose(q, frame), T_world_goal)
+    for _ in range(MAX_STEPS):
+        if max(np.linalg.norm(error[:3]), np.linalg.norm(error[3:])) <= 1.0:
+            return q
+        J = scale[:, None] * model.frame_jacobian(q, frame)
+        square = J.T @ J
+        step = np.linalg.solve(square + damping * np.trace(square) * np.eye(len(q)), J.T @ error)
+        step *= min(1.0, LONGEST / max(float(np.max(np.abs(step))), 1e-12))
+        following = np.clip(q + step, model.lower, model.upper)
+        next_error = scale * pose_error(model.frame_pose(following, frame), T_world_goal)
+        if np.linalg.norm(next_error) < np.linalg.norm(error):
+            q, error, damping = following, next_error, max(damping / 10, 1e-9)
+        else:
+            damping *= 10
+        if damping > 1e3:
+            return None
+    return None

@@ -6,16 +6,23 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.goal_postures import goal_postures
-from splatctrl_cli.control.path import least_clearance
-from splatctrl_cli.control.planned import GOAL_BLOCKED, NO_POSTURE, START_BLOCKED, planned_detours, planned_path
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
-from splatctrl_cli.control.solids import Ball, Solids
 from splatctrl_cli.control.target import pose_error
+from splatctrl_cli.planner.path import least_clearance
+from splatctrl_cli.planner.planned import (
+    GOAL_BLOCKED,
+    NO_POSTURE,
+    START_BLOCKED,
+    goal_postures,
+    planned_detours,
+    planned_path,
+)
+from splatctrl_cli.planner.solids import Ball, Solids
 from splatctrl_cli.records import Float64
-from tests.control.walls import LeveredArm, one_wall
+from tests.control.fakes import PlanarArm
+from tests.planner.walls import one_wall
 
-ARM = LeveredArm()
+ARM = PlanarArm()
 CONFIG, PLANNER = ControlConfig(), PlannerConfig(max_iterations=300, max_time=60.0)
 START, GOAL = np.array([0.7, 0.2]), np.array([-0.7, -0.2])
 
@@ -87,7 +94,7 @@ def test_the_same_seed_plans_the_same_path() -> None:
 
 
 def test_what_the_spheres_leave_uncovered_is_kept_as_well_where_the_controller_keeps_it() -> None:
-    class Bare(LeveredArm):
+    class Bare(PlanarArm):
         def __init__(self) -> None:
             super().__init__()
             self.sphere_deficit = np.full(5, 0.03)

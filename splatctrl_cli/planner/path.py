@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.control.advancement import ROUNDING, STILL
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.clearance import Clearance
 from splatctrl_cli.control.target import rotation_vector
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.edges import ROUNDING, STILL
 from splatctrl_cli.records import Float64
 
 MAX_PIECES = 200_000  # of a path, when its clearance is proved

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.comparison import Motion, Yardstick, proved_clearance
-from splatctrl_cli.control.path import resampled
+from splatctrl_cli.planner.comparison import Motion, Yardstick, proved_clearance
+from splatctrl_cli.planner.path import resampled
 from splatctrl_cli.records import Float64
-from tests.control.fakes import Balls
-from tests.control.walls import LeveredArm
+from tests.control.fakes import Balls, PlanarArm
 
-ARM = LeveredArm()
+ARM = PlanarArm()
 BALL = Balls([[0.7, 0.3, 0.0]], [0.05])
 FROM, TO = np.array([-0.5, 0.2]), np.array([-0.1, 0.3])
 TICK = 10_000_000

@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.path import (
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.planner.birrt import plan
+from splatctrl_cli.planner.path import (
     effector_length,
     effector_rates,
     joint_length,
@@ -10,14 +12,12 @@ from splatctrl_cli.control.path import (
     resampled,
     timed,
 )
-from splatctrl_cli.control.planner import plan
-from splatctrl_cli.control.tracking import follow_joints, follow_with_controller
-from splatctrl_cli.errors import InputError
-from tests.control.fakes import Balls
-from tests.control.walls import LeveredArm, clearance, one_wall, thin_post
+from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
+from tests.control.fakes import Balls, PlanarArm
+from tests.planner.walls import clearance, one_wall, thin_post
 
 PATH = np.array([[0.7, 0.2], [0.9, 2.0], [-0.4, 1.5], [-0.42, 1.5]])
-ARM = LeveredArm()
+ARM = PlanarArm()
 
 
 def test_lengths_are_those_of_an_arc() -> None:

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import CHUNK, DistanceFunction, DistancesAt, Stamps, audit
-from splatctrl_cli.control.clearance import PlanningArm
 from splatctrl_cli.control.explain import runs_of
-from splatctrl_cli.control.path import effector_length, joint_length
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.control.target import pose_error
+from splatctrl_cli.planner.path import effector_length, joint_length
 from splatctrl_cli.records import Bool, Float64, JointState
 
 TrueDistance = Callable[[Float64, int], Float64]
@@ -66,7 +66,7 @@ class Yardstick:
     `proved_clearance` takes it; truth is None where it is not known.
     """
 
-    model: PlanningArm
+    model: ArmModel
     frame: str
     T_world_goal: Float64
     config: ControlConfig
@@ -100,7 +100,7 @@ class Yardstick:
         )
 
 
-def proved_clearance(model: PlanningArm, motion: Motion, certified_at: Callable[[int], DistanceFunction]) -> float:
+def proved_clearance(model: ArmModel, motion: Motion, certified_at: Callable[[int], DistanceFunction]) -> float:
     """What no moving sphere's distance [m] goes below, at the states and between them; NaN where one is missing.
 
     certified_at gives at a stamp a lower bound of a 1-Lipschitz distance, the same object for the same scene. Half
@@ -119,7 +119,7 @@ def proved_clearance(model: PlanningArm, motion: Motion, certified_at: Callable[
     return least
 
 
-def _true_clearance(model: PlanningArm, motion: Motion, truth: TrueDistance) -> float:
+def _true_clearance(model: ArmModel, motion: Motion, truth: TrueDistance) -> float:
     moving = np.flatnonzero(model.moving_spheres)
     centers = model.sphere_centers_batch(motion.position)[:, moving]
     radii = model.sphere_set.radii[moving]

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.control.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.planner.solids import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.simulate.primitives import Primitive, Texture, signed_distance
 
 

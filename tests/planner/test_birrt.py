@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.control import planner
-from splatctrl_cli.control.advancement import EdgeCheck, check_edges
-from splatctrl_cli.control.clearance import Clearance, OnlyDistance
-from splatctrl_cli.control.path import joint_length, resampled
-from splatctrl_cli.control.planner import PlanOutcome, plan
-from splatctrl_cli.control.shortcut import shortened
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.planner import birrt
+from splatctrl_cli.planner.birrt import PlanOutcome, plan, shortened
+from splatctrl_cli.planner.clearance import Clearance, OnlyDistance
+from splatctrl_cli.planner.edges import EdgeCheck, check_edges
+from splatctrl_cli.planner.path import joint_length, resampled
 from splatctrl_cli.records import Float64
-from tests.control.fakes import Balls, Plane
-from tests.control.walls import LeveredArm, clearance, closed_ring, one_wall, thin_post
+from tests.control.fakes import Balls, PlanarArm, Plane
+from tests.planner.walls import clearance, closed_ring, one_wall, thin_post
 
 CONFIG = PlannerConfig(max_iterations=300, max_time=60.0)
 START, GOAL = np.array([0.7, 0.2]), np.array([-0.7, -0.2])
@@ -59,7 +58,7 @@ def test_trees_join_only_where_the_whole_edge_is_free(monkeypatch: pytest.Monkey
         )  # the straight edge is not free, the trees' are
         return EdgeCheck(free_share=np.full(len(start), share), num_checks=len(start))
 
-    monkeypatch.setattr(planner, "check_edges", checked)
+    monkeypatch.setattr(birrt, "check_edges", checked)
     found = plan(clearance(one_wall()), START, GOAL, replace(CONFIG, max_iterations=5))
     assert found.outcome is PlanOutcome.OUT_OF_ITERATIONS
 
@@ -89,7 +88,7 @@ def test_the_same_seed_gives_the_same_path_and_another_seed_another() -> None:
 
 
 def test_no_waypoint_leaves_the_limits() -> None:
-    arm = LeveredArm()
+    arm = PlanarArm()
     for seed in range(5):
         found = plan(clearance(one_wall()), START, GOAL, CONFIG, seed=seed)
         assert np.all(found.found >= arm.lower)
@@ -124,12 +123,12 @@ def test_shortcuts_are_proved_and_never_longer() -> None:
 
 
 def test_the_fast_kinematics_of_the_test_arm_are_its_slow_ones() -> None:
-    arm, q = LeveredArm(), random_edges(20)[0]
+    arm, q = PlanarArm(), random_edges(20)[0]
     np.testing.assert_allclose(arm.sphere_centers_batch(q), [arm.sphere_centers(row) for row in q], atol=1e-15)
 
 
 def random_edges(num: int) -> tuple[Float64, Float64]:
-    arm = LeveredArm()
+    arm = PlanarArm()
     rng = np.random.default_rng(7)
     return rng.uniform(arm.lower, arm.upper, (num, 2)), rng.uniform(arm.lower, arm.upper, (num, 2))
 
@@ -173,7 +172,7 @@ def test_the_free_share_of_an_edge_is_free_and_ends_at_the_wall() -> None:
 def test_pairs_of_the_robots_own_spheres_count() -> None:
     folded, free = np.array([[0.0, 2.6]]), clearance(thin_post())
     tip = free.rows(folded)[0][free.names.index("base[0]~fore[1]")]
-    own = LeveredArm().sphere_centers(folded[0])
+    own = PlanarArm().sphere_centers(folded[0])
     assert tip == pytest.approx(np.linalg.norm(own[0] - own[4]) - 0.06 - 0.04, abs=1e-12)
 
 
@@ -183,18 +182,18 @@ def test_a_field_without_a_distance_is_an_error_that_says_where() -> None:
             return np.full(len(points), np.nan)
 
     with pytest.raises(NotEvaluableError, match=r"sphere upper\[0\] at \(0.250, 0.000, 0.000\) m: the field has no"):
-        Clearance.of(LeveredArm(), Nowhere()).at(np.zeros((1, 2)))
+        Clearance.of(PlanarArm(), Nowhere()).at(np.zeros((1, 2)))
 
 
 def test_a_distance_field_is_a_scene_as_solids_are() -> None:
     q = random_edges(50)[0]
     field = OnlyDistance(field=Balls([[0.62, 0.31, 0.0]], [0.002]))
-    np.testing.assert_allclose(Clearance.of(LeveredArm(), field).rows(q), clearance(thin_post()).rows(q), atol=1e-12)
+    np.testing.assert_allclose(Clearance.of(PlanarArm(), field).rows(q), clearance(thin_post()).rows(q), atol=1e-12)
 
 
 def test_a_field_steeper_than_a_distance_is_checked_with_its_own_slope() -> None:
     steep = OnlyDistance(field=Plane([0.0, 1.0, 0.0], -0.5, scale=3.0))
-    trusting, wary = (Clearance.of(LeveredArm(), steep, lipschitz=slope) for slope in (1.0, 3.0))
+    trusting, wary = (Clearance.of(PlanarArm(), steep, lipschitz=slope) for slope in (1.0, 3.0))
     start, end = random_edges(100)
     dense = np.array([densest(wary, np.array(edge)) for edge in zip(start, end, strict=True)])
     assert np.all(dense[check_edges(wary, start, end, contact=1e-4).is_free] > 0)

@@ -10,25 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel, sphere_names
-from splatctrl_cli.control.solids import Solids
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.kernels.chain import Chain
 from splatctrl_cli.kernels.edges import EdgeRoom
+from splatctrl_cli.planner.solids import Solids
 from splatctrl_cli.records import Bool, DistanceField, Float64
-
-
-class PlanningArm(ArmModel, Protocol):
-    """An arm whose spheres' travel per radian (or metre) of every joint is bounded; `RobotModel` is one.
-
-    chain: its bodies and spheres as the kernels walk them, None where only its methods know.
-    """
-
-    @property
-    def chain(self) -> Chain | None: ...
-
-    def lever_arms(self) -> Float64:
-        """(S, J)."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +46,7 @@ class Clearance:
     kernel that checks edges among `Solids`, None for an arm without a chain.
     """
 
-    model: PlanningArm
+    model: ArmModel
     scene: HasDistance
     taken: Float64
     moving: NDArray[np.intp]
@@ -73,7 +58,7 @@ class Clearance:
     @classmethod
     def of(
         cls,
-        model: PlanningArm,
+        model: ArmModel,
         scene: HasDistance,
         *,
         margin: float | Float64 = 0.0,
