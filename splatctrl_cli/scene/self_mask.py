@@ -209,12 +209,16 @@ def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
 
 def _mixed(depth: Float32, candidate: Bool, front: Float32, core: Bool, tolerance: Float32, reach: int) -> Bool:
     """Candidates beside or at the outline (`front` is finite there, `core` is not) that lie behind the robot's front
-    and before all that is measured a little farther out.
+    and before all that is measured a little farther out; where nothing is, those that have no candidate beside them:
+    a curved link falls away from the camera steeper at its rim than a pixel tells.
     """
     at_edge = candidate & ~core & np.isfinite(front) & (depth > front)
     beside = candidate & ~np.isfinite(front)
     nearest_beside = nearest_within(depth, beside, 2 * reach + 2)
-    return np.asarray(at_edge & np.isfinite(nearest_beside) & (depth < nearest_beside - tolerance))
+    is_open = np.isinf(nearest_beside)
+    num_near = cv2.boxFilter(candidate.view(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    is_mixed = np.where(is_open, num_near == 1, depth < nearest_beside - tolerance)
+    return np.asarray(at_edge & is_mixed)
 
 
 def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:

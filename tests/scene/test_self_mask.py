@@ -105,6 +105,16 @@ def test_a_depth_between_the_robot_and_the_floor_at_its_outline_is_mixed_and_lef
     assert without_mixed(view, mask).depth[~SHOWN].all()
 
 
+@pytest.mark.parametrize(("rows", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.OBJECT)])
+def test_a_lone_depth_at_the_rim_before_nothing_is_mixed_and_a_thin_thing_there_is_not(
+    rows: int, kind: PixelKind
+) -> None:
+    depth = np.where(SHOWN, ball_depth(), 0.0)  # nothing else returns a depth
+    rim = np.flatnonzero(SHOWN[60])[0] - 1
+    depth[60 : 60 + rows, rim] = CENTER[2] + 0.03
+    assert (kinds(depth)[60 : 60 + rows, rim] == kind).all()
+
+
 def test_points_inside_the_robot_are_counted_by_link_and_are_no_robot() -> None:
     depth = ball_depth()
     depth[55:65, 75:85] += 0.05
