@@ -31,9 +31,9 @@ from splatctrl_cli.grid_files.grid_formats import write_grid
 from splatctrl_cli.grid_files.nrrd import read_nrrd_head
 from splatctrl_cli.grid_files.vti import read_vti
 from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError
+from splatctrl_cli.logs.encodings import decode_rvl
 from splatctrl_cli.logs.messages import read_image
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.rvl import decode_rvl
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.splat_files.splat_formats import FORMATS

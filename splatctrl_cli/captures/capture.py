@@ -24,10 +24,9 @@ from splatctrl_cli.logs.joint_topics import (
     with_joints,
     without_joints,
 )
-from splatctrl_cli.logs.masks import human_mask
 from splatctrl_cli.logs.messages import decode_file, metres
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.shot import Shot, merged
+from splatctrl_cli.logs.shot import Shot, human_mask, merged
 from splatctrl_cli.records import (
     Bool,
     Float32,

@@ -29,10 +29,9 @@ from splatctrl_cli.checks.state_motion import ImageMotion
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
-from splatctrl_cli.logs.masks import check_mask_topics
 from splatctrl_cli.logs.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
-from splatctrl_cli.logs.rig import Camera, camera_topics, missing
+from splatctrl_cli.logs.rig import Camera, camera_topics, check_mask_topics, missing
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.survey import Survey, survey
 from splatctrl_cli.records import RgbdFrame

@@ -12,8 +12,8 @@ from splatctrl_cli.checks.check_images import ImageWatch, Kept, strided_lens
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
-from splatctrl_cli.logs.pairing import pair_by_stamp
 from splatctrl_cli.logs.registration import DepthToColor
 from splatctrl_cli.logs.rig import Camera, build_cameras, intrinsics_of, nearest_gap_ns
 from splatctrl_cli.logs.survey import Survey

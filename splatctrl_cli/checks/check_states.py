@@ -9,10 +9,10 @@ from splatctrl_cli.checks.state_check import PoseVerdict, check_angles, pose_agr
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.rows import blocks_of
 from splatctrl_cli.logs.joint_log import JointStream
-from splatctrl_cli.logs.joints import joint_records
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import STATE_TYPES
+from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey
 from splatctrl_cli.records import Float64, JointState, LossReport
 from splatctrl_cli.robot.model import RobotModel

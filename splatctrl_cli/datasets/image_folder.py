@@ -16,11 +16,10 @@ from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.logs.masks import human_mask
 from splatctrl_cli.logs.messages import decode_file, metres, num_invalid
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion
-from splatctrl_cli.logs.shot import Shot, check_depth, is_kept, is_png
+from splatctrl_cli.logs.shot import Shot, check_depth, human_mask, is_kept, is_png
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]

@@ -21,8 +21,8 @@ from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, D
 from splatctrl_cli.datasets.layout import Layout, described, given_lens, pinhole
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.pairing import pair_by_stamp
 from splatctrl_cli.records import Float64
 
 SCALE = 1.0 / 5000.0  # [m] per count

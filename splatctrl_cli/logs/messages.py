@@ -12,8 +12,15 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.files.image_file import JPEG, PNG, TAIL, image_head
 from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError, stamp_ns
-from splatctrl_cli.logs.encodings import BAYER, BAYER_16, COLOR_CONVERSIONS, DEPTH_ENCODINGS, raw_pixels, to_rgb
-from splatctrl_cli.logs.rvl import decode_rvl
+from splatctrl_cli.logs.encodings import (
+    BAYER,
+    BAYER_16,
+    COLOR_CONVERSIONS,
+    DEPTH_ENCODINGS,
+    decode_rvl,
+    raw_pixels,
+    to_rgb,
+)
 from splatctrl_cli.records import Float32, UInt8
 
 __all__ = [

@@ -1,17 +1,16 @@
 """The cameras of a log made ready: intrinsics, world frame, lens and depth registration, or why they cannot be."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.cameras import find_cameras, find_info, is_registered
+from splatctrl_cli.logs.cameras import find_cameras, find_info, is_registered, listed, no_camera
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from splatctrl_cli.logs.lacking import listed, no_camera
-from splatctrl_cli.logs.masks import check_mask_topics
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.pose_topics import join_pose_topics, pose_topics
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
@@ -359,3 +358,23 @@ def _given_topics(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
             )
         )
     return tuple(cameras)
+
+
+def check_mask_topics(path: Path, survey: Survey, topics: Mapping[str, str], cameras: tuple[str, ...]) -> None:
+    """Raise InputError where a mask topic, by camera name, is for no camera or holds no grey images."""
+    grey = [
+        topic.topic.name
+        for topic in survey.of_type(IMAGE, COMPRESSED_IMAGE)
+        if topic.first_image is not None and topic.first_image.is_gray
+    ]
+    for camera, topic in topics.items():
+        if camera not in cameras:
+            raise InputError(
+                f"{path}: --human-topic {camera}={topic}: no camera {camera!r}",
+                remedy=f"use one of: {', '.join(cameras)}",
+            )
+        if topic not in grey:
+            raise InputError(
+                f"{path}: --human-topic {camera}={topic}: no mono8 or 8UC1 images on that topic",
+                remedy=f"grey topics there: {', '.join(grey) or 'none'}",
+            )

@@ -14,17 +14,14 @@ import numpy as np
 from splatctrl_cli.containers.raw_log import Damage, RawLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.logs.frame_plan import FramePlan, Index, Planned
-from splatctrl_cli.logs.image_rate import dropped, first_of_each
+from splatctrl_cli.logs.frame_plan import FramePlan, Index, Planned, PlannedImages, keeps_files
+from splatctrl_cli.logs.image_stamps import dropped, first_of_each, pair_by_stamp, paired
 from splatctrl_cli.logs.joint_topics import topics_of, with_joints
-from splatctrl_cli.logs.joints import joint_records
-from splatctrl_cli.logs.masks import human_mask, mask_by_color
 from splatctrl_cli.logs.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid
 from splatctrl_cli.logs.options import SourceOptions, still_note
-from splatctrl_cli.logs.pairing import paired
-from splatctrl_cli.logs.planned_images import PlannedImages, keeps_files
 from splatctrl_cli.logs.rig import Camera, build_cameras, nearest_gap_ns
-from splatctrl_cli.logs.shot import Place, Shot, check_depth, is_kept, is_png, merged
+from splatctrl_cli.logs.shot import Place, Shot, check_depth, human_mask, is_kept, is_png, merged
+from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey, survey
 from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8
 
@@ -141,7 +138,7 @@ class RosLogSource:
         """Plan the pairs of a camera, those without a pose counted. Raises InputError where none has one."""
         tolerance_ns = round(self._options.pose_tolerance_s * _SECOND)
         pairing_ns = round(self._options.pairing_tolerance_s * _SECOND)
-        masks = mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
+        masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
         poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
         num = plan.add(camera, stamp_ns, color, depth, masks, poses)
         if not num:
@@ -245,3 +242,19 @@ def _times(found: Survey, camera: Camera) -> str:
     images = f"images {min(stamps) / 1e9:.3f} to {max(stamps) / 1e9:.3f} s"
     span = found.tf.span_ns(camera.frame_id)
     return images if span is None else f"{images}, tf {span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"
+
+
+def _mask_by_color(
+    survey: Survey, color_topic: str, mask_topic: str, tolerance_ns: int, camera: str, loss: LossReport
+) -> dict[int, int]:
+    """Mask number by colour number, the closest stamps paired; images without a mask are noted in `loss`."""
+    if not mask_topic:
+        return {}
+    color_ns, mask_ns = survey.topics[color_topic].stamps_ns, survey.topics[mask_topic].stamps_ns
+    pairs = dict(pair_by_stamp(color_ns, mask_ns, tolerance_ns))
+    if len(pairs) < len(color_ns):
+        loss.notes.append(
+            f"camera {camera}: {len(color_ns) - len(pairs)} of {len(color_ns)} images have no mask on {mask_topic}"
+            f" within {tolerance_ns / 1e6:g} ms"
+        )
+    return pairs

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import UndecodableMessageError
@@ -140,6 +141,19 @@ def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot
     if state is not None:
         yield state
     yield from states
+
+
+def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:
+    """(H, W) uint8, 1 where an image file or message is not 0. Raises InputError unless 8-bit grey, (H, W)."""
+    if pixels.dtype != np.uint8 or pixels.shape != (camera.height, camera.width):
+        size = "x".join(map(str, reversed(pixels.shape[:2])))
+        channels = pixels.shape[2] if pixels.ndim == 3 else 1
+        raise InputError(
+            f"{where}: expected an 8-bit grey mask of {camera.width}x{camera.height}, as the colour images,"
+            f" got {size} of {channels} channel(s), {pixels.dtype}",
+            remedy="write 0 where there is no person, anything else where there is one",
+        )
+    return np.asarray(pixels != 0, np.uint8)
 
 
 def check_depth(depth: Float32, where: str, scale: float) -> bool:

@@ -12,13 +12,15 @@ from splatctrl_cli.logs.decoder import JOINT_STATE
 from splatctrl_cli.logs.joint_log import JointStream
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.state_clock import checked_stamps
+from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY
-from splatctrl_cli.logs.state_track import RawTrack
+from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
 from splatctrl_cli.records import Bool, LossReport
 
 BRIDGED = 0.5  # [s] at most between the states of another topic that a position is interpolated over
 STILL = 1e-3  # [rad or m] by which a joint may differ across a longer gap
+_NOTHING = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0)), velocity=np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +34,22 @@ class _Stream:
     @property
     def has_poses(self) -> bool:
         return self.states.column("T_base_ee") is not None
+
+
+def joint_records(
+    survey: Survey, options: SourceOptions, loss: LossReport, wanted: Sequence[str] | None = None
+) -> tuple[tuple[str, ...], StateColumns]:
+    """Joint names and states by stamp; no names and no states where the log holds none.
+
+    With `wanted` (a robot's joints), they are brought together from the topics that have them. Else the states are of
+    one topic, and those that lack a joint of the fullest (a gripper that publishes alone) are left out with a note.
+    """
+    topics = state_topics(survey, options, loss)
+    if not topics:
+        return (), _NOTHING
+    raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
+    states = cleaned(raw, loss)
+    return (raw.names, states) if len(states) else ((), _NOTHING)
 
 
 def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> list[TopicSurvey]:

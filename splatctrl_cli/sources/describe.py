@@ -17,11 +17,10 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import files_below, names_in
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
-from splatctrl_cli.logs.large_log import survey_to_describe
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.rig import camera_topics, missing
 from splatctrl_cli.logs.shot import Shot
-from splatctrl_cli.logs.survey import Survey, TopicSurvey
+from splatctrl_cli.logs.survey import Survey, TopicSurvey, survey_to_describe
 from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
 from splatctrl_cli.sources.describe_file import describe_file

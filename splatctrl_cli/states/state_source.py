@@ -10,11 +10,10 @@ from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.folder_description import has_table
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.logs.joints import joint_records
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.state_topics import with_prefix
+from splatctrl_cli.logs.state_topics import joint_records, with_prefix
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.records import LossReport, Record, RecordSource

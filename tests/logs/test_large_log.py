@@ -10,7 +10,7 @@ from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.mcap_records import DATA_END
 from splatctrl_cli.containers.raw_log import Damage
-from splatctrl_cli.logs import large_log
+from splatctrl_cli.logs import survey as surveys
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.sources.describe import describe
 from tests.logs.make_log import LogRecipe, make_log
@@ -40,7 +40,7 @@ def sparse_log(path: Path, num_bytes: int) -> Path:
 def test_a_large_log_is_described_without_being_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = sparse_log(tmp_path / "log.mcap", 10 * GIB)
     assert log.stat().st_size > 10 * GIB
-    monkeypatch.setattr(large_log, "survey", None)  # would be called to read it all
+    monkeypatch.setattr(surveys, "survey", None)  # would be called to read it all
     summary = describe(log)
     assert summary.facts["messages"] == 20 * 4 + 21
     assert summary.missing == ()
@@ -57,8 +57,8 @@ def test_an_index_counts_what_a_survey_counts(
         end = next(part.offset for part in McapFile(path).parts(Damage()) if part.opcode == DATA_END)
         path.write_bytes(path.read_bytes()[:end])
     expected = {name: topic.count for name, topic in survey(McapLog(path)).topics.items()}
-    monkeypatch.setattr(large_log, "LARGE", 0)
-    found, notes = large_log.survey_to_describe(open_raw_log(path))
+    monkeypatch.setattr(surveys, "LARGE", 0)
+    found, notes = surveys.survey_to_describe(open_raw_log(path))
     assert {name: topic.count for name, topic in found.topics.items()} == expected
     assert any("has no summary" in note for note in notes) != has_summary
     assert describe(path).missing == ()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.logs.pairing import pair_by_stamp
+from splatctrl_cli.logs.image_stamps import pair_by_stamp
 
 
 def test_each_image_pairs_with_the_nearest_in_time() -> None:

@@ -8,9 +8,9 @@ from mcap.writer import Writer as McapWriter
 
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
-from splatctrl_cli.logs import planned_images
+from splatctrl_cli.logs import frame_plan
+from splatctrl_cli.logs.frame_plan import HeldMessages, PlannedImages
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.planned_images import HeldMessages, PlannedImages
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
@@ -40,7 +40,7 @@ def topic_by_topic(log: Path, path: Path) -> Path:
 def test_a_log_that_keeps_its_topics_apart_gives_the_same_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held_bytes: int
 ) -> None:
-    monkeypatch.setattr(planned_images, "HELD_BYTES", held_bytes)
+    monkeypatch.setattr(frame_plan, "HELD_BYTES", held_bytes)
     log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
     apart = topic_by_topic(log, tmp_path / "apart.mcap")
     good, other = ([r for r in open_source(p).records() if isinstance(r, RgbdFrame)] for p in (log, apart))
@@ -52,7 +52,7 @@ def test_a_log_that_keeps_its_topics_apart_gives_the_same_frames(
 
 
 def test_held_messages_come_back_and_memory_holds_few_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planned_images, "HELD_BYTES", 100)
+    monkeypatch.setattr(frame_plan, "HELD_BYTES", 100)
     held = HeldMessages()
     data = [bytes([i]) * 40 for i in range(10)]
     for i, content in enumerate(data):

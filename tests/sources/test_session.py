@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.containers.session_log import SessionLog
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.image_rate import StampClock, dropped, first_of_each
+from splatctrl_cli.logs.image_stamps import StampClock, dropped, first_of_each
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.describe import describe
