@@ -9,7 +9,7 @@ import argparse
 import inspect
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -28,6 +28,7 @@ from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
 SHARED_BY = 3  # commands with the same option, in the same words, from which on it is explained once
+INPUT = "input"  # the group of options that say how a recording is read
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:\|.*\n)*)")
 REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout]]] = {
@@ -79,12 +80,23 @@ def cli_page() -> str:
         "",
         EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
     ]
-    counts = Counter(row for parser in _leaves(commands.choices.values()) for row in _rows(parser))
-    shared = [row for row, count in counts.items() if count >= SHARED_BY]
+    leaves = list(_leaves(commands.choices.values()))
+    counts = Counter(row for leaf in leaves for row in _rows(leaf))
+    of_recording = {row for leaf in leaves for row in _rows(leaf, INPUT)}
+    shared = {row: _kind(row, count == len(leaves), row in of_recording) for row, count in counts.items()}
+    shared = {row: kind for row, kind in shared.items() if kind or counts[row] >= SHARED_BY}
     for name, command in commands.choices.items():
-        lines += _command_section("##", name, command, set(shared))
-    lines += ["", "## Options of several commands", "", "The same in every command that lists them."]
-    return "\n".join([*lines, "", *_table(("argument", "meaning"), shared)]) + "\n"
+        lines += _command_section("##", name, command, shared)
+    lines += ["", "## Options of several commands", "", "The same in every command that has them."]
+    for kind in sorted(set(shared.values())):
+        rows = [row for row, other in shared.items() if other == kind]
+        lines += ["", *([f"### {kind}", ""] if kind else []), *_table(("argument", "meaning"), rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _kind(row: tuple[str, str], is_in_all: bool, is_of_recording: bool) -> str:
+    """The heading under which an option is explained once for all commands that have it, "" for none of its own."""
+    return "Of every command" if is_in_all else "Of a recording" if is_of_recording else ""
 
 
 def _leaves(parsers: Iterable[argparse.ArgumentParser]) -> Iterator[argparse.ArgumentParser]:
@@ -99,7 +111,7 @@ def _nested(parser: argparse.ArgumentParser) -> "argparse._SubParsersAction[Any]
 
 
 def _command_section(
-    level: str, name: str, parser: argparse.ArgumentParser, shared: set[tuple[str, str]]
+    level: str, name: str, parser: argparse.ArgumentParser, shared: Mapping[tuple[str, str], str]
 ) -> list[str]:
     """Heading, usage, summary and arguments; of a command with actions, a section for each action below it."""
     lines = ["", f"{level} {name}", "", _usage(name, parser), "", parser.description, ""]
@@ -107,14 +119,19 @@ def _command_section(
     if nested is None:
         rows = _rows(parser)
         lines += _table(("argument", "meaning"), [row for row in rows if row not in shared])
-        names = re.findall(r"--[a-z][a-z-]*", " ".join(row[0] for row in rows if row in shared))
-        common = ", ".join(f"`{name}`" for name in names)
-        return [*lines, "", f"[Shared options](#options-of-several-commands): {common}."]
+        names = [shared[row] or re.findall(r"--[a-z][a-z-]*", row[0])[-1] for row in rows if row in shared]
+        also = ", ".join(_link(name) for name in dict.fromkeys(names) if name != "Of every command")
+        return [*lines, "", f"Also: {also}."] if also else lines
     actions = [(f"`{name} {action.dest}`", action.help) for action in nested._choices_actions]
     lines += _table(("action", "what it does"), actions)
     for action, below in nested.choices.items():
         lines += _command_section(f"{level}#", f"{name} {action}", below, shared)
     return lines
+
+
+def _link(name: str) -> str:
+    """An option, or a heading of several, in the words of a list."""
+    return f"`{name}`" if name.startswith("-") else f"those [{name.lower()}](#{name.lower().replace(' ', '-')})"
 
 
 def _usage(name: str, parser: argparse.ArgumentParser) -> str:
@@ -131,9 +148,11 @@ def _placed(action: argparse.Action) -> str:
     return f"[{name}]" if action.nargs == "?" else name
 
 
-def _rows(parser: argparse.ArgumentParser) -> list[tuple[str, str]]:
+def _rows(parser: argparse.ArgumentParser, title: str | None = None) -> list[tuple[str, str]]:
+    """What --help shows of each argument, or of those in the group `title`."""
     formatter = parser._get_formatter()
-    actions = [a for group in parser._action_groups for a in group._group_actions if a.dest != "help"]
+    groups = [group for group in parser._action_groups if title in {None, group.title}]
+    actions = [a for group in groups for a in group._group_actions if a.dest != "help"]
     return [(f"`{_invocation(a)}`", formatter._expand_help(a) if a.help else "") for a in actions]
 
 
@@ -170,7 +189,7 @@ def config_page() -> str:
         "",
         "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it.",
     ]
-    header = ("key", "default", "range", "meaning, and reason for the range")
+    header = ("key", "default", "range", "meaning")
     for section in fields(config.Config):
         kind: Any = type(getattr(config.Config(), section.name))
         rows = [_setting_row(kind, key) for key in kind.declared]
@@ -180,11 +199,11 @@ def config_page() -> str:
 
 def _setting_row(section: type[Section], key: str) -> tuple[str, ...]:
     declared, hint = section.declared[key], get_type_hints(section)[key]
-    quoted = isinstance(declared, OneOf) and " or ".join(f'`"{word}"`' for word in declared.words)
+    quoted = isinstance(declared, OneOf) and ", ".join(f'`"{word}"`' for word in declared.words)
     return (
         f"`{key}`",
         f"`{_toml(getattr(section, key))}`" + ("" if type_name(hint) in SIMPLE else f" ({type_name(hint)})"),
-        quoted or declared.expected,
+        quoted or declared.expected.replace(" to ", "…"),
         declared.reason,
     )
 
@@ -196,7 +215,7 @@ def _toml(value: object) -> str:
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
     escaped = [[cell.replace("|", "\\|") for cell in row] for row in [header, *rows]]
     lines = [f"| {' | '.join(row)} |" for row in escaped]
-    lines.insert(1, f"|{' --- |' * len(header)}")
+    lines.insert(1, f"|{'---|' * len(header)}")
     return lines
 
 

@@ -55,13 +55,17 @@ def test_generated_pages_do_not_depend_on_the_terminal(monkeypatch: pytest.Monke
 
 def test_every_option_that_help_shows_is_in_the_page() -> None:
     page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    page, _, shared = page.partition("\n## Options of several commands\n")
+    of_kind = dict(re.findall(r"^### ([^\n]+)\n(.*?)(?=^### |\Z)", shared, flags=re.DOTALL | re.MULTILINE))
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", page, flags=re.DOTALL | re.MULTILINE))
     assert list(sections) == list(COMMANDS)
     subparsers = next(a for a in build_parser()._actions if a.dest == "command")
     assert isinstance(subparsers.choices, dict)
     for command, parser in subparsers.choices.items():
+        linked = [text for kind, text in of_kind.items() if f"[{kind.lower()}]" in sections[command]]
+        explained = "".join([sections[command], of_kind["Of every command"], *linked])
         for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", parser.format_help())) - {"--help"}:
-            assert option in sections[command], f"{command} {option}"
+            assert option in explained, f"{command} {option}"
 
 
 def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
