@@ -13,7 +13,7 @@ import numpy as np
 
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.control.barriers import Barrier
-from splatctrl_cli.control.problem import assemble
+from splatctrl_cli.control.ladder import assemble
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QpSolver, QuadraticProgram
 from splatctrl_cli.control.tasks import posture_task, velocity_task
 from splatctrl_cli.records import Float64

@@ -10,13 +10,12 @@ import numpy as np
 
 from benchmarks.scenes import TRAINING, sample_robot
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.course import LoggedMotion
-from splatctrl_cli.control.explain import runs_of
-from splatctrl_cli.control.rates import SceneStep, rate_of
+from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.goals import Guide, LoggedMotion
 from splatctrl_cli.control.replay import is_at_goal
+from splatctrl_cli.control.scene_field import SceneStep, rate_of
 from splatctrl_cli.control.standstill import BoxZone, StopZone, Zone, monitored_standstill
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.control.target import Guide
 from splatctrl_cli.jobs.known_scene import splat_fields
 from splatctrl_cli.records import Bool, Box, DistanceField, Float64
 from splatctrl_cli.scene.fitter import SceneFitter

@@ -7,12 +7,11 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.course import LoggedMotion, guided_goal
+from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
-from splatctrl_cli.control.rates import SceneStepAt, rate_of
+from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController, RowKind, VelocityMargin
-from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 FieldAt = Callable[[int], DistanceField]

@@ -19,15 +19,12 @@ from splatctrl_cli.control.checks import (
     sphere_clearance,
     static_violations,
 )
-from splatctrl_cli.control.course import LoggedMotion
-from splatctrl_cli.control.detour import Detour, PlanDetour
+from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
-from splatctrl_cli.control.rates import SceneStepAt, rate_of
 from splatctrl_cli.control.rows import scene_margin
+from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.control.target import Guide, pose_error
-from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.records import DistanceField, Float64, FloatRows
 
 FieldAt = Callable[[int], DistanceField]

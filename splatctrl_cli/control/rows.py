@@ -9,7 +9,7 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import barriers
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.barriers import Barrier
-from splatctrl_cli.control.braking import braking_speed
+from splatctrl_cli.control.limits import braking_speed
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.records import Bool, DistanceField, Float64
 

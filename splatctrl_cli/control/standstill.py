@@ -9,7 +9,7 @@ import numpy as np
 
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import Stamps
-from splatctrl_cli.control.course import LoggedMotion
+from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Bool, Box, Float64
 

@@ -10,12 +10,12 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import tasks
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.checks import check_coverage, check_model, checked_posture
+from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.presets import PAPER, PrintedTask, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named
 from splatctrl_cli.control.rows import RowBuilder, Rows
-from splatctrl_cli.control.target import Guide, pose_error, reference_velocity
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 SCALES = (0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from splatctrl_cli.control.explain import EventKind
+from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replay_judged import SLOW, Judged, counted, events_of, held, least_of, mm, nearby, seconds_at

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction, Observed, observed_lookup
-from splatctrl_cli.control.explain import UNREPRESENTED, Obstacle
+from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
-from splatctrl_cli.control.people import guarded
-from splatctrl_cli.control.rates import SceneStep
+from splatctrl_cli.control.scene_field import SceneStep, guarded
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.distance import SphereField, field_over
 from splatctrl_cli.field.grid import GridField, exact_channel

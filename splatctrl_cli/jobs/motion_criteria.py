@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from splatctrl_cli.control.explain import EventKind
+from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replay_judged import (

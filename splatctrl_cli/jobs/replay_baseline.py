@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.explain import runs_of
+from splatctrl_cli.control.events import runs_of
 from splatctrl_cli.control.replay import Outcome
 from splatctrl_cli.control.standstill import (
     BoxZone,

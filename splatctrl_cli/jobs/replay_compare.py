@@ -10,7 +10,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction
-from splatctrl_cli.control.detour import PlanDetour
+from splatctrl_cli.control.goals import PlanDetour
 from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.errors import UsageError

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.control.explain import INTERVENTIONS, SHOWN, Event
+from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event
 from splatctrl_cli.records import Float64, FloatRows
 from splatctrl_cli.report.replay_pictures import (
     clearance_picture,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.explain import INTERVENTIONS, SHOWN, Event, first_intervention
+from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, first_intervention
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 from splatctrl_cli.jobs import replay_compare

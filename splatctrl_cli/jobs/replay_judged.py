@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.control.explain import Event, EventKind
+from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replay_metrics import Metrics
 from splatctrl_cli.jobs.replay_modes import Replay

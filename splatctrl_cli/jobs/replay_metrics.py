@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from splatctrl_cli.control.explain import first_intervention
+from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.replay import Outcome
 from splatctrl_cli.control.step import RowKind

@@ -10,14 +10,14 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.checks import StaticViolation, check_within_limits, static_violations
-from splatctrl_cli.control.course import LoggedMotion
-from splatctrl_cli.control.explain import Event, EventFold, EventKind, Obstacle, clearance_signals
+from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle
+from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
 from splatctrl_cli.control.rows import scene_margin
+from splatctrl_cli.control.signals import clearance_signals
 from splatctrl_cli.control.standstill import Separation
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.clearance import ClearanceAgreement, clearance_agreement, mark_seen
 from splatctrl_cli.files.rows import RowFile, Rows, ranges

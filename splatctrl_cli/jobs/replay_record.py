@@ -9,19 +9,11 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, Clearance, Stamps, audited, moving_clearance
 from splatctrl_cli.control.checks import static_clearance
-from splatctrl_cli.control.explain import (
-    EventFold,
-    EventKind,
-    Obstacle,
-    audit_signals,
-    interval_signals,
-    limit_signals,
-    stale_signal,
-    step_signals,
-)
+from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.motion_limits import MotionLimits
 from splatctrl_cli.control.near_space import NearSpace
+from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replay_store import BLOCK, Figures, StoredAudit, StoredObjects

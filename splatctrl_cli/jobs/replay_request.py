@@ -6,7 +6,7 @@ from dataclasses import field as made_by
 from pathlib import Path
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.course import LoggedMotion
+from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.jobs.evidence import Mismatch
 from splatctrl_cli.jobs.known_scene import KnownScene
 from splatctrl_cli.logs.options import SourceOptions

@@ -7,8 +7,8 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import Stamps
+from splatctrl_cli.control.goals import TwistTrack
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replay_request import ReplayRequest

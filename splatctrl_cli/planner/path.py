@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.target import rotation_vector
+from splatctrl_cli.control.goals import rotation_vector
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.planner.clearance import Clearance
 from splatctrl_cli.planner.edges import ROUNDING, STILL

@@ -6,11 +6,10 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
-from splatctrl_cli.control.course import guided_goal
-from splatctrl_cli.control.rates import SceneStepAt, rate_of
+from splatctrl_cli.control.goals import Guide, guided_goal, pose_error
 from splatctrl_cli.control.replay import FieldAt, is_at_goal
+from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.control.target import Guide, pose_error
 from splatctrl_cli.planner.clearance import Clearance
 from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length
 from splatctrl_cli.records import Float64

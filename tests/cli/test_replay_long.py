@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.control.explain import EventFold, EventKind, Signal, events_of
+from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.files import rows
 from splatctrl_cli.jobs import replay_columns, replay_record, replay_store
 from splatctrl_cli.logs import state_columns

@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, ControlConfig
-from splatctrl_cli.control.explain import UNREPRESENTED
+from splatctrl_cli.control.events import UNREPRESENTED
 from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.jobs.known_scene import from_splats, splat_fields
 from splatctrl_cli.records import Balls, Float64, KnownVoxels, Label

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.detour import Detour
+from splatctrl_cli.control.goals import Detour
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
 from splatctrl_cli.planner.path import timed
 from splatctrl_cli.records import Float64

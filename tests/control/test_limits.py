@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig, load_config
-from splatctrl_cli.control.braking import braking_speed, brought_to_rest
-from splatctrl_cli.control.course import LoggedMotion
-from splatctrl_cli.control.limits import JointLimits
+from splatctrl_cli.control.goals import LoggedMotion
+from splatctrl_cli.control.limits import JointLimits, braking_speed, brought_to_rest, fr3_limits
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
-from splatctrl_cli.control.velocity_limits import fr3_limits
 from splatctrl_cli.errors import UsageError
 from tests.control.fakes import PlanarArm, far_away
 from tests.reference.control import braking_room, fr3_velocity_range

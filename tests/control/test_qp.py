@@ -7,8 +7,7 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import Barrier, can_bind
-from splatctrl_cli.control.ladder import Rung, descend
-from splatctrl_cli.control.problem import assemble, assemble_hard
+from splatctrl_cli.control.ladder import Rung, assemble, assemble_hard, descend
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QuadraticProgram, residuals, solver_named
 from splatctrl_cli.control.tasks import Cost, eliminated_weight, posture_task, velocity_task
 from splatctrl_cli.errors import UsageError

@@ -9,8 +9,8 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.limits import JointLimits, box_rows
 from splatctrl_cli.control.presets import PrintedTask, assemble_printed
-from splatctrl_cli.control.rates import SceneStep, distance_rate
 from splatctrl_cli.control.rows import BRAKING_SHARE, RowBuilder, Rows, scene_margin
+from splatctrl_cli.control.scene_field import SceneStep, distance_rate
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.tasks import posture_task
 from splatctrl_cli.errors import InputError

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.control.course import LoggedMotion
-from splatctrl_cli.control.explain import runs_of
+from splatctrl_cli.control.events import runs_of
+from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.standstill import (
     RESOLUTION,
     BoxZone,

@@ -13,8 +13,8 @@ from splatctrl_cli.control.barriers import (
     pair_distance,
     pair_gradient,
 )
+from splatctrl_cli.control.goals import pose_error, reference_velocity, rotation_vector
 from splatctrl_cli.control.limits import box_rows, velocity_box
-from splatctrl_cli.control.target import pose_error, reference_velocity, rotation_vector
 from splatctrl_cli.control.tasks import posture_task, velocity_task
 from splatctrl_cli.geometry import rotation_from_quat, transform_from
 from tests.control.fakes import Balls, PlanarArm, Plane

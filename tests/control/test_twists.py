@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.course import LoggedMotion
+from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import Outcome, ReplayTask, ReplayTrace, closed_loop
-from splatctrl_cli.control.twists import TwistTrack
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm, far_away
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.explain import EventKind
+from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs import evidence_criteria as evidence

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
+from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import ReplayTask, is_at_goal
-from splatctrl_cli.control.target import pose_error
 from splatctrl_cli.planner.path import least_clearance
 from splatctrl_cli.planner.planned import (
     GOAL_BLOCKED,

@@ -7,20 +7,18 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.audit import audit
-from splatctrl_cli.control.explain import (
+from splatctrl_cli.control.events import (
     UNREPRESENTED,
     Event,
     EventKind,
     Obstacle,
     Signal,
-    audit_signals,
     events_of,
     first_intervention,
     runs_of,
-    stale_signal,
-    step_signals,
 )
 from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.signals import audit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep, Intervention, QpIkController, RowKind, RowSlack
 from splatctrl_cli.records import JointState
 from tests.control.fakes import Balls, PlanarArm, far_away

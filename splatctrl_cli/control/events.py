@@ -1,16 +1,13 @@
 """When and why: runs of states with something to say about them, as intervals with their worst value and names."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.control.audit import AuditTrace, Stamps
-from splatctrl_cli.control.ladder import Rung
-from splatctrl_cli.control.motion_limits import Strain
-from splatctrl_cli.control.step import ControlStep, RowKind
+from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.records import Bool, Float64
 
 UNREPRESENTED = "unrepresented voxel"  # label of an obstacle that is occupied and has no splat
@@ -101,6 +98,22 @@ class Event:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OneEach:
+    """One of `names` at each state, by index (T,)."""
+
+    names: Sequence[str]
+    index: NDArray[np.int64]
+
+    def __call__(self, i: int) -> Sequence[str]:
+        return [self.names[int(self.index[i])]]
+
+    def over(self, first: int, end: int) -> Sequence[str]:
+        """Each name of these states once, in the order they come up."""
+        found, at = np.unique(self.index[first:end], return_index=True)
+        return [self.names[int(i)] for i in found[np.argsort(at)]]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Signal:
     """What makes events of one kind: is_on (T,), value (T,), the names at a state (the one that the value is of comes
     first), and which end is the worse.
@@ -115,7 +128,7 @@ class Signal:
 
     def names_over(self, first: int, end: int) -> Iterable[str]:
         """The names at these states, in the order they come up."""
-        if isinstance(self.names_at, _OneEach):
+        if isinstance(self.names_at, OneEach):
             return self.names_at.over(first, end)
         return (name for i in range(first, end) for name in self.names_at(i))
 
@@ -145,14 +158,14 @@ class _Run:
     kind: EventKind
     source: str
     first_ns: int
-    last_ns: int
-    num_states: int
-    worst: float
-    state: int
-    worst_ns: int
-    worst_name: str
-    names: dict[str, None]
-    obstacle: Obstacle | None
+    last_ns: int = 0
+    num_states: int = 0
+    worst: float = np.nan
+    state: int = -1
+    worst_ns: int = 0
+    worst_name: str = ""
+    names: dict[str, None] = field(default_factory=dict)
+    obstacle: Obstacle | None = None
 
 
 class EventFold:
@@ -177,7 +190,9 @@ class EventFold:
                 self._closed.append(before)
                 before = None
             for first, end in runs:
-                run = before or _begun(order, signal, int(stamp_ns[first]))
+                run = before or _Run(
+                    order=order, kind=signal.kind, source=signal.source, first_ns=int(stamp_ns[first])
+                )
                 before = None
                 self._grown(run, stamp_ns, signal, first, end, near)
                 if end == len(stamp_ns):
@@ -227,175 +242,6 @@ class EventFold:
         )
 
 
-def _begun(order: int, signal: Signal, first_ns: int) -> _Run:
-    return _Run(
-        order=order,
-        kind=signal.kind,
-        source=signal.source,
-        first_ns=first_ns,
-        last_ns=first_ns,
-        num_states=0,
-        worst=-np.inf if signal.is_high_worse else np.inf,
-        state=-1,
-        worst_ns=first_ns,
-        worst_name="",
-        names={},
-        obstacle=None,
-    )
-
-
-def audit_signals(
-    audit: AuditTrace,
-    margin: float,
-    spheres: Sequence[str],
-    joints: Sequence[str],
-    self_pairs: Sequence[tuple[int, int]] = (),
-) -> list[Signal]:
-    """What the clearances, limits and known space of T states amount to; self_pairs (P, 2): of spheres."""
-    signals = []
-    for source, clearance in audit.clearance.items():
-        signals += clearance_signals(source, clearance.distance, clearance.sphere, margin, spheres)
-        is_blank = np.isnan(clearance.distance)
-        names = _names_of(spheres, clearance.sphere)
-        signals.append(
-            Signal(
-                kind=EventKind.WITHOUT_DISTANCE,
-                is_on=is_blank,
-                value=is_blank.astype(np.float64),
-                names_at=names,
-                source=source,
-            )
-        )
-    unknown = np.nan_to_num(audit.unknown_share)
-    signals.append(Signal(kind=EventKind.UNKNOWN_SPACE, is_on=unknown > 0, value=unknown, names_at=_nobody))
-    outside = audit.limit_margin
-    signals.append(_low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, _names_of(joints, audit.limit_joint)))
-    touching, pairs = audit.self_clearance, [f"{spheres[a]} and {spheres[b]}" for a, b in self_pairs]
-    signals.append(_low(EventKind.SELF_COLLISION, touching < 0, touching, _names_of(pairs, audit.self_pair)))
-    return signals
-
-
-def clearance_signals(
-    source: str, distance: Float64, sphere: NDArray[np.int64], margin: float, spheres: Sequence[str]
-) -> list[Signal]:
-    """Below the margin, and in contact, by the clearance (T,) [m] of the sphere (T,) that is nearest."""
-    names = _names_of(spheres, sphere)
-    return [
-        _low(kind, distance < bound, distance, names, source)
-        for kind, bound in ((EventKind.BELOW_MARGIN, margin), (EventKind.IN_COLLISION, 0.0))
-    ]
-
-
-def limit_signals(strain: Strain, joints: Sequence[str]) -> list[Signal]:
-    """Where a motion is faster, or changes more suddenly, than its joints may."""
-    return [
-        Signal(kind=kind, is_on=value > 1, value=value, names_at=_names_of(joints, joint))
-        for kind, value, joint in (
-            (EventKind.TOO_FAST, strain.velocity, strain.velocity_joint),
-            (EventKind.TOO_SUDDEN, strain.acceleration, strain.acceleration_joint),
-        )
-    ]
-
-
-def interval_signals(lower: Float64, unbounded: Float64, margin: float) -> list[Signal]:
-    """Since the state before each of T: a clearance bound (T,) [m] below the margin, and time (T,) [s] unbounded."""
-    is_low = lower < margin
-    return [
-        _low(EventKind.BETWEEN_STATES, is_low, lower, _nobody),
-        Signal(kind=EventKind.NOT_BOUNDED, is_on=unbounded > 0, value=unbounded, names_at=_nobody),
-    ]
-
-
-def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
-    """Where the scene in use is older than allowed; age_s (T,) [s], NaN where a scene has no time."""
-    return Signal(kind=EventKind.STALE_MAP, is_on=age_s > max_age_s, value=np.nan_to_num(age_s), names_at=_nobody)
-
-
-def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
-    """What the controller did at T states; None where it was not asked."""
-    signals = [_intervention_signal(steps, kind) for kind in RowKind]
-    slack = _of(steps, lambda step: max((row.slack for row in step.relaxed), default=0.0))
-    signals.append(
-        Signal(
-            kind=EventKind.RELAXED,
-            is_on=slack > 0,
-            value=slack,
-            names_at=lambda i: [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)],
-        )
-    )
-    residual, clearance = _of(steps, lambda step: step.residual), _of(steps, lambda step: step.clearance)
-    is_least = _of(steps, lambda step: float(step.rung is Rung.MINIMUM_VIOLATION)) > 0
-    is_hold = _of(steps, lambda step: float(step.rung is Rung.HOLD)) > 0
-    scale = _of(steps, lambda step: step.scale, otherwise=1.0)
-    cannot = _of(steps, lambda step: float(len(step.violated_fixed))) > 0
-    fixed = _of(steps, lambda step: step.fixed_distance)
-
-    def nearest(i: int) -> Sequence[str]:
-        return [_asked(steps, i).nearest]
-
-    signals += [
-        Signal(kind=EventKind.MINIMUM_VIOLATION, is_on=is_least, value=residual, names_at=nearest),
-        _low(EventKind.HOLD, is_hold, clearance, nearest),
-        _low(EventKind.SCALED_BACK, (scale < 1) & ~is_hold, scale, nearest),
-        _low(EventKind.CANNOT_ACT, cannot, fixed, lambda i: _asked(steps, i).violated_fixed),
-    ]
-    return signals
-
-
 def first_intervention(events: Sequence[Event]) -> Event | None:
     """The earliest event in which the controller did something else than it was asked for."""
     return next((event for event in events if event.kind in INTERVENTIONS), None)
-
-
-def _intervention_signal(steps: Sequence[ControlStep | None], kind: RowKind) -> Signal:
-    def largest(step: ControlStep) -> float:
-        return max((row.multiplier for row in step.interventions if row.kind is kind), default=0.0)
-
-    def names_at(index: int) -> Sequence[str]:
-        rows = [row for row in _asked(steps, index).interventions if row.kind is kind]
-        return [row.name for row in sorted(rows, key=lambda row: -row.multiplier)]
-
-    value = _of(steps, largest)
-    return Signal(kind=EventKind(kind.value), is_on=value > 0, value=value, names_at=names_at)
-
-
-def _low(
-    kind: EventKind, is_on: Bool, value: Float64, names_at: Callable[[int], Sequence[str]], source: str = ""
-) -> Signal:
-    return Signal(kind=kind, is_on=is_on, value=value, names_at=names_at, is_high_worse=False, source=source)
-
-
-def _of(
-    steps: Sequence[ControlStep | None], value: Callable[[ControlStep], float], otherwise: float = 0.0
-) -> Float64:
-    return np.array([otherwise if step is None else value(step) for step in steps], dtype=np.float64)
-
-
-def _asked(steps: Sequence[ControlStep | None], index: int) -> ControlStep:
-    step = steps[index]
-    assert step is not None
-    return step
-
-
-@dataclass(frozen=True, kw_only=True)
-class _OneEach:
-    """One of `names` at each state, by index (T,)."""
-
-    names: Sequence[str]
-    index: NDArray[np.int64]
-
-    def __call__(self, i: int) -> Sequence[str]:
-        return [self.names[int(self.index[i])]]
-
-    def over(self, first: int, end: int) -> Sequence[str]:
-        """Each name of these states once, in the order they come up."""
-        found, at = np.unique(self.index[first:end], return_index=True)
-        return [self.names[int(i)] for i in found[np.argsort(at)]]
-
-
-def _names_of(names: Sequence[str], index: NDArray[np.int64]) -> Callable[[int], Sequence[str]]:
-    return _OneEach(names=names, index=index)
-
-
-def _nobody(_: int) -> Sequence[str]:
-    return ()

@@ -1,0 +1,187 @@
+"""Where the frame should be at each time, and the velocity that leads there: a pose, a logged motion that is followed
+pose by pose, a planned way out of a local minimum, or the twists that a person or another controller commanded.
+
+Twists are world-aligned, linear part first.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.audit import Stamps
+from splatctrl_cli.geometry import quat_from_rotation
+from splatctrl_cli.records import Bool, Float64, FloatRows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guide:
+    """How a goal itself moves: twist (6,) [m/s, rad/s], world, of its pose; posture (J,) [rad] that the arm leans to,
+    and the velocity (J,) [rad/s] of that posture.
+    """
+
+    twist: Float64
+    posture: Float64
+    velocity: Float64
+
+
+def rotation_vector(R: Float64) -> Float64:
+    """The logarithm (3,) [rad] of a rotation (3, 3): axis times an angle in [0, pi]."""
+    quat_xyzw = quat_from_rotation(R)
+    half_sine = float(np.linalg.norm(quat_xyzw[:3]))
+    if half_sine == 0.0:
+        return np.zeros(3)
+    return np.asarray(quat_xyzw[:3] * (2.0 * np.arctan2(half_sine, quat_xyzw[3]) / half_sine))
+
+
+def pose_error(T_world_frame: Float64, T_world_goal: Float64) -> Float64:
+    """The twist (6,) [m, rad] in world that carries a frame to its goal in one second."""
+    rotation = rotation_vector(T_world_goal[:3, :3] @ T_world_frame[:3, :3].T)
+    return np.concatenate([T_world_goal[:3, 3] - T_world_frame[:3, 3], rotation])
+
+
+def reference_velocity(error: Float64, *, gain: float, max_linear: float, max_angular: float) -> Float64:
+    """The reference (6,) [m/s, rad/s]: gain times the pose error, each part capped in norm, direction kept."""
+    velocity = gain * error
+    return np.concatenate([_capped(velocity[:3], max_linear), _capped(velocity[3:], max_angular)])
+
+
+def _capped(vector: Float64, limit: float) -> Float64:
+    norm = float(np.linalg.norm(vector))
+    return vector if norm <= limit else vector * (limit / norm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggedMotion:
+    """T logged states by time: stamp_ns (T,) that never go back, position and velocity (T, J) [rad, rad/s], which may
+    be read from a file.
+    """
+
+    stamp_ns: Stamps
+    position: FloatRows
+    velocity: FloatRows
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last state."""
+        return int(self.stamp_ns[-1])
+
+    def at(self, stamp_ns: int) -> tuple[Float64, Float64]:
+        """Position and velocity (J,) at a stamp, linear between states; the first before all, and the last, at rest,
+        after all.
+        """
+        if stamp_ns > self.last_ns:
+            return np.asarray(self.position[-1]), np.zeros(self.position.shape[1])
+        after = int(np.searchsorted(self.stamp_ns, stamp_ns, side="left"))
+        if after == 0 or self.stamp_ns[after] == stamp_ns:
+            return np.asarray(self.position[after]), np.asarray(self.velocity[after])
+        before_ns, after_ns = self.stamp_ns[after - 1 : after + 1]
+        share = float(stamp_ns - before_ns) / float(after_ns - before_ns)
+        position, velocity = (
+            (1.0 - share) * values[after - 1] + share * values[after] for values in (self.position, self.velocity)
+        )
+        return position, velocity
+
+    def goal_at(self, model: ArmModel, frame: str, stamp_ns: int) -> tuple[Float64, Guide]:
+        """The logged pose (4, 4) of a frame at a stamp, and how it and the posture moved then."""
+        position, velocity = self.at(stamp_ns)
+        return guided_goal(model, frame, position, velocity)
+
+
+def guided_goal(model: ArmModel, frame: str, position: Float64, velocity: Float64) -> tuple[Float64, Guide]:
+    """The pose (4, 4) of a frame at a posture (J,) that moves with a velocity (J,), as a goal that moves."""
+    twist = model.frame_jacobian(position, frame) @ velocity
+    return model.frame_pose(position, frame), Guide(twist=twist, posture=position, velocity=velocity)
+
+
+class Path(Protocol):
+    """A motion with a clock; `planner.path.TimedPath` is one."""
+
+    @property
+    def duration(self) -> float:
+        """Seconds from start to end."""
+        ...
+
+    def at(self, time: float) -> tuple[Float64, Float64]:
+        """Position and velocity (1, J) at a time [s]."""
+        ...
+
+
+@dataclass
+class Detour:
+    """A path with a clock that runs on only while the frame is within `wait_distance` [m] of its goal on the path."""
+
+    path: Path
+    wait_distance: float
+    clock: float = 0.0
+
+    @property
+    def is_over(self) -> bool:
+        """True once the goal stands at the path's end."""
+        return self.clock >= self.path.duration
+
+    def goal(self, model: ArmModel, frame: str) -> tuple[Float64, Guide]:
+        """The pose (4, 4) of a frame where the clock stands, and how it and the posture move there."""
+        position, velocity = self.path.at(self.clock)
+        return guided_goal(model, frame, position[0], velocity[0])
+
+    def advance(self, seconds: float, pose_error: Float64) -> None:
+        """Let the clock run, unless the frame is behind by its pose error (6,)."""
+        if float(np.linalg.norm(pose_error[:3])) < self.wait_distance:
+            self.clock = min(self.clock + seconds, self.path.duration)
+
+
+PlanDetour = Callable[[int, Float64, Float64], Detour | None]
+"""A stamp [ns], the posture (J,) and the goal's pose (4, 4) -> a way there in the scene known then, or None."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwistTrack:
+    """N twists by time: stamp_ns (N,) that rise, twist (N, 6) [m/s, rad/s] of the controlled frame, linear first.
+
+    axes: the frame whose axes they are in, turned with it as the arm moves; None for those of the world.
+    """
+
+    stamp_ns: Stamps
+    twist: Float64
+    axes: str | None = None
+
+    def at(self, stamp_ns: int, timeout: float) -> Float64:
+        """The newest twist (6,) not later than a stamp [ns]; zero where it is older than `timeout` [s] or none is."""
+        index = int(np.searchsorted(self.stamp_ns, stamp_ns, side="right")) - 1
+        if index < 0 or (stamp_ns - self.stamp_ns[index]) * 1e-9 > timeout:
+            return np.zeros(6)
+        return np.asarray(self.twist[index])
+
+    def is_known(self, stamp_ns: Stamps, timeout: float) -> Bool:
+        """Whether a twist holds at each stamp (T,)."""
+        index = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
+        age = (stamp_ns - self.stamp_ns[np.maximum(index, 0)]) * 1e-9
+        return np.asarray((index >= 0) & (age <= timeout))
+
+    def asked(self, model: ArmModel, q: Float64, stamp_ns: int, timeout: float) -> Float64:
+        """The twist (6,) of a stamp in the world's axes, at a posture (J,); not capped."""
+        twist = self.at(stamp_ns, timeout)
+        if self.axes is None:
+            return twist
+        R = model.frame_pose(q, self.axes)[:3, :3]
+        return np.concatenate([R @ twist[:3], R @ twist[3:]])
+
+    def reference(self, model: ArmModel, config: ControlConfig, q: Float64, stamp_ns: int) -> Float64:
+        """What the controller reaches for (6,), world: the twist, each part capped in norm as any reference."""
+        return reference_velocity(
+            self.asked(model, q, stamp_ns, config.twist_timeout),
+            gain=1.0,
+            max_linear=config.max_linear_speed,
+            max_angular=config.max_angular_speed,
+        )
+
+    def goal_at(
+        self, model: ArmModel, config: ControlConfig, frame: str, q: Float64, stamp_ns: int
+    ) -> tuple[Float64, Guide]:
+        """The frame's own pose (4, 4) as a goal that moves with the twist; the posture leans nowhere."""
+        twist = self.reference(model, config, q, stamp_ns)
+        return model.frame_pose(q, frame), Guide(twist=twist, posture=q, velocity=np.zeros(len(q)))
