@@ -397,7 +397,6 @@ def test_what_was_once_a_false_green_is_none(seed: int, index: int) -> None:
     assert not found.is_false_green, found
 
 
-@pytest.mark.xfail(strict=True, reason="as many spheres come to unseen space in runs without a fault")
 def test_a_thing_in_space_that_a_lone_camera_never_saw_is_no_false_green() -> None:
     assert not run(0, 2157).is_false_green
 
