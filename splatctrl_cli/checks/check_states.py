@@ -58,7 +58,7 @@ def log_states(
 def stream_findings(where: str, stream: JointStream) -> list[Finding]:
     """What is wrong with the states of a topic that name the same joints, as they were recorded."""
     found: list[Finding] = []
-    position = stream.column("position")
+    position = stream.columns().get("position")
     if position is None:
         return []
     num_bad, first_bad, joint = 0, 0, 0
@@ -91,7 +91,7 @@ def stream_findings(where: str, stream: JointStream) -> list[Finding]:
 def _velocities(where: str, stream: JointStream, is_moving: bool) -> list[Finding]:
     if not is_moving:
         return [note("joints-still", where, "no joint moves")]
-    velocity = stream.column("velocity")
+    velocity = stream.columns().get("velocity")
     if velocity is None:
         text = "no velocities were recorded: the change of the positions is taken"
         return [note("joints-velocity", where, text)]

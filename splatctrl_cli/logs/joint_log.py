@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.files.rows import BLOCK, RowFile, Rows
-from splatctrl_cli.logs.state_columns import append_after
+from splatctrl_cli.files.rows import Rows
+from splatctrl_cli.logs.state_columns import ColumnWriter
 from splatctrl_cli.logs.state_messages import RawJoints
 from splatctrl_cli.records import Float64
 
@@ -22,23 +22,19 @@ class JointStream:
         self.names = names
         self._stamps, self._log_times = array("q"), array("q")
         self._orders: dict[tuple[str, ...], list[int]] = {names: list(range(len(names)))}
-        self._waiting: list[RawJoints] = []
-        self._files: dict[str, RowFile] = {}
+        self._columns = ColumnWriter({name: (4, 4) if name == "T_base_ee" else (len(names),) for name in COLUMNS})
 
     @classmethod
     def of(
         cls, names: tuple[str, ...], stamp_ns: Stamps, log_time_ns: Stamps, columns: Mapping[str, Iterable[Float64]]
     ) -> "JointStream":
-        """The stream that had these columns, given as blocks of rows."""
+        """The stream that had these columns, given as blocks of rows. Raises ValueError for other lengths."""
         stream = cls(names)
         stream._stamps.extend(stamp_ns.tolist())
         stream._log_times.extend(log_time_ns.tolist())
         for name, blocks in columns.items():
-            shape = (4, 4) if name == "T_base_ee" else (len(names),)
-            stream._files[name] = RowFile(shape)
-            for block in blocks:
-                stream._files[name].append(block)
-        if {len(file) for file in stream._files.values()} - {len(stream)}:
+            stream._columns.add_column(name, blocks)
+        if columns and len(stream._columns) != len(stream):
             raise ValueError(f"columns of other lengths than {len(stream)}")
         return stream
 
@@ -55,32 +51,18 @@ class JointStream:
         """When they were logged (T,)."""
         return np.array(self._log_times, dtype=np.int64)
 
-    def column(self, name: str) -> Rows | None:
-        """position, velocity, commanded_velocity (T, J), T_base_ee (T, 4, 4): NaN where a state has none, None where
-        none has one.
+    def columns(self) -> dict[str, Rows]:
+        """position, velocity, commanded_velocity (T, J), T_base_ee (T, 4, 4): NaN where a state has none, not there
+        where none has one.
         """
-        self._flush()
-        return Rows(self._files[name]) if name in self._files else None
+        return self._columns.tables()
 
     def add(self, state: RawJoints) -> None:
         """The next state. Raises OverflowError for a time beyond 64 bits."""
         times = array("q", (state.stamp_ns, state.log_time_ns))  # both, before either is kept
         self._stamps.append(times[0])
         self._log_times.append(times[1])
-        self._waiting.append(state)
-        if len(self._waiting) == BLOCK:
-            self._flush()
-
-    def _flush(self) -> None:
-        states, num = self._waiting, len(self._stamps) - len(self._waiting)
-        self._waiting = []
-        for name in COLUMNS if states else ():
-            values = [self._row(state, name) for state in states]
-            if any(value is not None for value in values) or name in self._files:
-                shape = (4, 4) if name == "T_base_ee" else (len(self.names),)
-                nothing = np.full(shape, np.nan)
-                rows = np.array([nothing if value is None else value for value in values])
-                append_after(self._files, name, shape, num, rows)
+        self._columns.add({name: self._row(state, name) for name in COLUMNS})
 
     def _row(self, state: RawJoints, name: str) -> Float64 | None:
         value: Float64 | None = getattr(state, name)

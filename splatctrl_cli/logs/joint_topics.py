@@ -16,7 +16,7 @@ from splatctrl_cli.containers.raw_log import Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_head, npy_of
 from splatctrl_cli.files.rows import Rows, blocks_of, ranges
-from splatctrl_cli.logs.joint_log import COLUMNS, JointLog, JointStream
+from splatctrl_cli.logs.joint_log import JointLog, JointStream
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.state_topics import joint_records
@@ -67,7 +67,7 @@ def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) 
             times = {"stamp_ns": stream.stamp_ns, "log_time_ns": stream.log_time_ns}
             for name, values in times.items():
                 np.save(folder / place / f"{name}.npy", values, allow_pickle=False)
-            columns = {name: rows for name in COLUMNS if (rows := stream.column(name)) is not None}
+            columns = stream.columns()
             for name, rows in columns.items():
                 _write_rows(folder / place / f"{name}.npy", rows)
             for name in (*times, *columns):

@@ -1,8 +1,10 @@
 """Cleaned joint states as columns that memory need not hold, and as the states they are."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import overload
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Self, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,8 @@ from splatctrl_cli.files.rows import BLOCK, RowFile, Rows, Table, of_columns, ra
 from splatctrl_cli.records import Float64, JointState
 
 Stamps = NDArray[np.int64]
+OF_JOINTS = ("position", "velocity", "commanded_velocity")
+COLUMNS = (*OF_JOINTS, "T_base_ee", "T_world_ee")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,29 +70,63 @@ class StateColumns(Sequence[JointState]):
             for i, stamp in enumerate(self.stamp_ns[first:last].tolist())
         ]
 
-    def select(self, index: NDArray[np.int64]) -> "StateColumns":
+    def select(self, index: NDArray[np.int64]) -> Self:
         """The states of an index (K,), in its order."""
-        commanded, base, world = self.commanded_velocity, self.T_base_ee, self.T_world_ee
-        return StateColumns(
-            stamp_ns=self.stamp_ns[index],
-            position=selected(self.position, index),
-            velocity=selected(self.velocity, index),
-            commanded_velocity=None if commanded is None else selected(commanded, index),
-            T_base_ee=None if base is None else selected(base, index),
-            T_world_ee=None if world is None else selected(world, index),
-        )
+        return replace(self, stamp_ns=self.stamp_ns[index], **self._each(partial(selected, index=index), COLUMNS))
 
-    def of_joints(self, order: NDArray[np.int64]) -> "StateColumns":
+    def of_joints(self, order: NDArray[np.int64]) -> Self:
         """The joints of an order (J,)."""
-        commanded = self.commanded_velocity
-        return StateColumns(
-            stamp_ns=self.stamp_ns,
-            position=of_columns(self.position, order),
-            velocity=of_columns(self.velocity, order),
-            commanded_velocity=None if commanded is None else of_columns(commanded, order),
-            T_base_ee=self.T_base_ee,
-            T_world_ee=self.T_world_ee,
-        )
+        return replace(self, **self._each(partial(of_columns, order=order), OF_JOINTS))
+
+    def _each(self, change: Callable[[Table], Table], names: Iterable[str]) -> dict[str, Any]:
+        """What becomes of those columns that there are."""
+        return {name: change(table) for name in names if (table := getattr(self, name)) is not None}
+
+
+class ColumnWriter:
+    """Columns of states that come one after the other, a block at a time: NaN where a state has no value."""
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """shapes: of a row of each column."""
+        self._shapes = shapes
+        self._files: dict[str, RowFile] = {}
+        self._num = 0  # states that are in the files
+        self._waiting: list[Mapping[str, Float64 | None]] = []
+
+    def __len__(self) -> int:
+        return self._num + len(self._waiting)
+
+    def add(self, values: Mapping[str, Float64 | None]) -> None:
+        """The next state's, by column."""
+        self._waiting.append(values)
+        if len(self._waiting) == BLOCK:
+            self._flush()
+
+    def add_column(self, name: str, blocks: Iterable[Float64]) -> None:
+        """A whole column of states that are known already."""
+        file = self._files.setdefault(name, RowFile(self._shapes[name]))
+        for block in blocks:
+            file.append(block)
+        if len(file) != (self._num or len(file)):
+            raise ValueError(f"{name}: {len(file)} rows, expected {self._num}")
+        self._num = len(file)
+
+    def tables(self) -> dict[str, Rows]:
+        """Of all states so far; a column of which no state has a value is not there."""
+        self._flush()
+        return {name: Rows(self._files[name]) for name in self._shapes if name in self._files}
+
+    def _flush(self) -> None:
+        states, self._waiting = self._waiting, []
+        for name, shape in self._shapes.items() if states else ():
+            values, nothing = [state[name] for state in states], np.full(shape, np.nan)
+            if name not in self._files and any(value is not None for value in values):
+                self._files[name] = RowFile(shape)
+                for first, last in ranges(self._num):  # one that comes up late
+                    self._files[name].append(np.full((last - first, *shape), np.nan))
+            if name in self._files:
+                self._files[name].append(np.array([nothing if value is None else value for value in values]))
+        self._num += len(states)
 
 
 class StateCollector:
@@ -96,66 +134,24 @@ class StateCollector:
 
     def __init__(self, num_joints: int) -> None:
         self._num_joints = num_joints
-        self._stamps: list[Stamps] = []
-        self._files: dict[str, RowFile] = {}
-        self._num = 0
-        self._waiting: list[JointState] = []
+        self._stamps = array("q")
+        joints, pose = (num_joints,), (4, 4)
+        self._columns = ColumnWriter({name: joints if name in OF_JOINTS else pose for name in COLUMNS})
 
     def add(self, state: JointState) -> None:
         """The next state. Raises InputError for one of another number of joints."""
         if np.shape(state.position) != (self._num_joints,):
-            number = self._num + len(self._waiting)
             raise InputError(
-                f"joint state {number}: expected {self._num_joints} joints, got {np.size(state.position)}"
+                f"joint state {len(self._stamps)}: expected {self._num_joints} joints, got {np.size(state.position)}"
             )
-        self._waiting.append(state)
-        if len(self._waiting) == BLOCK:
-            self._flush()
+        self._stamps.append(state.stamp_ns)
+        self._columns.add({name: getattr(state, name) for name in COLUMNS})
 
     def columns(self) -> StateColumns:
         """Of all states so far."""
-        self._flush()
-        stamps = np.concatenate(self._stamps) if self._stamps else np.zeros(0, dtype=np.int64)
-        found: dict[str, Table] = {name: Rows(file) for name, file in self._files.items()}
         nothing = np.zeros((0, self._num_joints))
-        return StateColumns(
-            stamp_ns=stamps,
-            position=found.get("position", nothing),
-            velocity=found.get("velocity", nothing),
-            commanded_velocity=found.get("commanded_velocity"),
-            T_base_ee=found.get("T_base_ee"),
-            T_world_ee=found.get("T_world_ee"),
-        )
-
-    def _flush(self) -> None:
-        states = self._waiting
-        if not states:
-            return
-        self._waiting = []
-        self._stamps.append(np.array([state.stamp_ns for state in states], dtype=np.int64))
-        joints, pose = (self._num_joints,), (4, 4)
-        self._append("position", joints, [state.position for state in states])
-        self._append("velocity", joints, [state.velocity for state in states])
-        self._append("commanded_velocity", joints, [state.commanded_velocity for state in states])
-        self._append("T_base_ee", pose, [state.T_base_ee for state in states])
-        self._append("T_world_ee", pose, [state.T_world_ee for state in states])
-        self._num += len(states)
-
-    def _append(self, name: str, shape: tuple[int, ...], values: Sequence[Float64 | None]) -> None:
-        is_absent = all(value is None for value in values)
-        if is_absent and name not in self._files:
-            return
-        nothing = np.full(shape, np.nan)
-        append_after(self._files, name, shape, self._num, np.array([nothing if v is None else v for v in values]))
-
-
-def append_after(files: dict[str, RowFile], name: str, shape: tuple[int, ...], num: int, rows: Float64) -> None:
-    """Add rows to the file of a column; one that comes up late is NaN at the `num` states before."""
-    if name not in files:
-        files[name] = RowFile(shape)
-        for first, last in ranges(num):
-            files[name].append(np.full((last - first, *shape), np.nan))
-    files[name].append(rows)
+        found: dict[str, Table] = {"position": nothing, "velocity": nothing, **self._columns.tables()}
+        return StateColumns(stamp_ns=np.array(self._stamps, dtype=np.int64), **found)
 
 
 def _optional(values: Table | None, first: int, last: int) -> list[Float64 | None]:

@@ -33,7 +33,7 @@ class _Stream:
 
     @property
     def has_poses(self) -> bool:
-        return self.states.column("T_base_ee") is not None
+        return "T_base_ee" in self.states.columns()
 
 
 def joint_records(
@@ -127,7 +127,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
     if others:
         taken = ", ".join(dict.fromkeys(used))
         loss.notes.append(f"joint states are taken from {taken}, not from {', '.join(others)}")
-    return track if missing else track.of_joints(wanted)
+    return track if missing else track.of_names(wanted)
 
 
 def _streams(topics: Sequence[TopicSurvey]) -> list[_Stream]:
@@ -157,20 +157,14 @@ def with_prefix(wanted: Sequence[str]) -> dict[str, str]:
 
 def _raw(stream: _Stream, names: tuple[str, ...], loss: LossReport) -> RawTrack:
     """The states of a stream with `names` as columns."""
-    states = stream.states
-    order = np.array([stream.names.index(name) for name in names], dtype=np.int64)
-    position, velocity = states.column("position"), states.column("velocity")
-    commanded, poses = states.column("commanded_velocity"), states.column("T_base_ee")
-    assert position is not None
-    return RawTrack(
+    states, columns = stream.states, stream.states.columns()
+    raw = RawTrack(
         where=stream.where,
-        names=names,
+        names=stream.names,
         stamp_ns=checked_stamps(states.stamp_ns, states.log_time_ns, stream.where, loss),
-        position=position.of_columns(order),
-        velocity=absent(len(states), len(names)) if velocity is None else velocity.of_columns(order),
-        commanded_velocity=None if commanded is None else commanded.of_columns(order),
-        T_base_ee=poses,
+        **{"velocity": absent(len(states), len(stream.names)), **columns},
     )
+    return raw.of_names(names)
 
 
 def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
@@ -206,20 +200,15 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
             file.append(np.hstack([one[part], between]))
         return Rows(file)
 
-    commanded = track.commanded_velocity
-    filled = RawTrack(
-        where=track.where,
+    one, two = track.commanded_velocity, other.commanded_velocity
+    filled = replace(
+        track,
         names=(*track.names, *other.names),
-        stamp_ns=stamps,
         position=joined(track.position, other.position),
         velocity=joined(track.velocity, other.velocity),
-        commanded_velocity=None
-        if commanded is None or other.commanded_velocity is None
-        else joined(commanded, other.commanded_velocity),
-        T_base_ee=track.T_base_ee,
-        T_world_ee=track.T_world_ee,
+        commanded_velocity=None if one is None or two is None else joined(one, two),
     )
-    return filled.select(keep)
+    return filled.select(np.flatnonzero(keep))
 
 
 def _is_still(table: Table, before: NDArray[np.int64], after: NDArray[np.int64]) -> Bool:

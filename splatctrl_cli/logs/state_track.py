@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from splatctrl_cli.files.rows import RowFile, Rows, Table, of_columns, ranges, selected
+from splatctrl_cli.files.rows import RowFile, Rows, Table, ranges
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.state_velocity import Stamps, differentiated, gaps_of, slopes_by_block
+from splatctrl_cli.logs.state_velocity import differentiated, gaps_of, slopes_by_block
 from splatctrl_cli.records import Bool, Float64, LossReport
 
 STILL = 1e-3  # [rad or m] of motion under which a velocity of zero is believed
@@ -18,50 +17,20 @@ COMPARED = 5000  # states at most, spread over the log
 MOVING = 0.05  # [1/s] speeds that are compared
 
 
-@dataclass(frozen=True, kw_only=True)
-class RawTrack:
-    """Joint states as recorded, in file order.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawTrack(StateColumns):
+    """Joint states as recorded, in file order; velocity is NaN where absent.
 
-    stamp_ns (T,); position (T, J); velocity (T, J), NaN where absent; commanded_velocity (T, J), T_base_ee and
-    T_world_ee (T, 4, 4), NaN where absent, None where there are none.
     where: what to call it in a message (a topic, a file).
     """
 
     where: str
     names: tuple[str, ...]
-    stamp_ns: Stamps
-    position: Table
-    velocity: Table
-    commanded_velocity: Table | None = None
-    T_base_ee: Table | None = None
-    T_world_ee: Table | None = None
 
-    def select(self, keep: Bool | NDArray[np.intp]) -> "RawTrack":
-        """The states of a mask (T,), or of indices, in that order."""
-        index = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep.astype(np.int64)
-        commanded, base, world = self.commanded_velocity, self.T_base_ee, self.T_world_ee
-        return RawTrack(
-            where=self.where,
-            names=self.names,
-            stamp_ns=self.stamp_ns[index],
-            position=selected(self.position, index),
-            velocity=selected(self.velocity, index),
-            commanded_velocity=None if commanded is None else selected(commanded, index),
-            T_base_ee=None if base is None else selected(base, index),
-            T_world_ee=None if world is None else selected(world, index),
-        )
-
-    def of_joints(self, names: Sequence[str]) -> "RawTrack":
+    def of_names(self, names: Sequence[str]) -> "RawTrack":
         """The columns of these joints, in that order."""
         order = np.array([self.names.index(name) for name in names], dtype=np.int64)
-        commanded = self.commanded_velocity
-        return replace(
-            self,
-            names=tuple(names),
-            position=of_columns(self.position, order),
-            velocity=of_columns(self.velocity, order),
-            commanded_velocity=None if commanded is None else of_columns(commanded, order),
-        )
+        return replace(self.of_joints(order), names=tuple(names))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,14 +63,7 @@ def cleaned(raw: RawTrack, loss: LossReport) -> StateColumns:
     num_without = num - _num_posed(ordered)
     if 0 < num_without < num:
         loss.notes.append(f"{raw.where}: {num_without} of {num} states have no valid end-effector pose")
-    return StateColumns(
-        stamp_ns=ordered.stamp_ns,
-        position=ordered.position,
-        velocity=velocity,
-        commanded_velocity=ordered.commanded_velocity,
-        T_base_ee=ordered.T_base_ee,
-        T_world_ee=ordered.T_world_ee,
-    )
+    return replace(ordered, velocity=velocity)
 
 
 def _num_posed(raw: RawTrack) -> int:
@@ -125,7 +87,7 @@ def _finite(raw: RawTrack, loss: LossReport) -> RawTrack:
         return raw
     loss.damaged += num_broken
     loss.notes.append(f"{raw.where}: {num_broken} states with NaN or infinity: left out")
-    return raw.select(is_finite)
+    return raw.select(np.flatnonzero(is_finite))
 
 
 def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
@@ -147,7 +109,7 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
     loss.conflicting_states += num_other
     more = f", {num_other} of them with other positions" if num_other else ""
     loss.notes.append(f"{raw.where}: {num_again} states repeat a stamp{more}: the first of each is kept")
-    return raw.select(~is_again)
+    return raw.select(np.flatnonzero(~is_again))
 
 
 def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:

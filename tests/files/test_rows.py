@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.files import npz_columns, rows
 from splatctrl_cli.files.rows import RowFile, Rows, ranges, scratch_folder, selected
-from splatctrl_cli.logs import joint_log, state_columns
+from splatctrl_cli.logs import state_columns
 from splatctrl_cli.logs.state_clock import checked_stamps
 from splatctrl_cli.logs.state_columns import StateCollector
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
@@ -24,7 +24,7 @@ JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 @pytest.fixture(params=[1, 7, 10_000])
 def block(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
     """So many states at once, everywhere."""
-    for module in (rows, joint_log, npz_columns, state_columns, state_csv):
+    for module in (rows, npz_columns, state_columns, state_csv):
         monkeypatch.setattr(module, "BLOCK", request.param)
     return int(request.param)
 
