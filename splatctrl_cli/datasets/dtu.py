@@ -6,8 +6,8 @@ depth_visual_0000.png (above 10 where the depth counts). Lengths there are milli
 """
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -70,8 +70,53 @@ def read_dtu(
     size than the image is sampled, not blended: a larger map at the pixels that the image's come from; a smaller map
     sets only the pixels it was made for. A view without depth is left out. Raises InputError naming the file.
     """
-    scan, folder = _scan_folder(root, scan)
-    images = _images(folder)
+    scan, folder = chosen_scan(root, scan_folders(root), scan)
+
+    def camera(number: int, size: tuple[int, int]) -> tuple[Intrinsics, Float64]:
+        path = _camera_file(root, number)
+        K, T_world_camera = _read_camera(path)
+        return _fitted(K, size, path), T_world_camera
+
+    found = read_views(
+        scan,
+        _images(folder),
+        camera,
+        depth_of=lambda number: _depth_file(root, scan, number),
+        mask_of=lambda number: None if masks is None else _mask_file(masks, number),
+        shrink=shrink,
+        keeps_without_depth=False,
+    )
+    if not found.views:
+        raise InputError(
+            f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
+        )
+    check_lengths(f"{root}: scan '{scan}'", found.views)
+    return replace(found, files=(*found.files, *(_camera_file(root, number) for number in found.numbers)))
+
+
+def chosen_scan(root: Path, folders: Mapping[str, Path], scan: str | None) -> tuple[str, Path]:
+    """The scan of that name, or the only one, and its folder. Raises InputError with the choices."""
+    if scan is None and len(folders) == 1:
+        scan = next(iter(folders))
+    if scan is None or scan not in folders:
+        got = "several scans" if scan is None else f"no scan '{scan}'"
+        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}")
+    return scan, folders[scan]
+
+
+def read_views(
+    scan: str,
+    images: Mapping[int, Path],
+    camera: Callable[[int, tuple[int, int]], tuple[Intrinsics, Float64]],
+    *,
+    depth_of: Callable[[int], Path | None],
+    mask_of: Callable[[int], Path | None],
+    shrink: Shrink,
+    keeps_without_depth: bool,
+) -> DtuScan:
+    """The views of images by number, one at a time in memory before `shrink`; a view that has no file of depth has a
+    depth of 0 everywhere, or is left out. camera: intrinsics and T_world_camera by number and (width, height).
+    """
     views: list[DtuView] = []
     numbers: list[int] = []
     files: list[Path] = []
@@ -79,32 +124,28 @@ def read_dtu(
     for number, path in images.items():
         color = read_image(path)
         size = (color.shape[1], color.shape[0])
-        camera = _camera_file(root, number)
-        K, T_world_camera = _read_camera(camera)
-        depth_path = _depth_file(root, scan, number)
+        intrinsics, T_world_camera = camera(number, size)
+        depth_path, depth = depth_of(number), np.zeros(color.shape[:2], np.float32)
         if depth_path is None:
             without_depth.append(path.name)
-            continue
-        visual = depth_path.with_name(f"depth_visual_{number:04d}.png")
-        depth = read_depth(depth_path, visual, size)
-        mask_path = None if masks is None else _mask_file(masks, number)
-        numbers.append(number)
+            if not keeps_without_depth:
+                continue
+        else:
+            visual = depth_path.with_name(f"depth_visual_{number:04d}.png")
+            depth = read_depth(depth_path, visual, size)
+            files += [depth_path, *([visual] if visual.is_file() else [])]
+        mask_path = mask_of(number)
         view = DtuView(
             name=path.stem,
             color=color,
             depth=depth,
-            intrinsics=_fitted(K, size, camera),
+            intrinsics=intrinsics,
             T_world_camera=T_world_camera,
             mask=None if mask_path is None else read_mask(mask_path, size),
         )
         views.append(shrink(view))
-        files += [path, camera, depth_path, *([visual] if visual.exists() else [])]
-        files += [] if mask_path is None else [mask_path]
-    if not views:
-        raise InputError(
-            f"{root}: scan '{scan}' has no depth", remedy=f"expected Depths_raw/{scan}/depth_map_0000.pfm and so on"
-        )
-    check_lengths(f"{root}: scan '{scan}'", views)
+        numbers.append(number)
+        files += [path] if mask_path is None else [path, mask_path]
     return DtuScan(
         name=scan,
         views=tuple(views),
@@ -149,10 +190,15 @@ def write_dtu(root: Path, scan: str, views: Sequence[DtuView]) -> None:
     for number, view in enumerate(views):
         cameras.joinpath(f"{number:08d}_cam.txt").write_text(_camera_text(view), encoding="utf-8")
         image = rectified / f"rect_{number + 1:03d}_{LIGHT}_r5000.png"
-        image.write_bytes(cv2.imencode(".png", view.color[:, :, ::-1])[1].tobytes())
+        write_png(image, view.color[:, :, ::-1])
         write_pfm(depths / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
         visual = np.where(view.depth > 0, 255, 0).astype(np.uint8)
-        depths.joinpath(f"depth_visual_{number:04d}.png").write_bytes(cv2.imencode(".png", visual)[1].tobytes())
+        write_png(depths / f"depth_visual_{number:04d}.png", visual)
+
+
+def write_png(path: Path, image: UInt8) -> None:
+    """Write an image, blue first where it has colours."""
+    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
 
 
 def scan_folders(root: Path) -> dict[str, Path]:
@@ -165,16 +211,6 @@ def scan_folders(root: Path) -> dict[str, Path]:
             remedy="give the folder that holds Rectified, or the scans in IDR's layout",
         )
     return {path.name.removesuffix("_train"): path for path in sorted(rectified.iterdir()) if path.is_dir()}
-
-
-def _scan_folder(root: Path, scan: str | None) -> tuple[str, Path]:
-    folders = scan_folders(root)
-    if scan is None and len(folders) == 1:
-        scan = next(iter(folders))
-    if scan is None or scan not in folders:
-        got = "several scans" if scan is None else f"no scan '{scan}'"
-        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(folders) or 'none is there'}")
-    return scan, folders[scan]
 
 
 def _images(folder: Path) -> dict[int, Path]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from splatctrl_cli.datasets.dtu import DtuScan, DtuView, Shrink, read_dtu
 from splatctrl_cli.datasets.idr import idr_scans, read_idr
-from splatctrl_cli.datasets.protocols import ScoreProtocol, Split
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.records import Bool, Intrinsics, LossReport, Record, RgbdFrame
 

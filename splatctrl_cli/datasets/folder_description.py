@@ -145,11 +145,15 @@ class Description:
         try:
             matrix = np.array(rows, dtype=np.float64) if rows else np.eye(4)
         except ValueError:
-            raise InputError(f"{where}: expected a 4x4 matrix", remedy="see docs/input.md") from None
+            raise _refused(f"{where}: expected a 4x4 matrix") from None
         return rigid(matrix, where)
 
 
 T = TypeVar("T")
+
+
+def _refused(what: str) -> InputError:
+    return InputError(what, remedy="see docs/input.md")
 
 
 def read_description(path: Path, root: Path | None = None) -> Description:
@@ -178,12 +182,10 @@ def read_rig(path: Path, root: Path | None = None) -> list[Description]:
     content = _content(path)
     cameras = content.pop("cameras", [])
     if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
-        raise InputError(f"{path}: cameras: expected tables [[cameras]], got {cameras!r}", remedy="see docs/input.md")
+        raise _refused(f"{path}: cameras: expected tables [[cameras]], got {cameras!r}")
     names = [camera.get("name") for camera in cameras]
     if None in names or len(set(names)) < len(names):
-        raise InputError(
-            f"{path}: [[cameras]]: expected a name for each of its own, got {names}", remedy="see docs/input.md"
-        )
+        raise _refused(f"{path}: [[cameras]]: expected a name for each of its own, got {names}")
     if cameras and not {"camera", "frames", "split"}.isdisjoint(content):
         raise InputError(
             f"{path}: [[cameras]] beside [camera], [frames] or [split]", remedy="leave the single tables out"
@@ -195,7 +197,7 @@ def _of_camera(common: dict[str, Any], camera: dict[str, Any], path: Path) -> di
     """The description of one of several cameras."""
     for key in ("color", "depth", "poses"):
         if not isinstance(camera.get(key), str):
-            raise InputError(f"{path}: [[cameras]]: {key} is missing", remedy="see docs/input.md")
+            raise _refused(f"{path}: [[cameras]]: {key} is missing")
     lens = {key: value for key, value in camera.items() if key not in ("color", "depth", "poses")}
     frames = {"color": camera["color"], "depth": camera["depth"]}
     poses = {"format": "matrix-files", **common.get("poses", {}), "file": camera["poses"]}
@@ -206,7 +208,7 @@ def _content(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not TOML: {error}", remedy="see docs/input.md") from None
+        raise _refused(f"{path}: not TOML: {error}") from None
 
 
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
@@ -238,14 +240,11 @@ def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description
         if camera is not None:
             check_camera(camera, f"{path}: {name}")
     if not 0 < description.depth.scale < 1e3:
-        raise InputError(
-            f"{path}: depth.scale: expected metres per count, got {description.depth.scale}",
-            remedy="see docs/input.md",
-        )
+        raise _refused(f"{path}: depth.scale: expected metres per count, got {description.depth.scale}")
     if description.poses is None or description.poses.format != "nerfstudio":
         for name in ("camera", "frames"):
             if getattr(description, name) is None:
-                raise InputError(f"{path}: [{name}] is missing", remedy="see docs/input.md")
+                raise _refused(f"{path}: [{name}] is missing")
     return description
 
 
@@ -254,28 +253,21 @@ def check_camera(camera: CameraTable, where: str) -> None:
     for name in ("width", "height", "fx", "fy"):
         value = getattr(camera, name)
         if not SMALLEST <= value < 1e5:
-            raise InputError(
-                f"{where}.{name}: expected a positive number of pixels, got {value}", remedy="see docs/input.md"
-            )
+            raise _refused(f"{where}.{name}: expected a positive number of pixels, got {value}")
     for name in ("cx", "cy"):
         if not abs(getattr(camera, name)) < 1e5:
-            raise InputError(
-                f"{where}.{name}: expected pixels, got {getattr(camera, name)}", remedy="see docs/input.md"
-            )
+            raise _refused(f"{where}.{name}: expected pixels, got {getattr(camera, name)}")
     if not all(isinstance(value, int | float) for value in camera.distortion):
-        raise InputError(f"{where}.distortion: expected numbers, got {camera.distortion}", remedy="see docs/input.md")
+        raise _refused(f"{where}.distortion: expected numbers, got {camera.distortion}")
     if camera.distortion_model not in DISTORTION_MODELS:
         names = ", ".join(DISTORTION_MODELS)
-        raise InputError(
-            f"{where}.distortion_model: expected one of {names}, got {camera.distortion_model!r}",
-            remedy="see docs/input.md",
-        )
+        raise _refused(f"{where}.distortion_model: expected one of {names}, got {camera.distortion_model!r}")
 
 
 def _required(kind: type[T], content: dict[str, Any], name: str, path: Path) -> T:
     table = _optional(kind, content, name, path)
     if table is None:
-        raise InputError(f"{path}: [{name}] is missing", remedy="see docs/input.md")
+        raise _refused(f"{path}: [{name}] is missing")
     return table
 
 
@@ -284,12 +276,12 @@ def _optional(kind: type[T], content: dict[str, Any], name: str, path: Path) -> 
         return None
     table = content[name]
     if not isinstance(table, dict):
-        raise InputError(f"{path}: {name}: expected a table [{name}], got {table!r}", remedy="see docs/input.md")
+        raise _refused(f"{path}: {name}: expected a table [{name}], got {table!r}")
     declared = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
     _check_keys(table, set(declared), str(path), f"{name}.")
     for key, f in declared.items():
         if key not in table and f.default is MISSING and f.default_factory is MISSING:
-            raise InputError(f"{path}: {name}.{key} is missing", remedy="see docs/input.md")
+            raise _refused(f"{path}: {name}.{key} is missing")
     values = {key: _typed(value, declared[key].type, f"{path}: {name}.{key}") for key, value in table.items()}
     return kind(**values)
 
@@ -304,9 +296,7 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
         float | None: is_number,
     }.get(hint, isinstance(value, list))
     if not good:
-        raise InputError(
-            f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}", remedy="see docs/input.md"
-        )
+        raise _refused(f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
     return float(value) if hint in (float, float | None) else value
 
 
@@ -320,6 +310,4 @@ def _check_keys(table: dict[str, Any], known: set[str], where: str, prefix: str)
 
 def _check_choice(path: Path, key: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise InputError(
-            f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}", remedy="see docs/input.md"
-        )
+        raise _refused(f"{path}: {key}: expected one of {', '.join(choices)}, got {value!r}")

@@ -9,6 +9,7 @@ There is no depth: SCAN/depth may hold depth_map_0000.pfm (and depth_visual_0000
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,15 +21,15 @@ from splatctrl_cli.datasets.dtu import (
     DtuView,
     Shrink,
     check_lengths,
-    read_depth,
-    read_image,
-    read_mask,
+    chosen_scan,
+    read_views,
+    write_png,
 )
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.pfm import write_pfm
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float64, Intrinsics, UInt8
+from splatctrl_cli.records import Float64, Intrinsics
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 _MOST = 1 << 24  # bytes of cameras: 500 each
@@ -55,13 +56,7 @@ def read_idr(
     `shrink` makes of each view the one that is kept. A view without a depth map stays, with a depth of 0 everywhere.
     Raises InputError naming the file.
     """
-    scans = idr_scans(root)
-    if scan is None and len(scans) == 1:
-        scan = next(iter(scans))
-    if scan is None or scan not in scans:
-        got = "several scans" if scan is None else f"no scan '{scan}'"
-        raise InputError(f"{root}: {got}", remedy=f"give --scan, one of: {', '.join(scans)}")
-    folder = scans[scan]
+    scan, folder = chosen_scan(root, idr_scans(root), scan)
     path = next(folder / name for name in CAMERAS if (folder / name).is_file())
     projections = _projections(path)
     images = _numbered(folder / "image", len(projections))
@@ -71,40 +66,22 @@ def read_idr(
     missing = [number for number in images if number not in masks]
     if masks and missing:
         raise InputError(f"{folder / 'mask'}: expected a mask for each image, got none for image {missing[0]}")
-    files = [path, *images.values(), *(masks[number] for number in images if masks)]
-    views, without_depth = [], []
-    for number, image in images.items():
-        P = projections[number]
-        color = read_image(image)
-        size = (color.shape[1], color.shape[0])
-        K, T_world_camera = decompose(P, f"{path}: world_mat_{number}")
-        depth = np.zeros(color.shape[:2], np.float32)
-        depth_path = (depths or folder / "depth") / f"depth_map_{number:04d}.pfm"
-        if depth_path.is_file():
-            visual = depth_path.with_name(f"depth_visual_{number:04d}.png")
-            depth = read_depth(depth_path, visual, size)
-            files += [depth_path, *([visual] if visual.is_file() else [])]
-        else:
-            without_depth.append(image.name)
-        view = DtuView(
-            name=image.stem,
-            color=color,
-            depth=depth,
-            intrinsics=_intrinsics(K, size, path),
-            T_world_camera=T_world_camera,
-            mask=read_mask(masks[number], size) if masks else None,
-        )
-        views.append(shrink(view))
-    if depths is not None and len(without_depth) == len(views):
-        raise InputError(f"{depths}: expected depth_map_0000.pfm and so on, got none")
-    check_lengths(f"{folder}", views)
-    return DtuScan(
-        name=scan,
-        views=tuple(views),
-        numbers=tuple(images),
-        files=tuple(files),
-        without_depth=tuple(without_depth),
+
+    def camera(number: int, size: tuple[int, int]) -> tuple[Intrinsics, Float64]:
+        K, T_world_camera = decompose(projections[number], f"{path}: world_mat_{number}")
+        return _intrinsics(K, size, path), T_world_camera
+
+    def depth_of(number: int) -> Path | None:
+        file = (depths or folder / "depth") / f"depth_map_{number:04d}.pfm"
+        return file if file.is_file() else None
+
+    found = read_views(
+        scan, images, camera, depth_of=depth_of, mask_of=masks.get, shrink=shrink, keeps_without_depth=True
     )
+    if depths is not None and len(found.without_depth) == len(found.views):
+        raise InputError(f"{depths}: expected depth_map_0000.pfm and so on, got none")
+    check_lengths(f"{folder}", found.views)
+    return replace(found, files=(*found.files, path))
 
 
 def write_idr(root: Path, scan: str, views: Sequence[DtuView], *, with_depth: bool = True) -> Path:
@@ -121,9 +98,10 @@ def write_idr(root: Path, scan: str, views: Sequence[DtuView], *, with_depth: bo
     matrices: dict[str, Float64] = {}
     for number, view in enumerate(views):
         matrices |= {f"world_mat_{number}": projection(view), f"scale_mat_{number}": scale}
-        _write_png(folder / "image" / f"{number:06d}.png", view.color[:, :, ::-1])
+        write_png(folder / "image" / f"{number:06d}.png", view.color[:, :, ::-1])
         if view.mask is not None:
-            _write_png(folder / "mask" / f"{number:03d}.png", np.where(view.mask, 255, 0).astype(np.uint8))
+            (folder / "mask").mkdir(exist_ok=True)
+            write_png(folder / "mask" / f"{number:03d}.png", np.where(view.mask, 255, 0).astype(np.uint8))
         if with_depth:
             (folder / "depth").mkdir(exist_ok=True)
             write_pfm(folder / "depth" / f"depth_map_{number:04d}.pfm", view.depth * np.float32(MILLIMETRES))
@@ -147,11 +125,6 @@ def _sphere(views: Sequence[DtuView]) -> tuple[Float64, float]:
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # what of a vector is no way along the axis
     middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
     return middle, 0.5 * float(np.linalg.norm(centers - middle, axis=1).min())
-
-
-def _write_png(path: Path, image: UInt8) -> None:
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
 
 
 def decompose(P: Float64, where: str) -> tuple[Float64, Float64]:

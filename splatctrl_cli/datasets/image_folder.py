@@ -1,7 +1,8 @@
-"""A folder of colour and depth images with a TOML description, as records."""
+"""Folders of colour and depth images with a TOML description, of one camera or of several, as records."""
 
+import heapq
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.datasets.folder_description import CameraTable, Description, read_description
+from splatctrl_cli.datasets.folder_description import CameraTable, Description, read_description, read_rig
 from splatctrl_cli.datasets.folder_views import HOLDOUT, View, find_files, views_of
 from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
@@ -23,7 +24,6 @@ from splatctrl_cli.logs.shot import Shot, check_depth, human_mask, is_kept, is_p
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
-
 _NOT_FOR_FOLDERS = (
     *("world_frame", "camera_topics", "camera_pose_topics", "human_topics"),
     *("joint_topic", "stamps"),
@@ -261,3 +261,69 @@ def _check_size(path: Path, pixels: NDArray[Any], camera: CameraTable) -> None:
             f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",
             remedy="correct the size, or describe the depth camera in [depth_camera]",
         )
+
+
+def open_image_folder(path: Path, options: SourceOptions) -> "ImageFolderSource | RigFolderSource":
+    """The records that a TOML description names."""
+    return RigFolderSource(path, options) if read_rig(path, options.root) else ImageFolderSource(path, options)
+
+
+class RigFolderSource:
+    """Records of several cameras by stamp, each camera an image folder of its own; no joint states."""
+
+    joint_names: tuple[str, ...] = ()
+    world_frame = "world"
+
+    def __init__(self, path: Path, options: SourceOptions) -> None:
+        options.refuse(("holdout", "intrinsics", "camera_pose_topics"), "a description with several cameras", path)
+        self.name = path.name
+        by_name = {}
+        for description in read_rig(path, options.root):
+            assert description.camera is not None
+            name = description.camera.name
+            pose = {name: options.camera_poses[name]} if name in options.camera_poses else {}
+            by_name[name] = ImageFolderSource(path, replace(options, cameras=None, camera_poses=pose), description)
+        for name in (*(options.cameras or ()), *options.camera_poses):
+            if name not in by_name:
+                raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(by_name)}")
+        self.cameras = options.cameras or tuple(by_name)
+        self._parts = [by_name[name] for name in self.cameras]
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the description says when the images were taken."""
+        return self._parts[0].has_clock
+
+    @property
+    def loss(self) -> LossReport:
+        """That of all cameras together."""
+        losses = [part.loss for part in self._parts]
+        counts = {
+            f.name: sum(getattr(loss, f.name) for loss in losses) for f in fields(LossReport) if f.name != "notes"
+        }
+        return LossReport(**counts, notes=[note for loss in losses for note in loss.notes])
+
+    def records(self) -> Iterator[Record]:
+        """Frames by stamp."""
+        for item in self.shots():
+            yield item.frame if isinstance(item, Shot) else item
+
+    def shots(self) -> Iterator[Shot | JointState]:
+        """Shots by stamp, of the same stamp by camera."""
+        return heapq.merge(*(part.shots() for part in self._parts), key=_stamp_ns)
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of every view."""
+        return heapq.merge(*(part.poses() for part in self._parts), key=lambda pose: pose[0])
+
+    def count_views(self) -> dict[str, int]:
+        """Views by camera."""
+        return {name: count for part in self._parts for name, count in part.count_views().items()}
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the description, the pose files and the images, by path below the root."""
+        return {name: digest for part in self._parts for name, digest in part.digests().items()}
+
+
+def _stamp_ns(item: Shot | JointState) -> int:
+    return item.stamp_ns

@@ -2,10 +2,10 @@
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,14 +19,18 @@ from splatctrl_cli.datasets.folder_description import (
     StampsTable,
     check_camera,
 )
+from splatctrl_cli.datasets.poses import read_matrix_file, read_numbers
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.messages import decode_file
 from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.pairing import pair_by_stamp
 from splatctrl_cli.records import Float64
 
 CAMERA = "camera"  # the name of a layout's only lens
 MILLIMETRE = 1e-3
 SAME = 1e-6  # largest entry of a matrix that is the identity
+Key = TypeVar("Key", int, str)
+_WHOLE = "check that the folder is whole"
 _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 
 
@@ -65,42 +69,100 @@ class Lenses:
         return self._tables[-1]
 
 
-def described(
+@dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """The views of a layout whose description is at `path`, and how many colour and depth files have no partner.
+
+    Raises InputError where there is no view.
+    """
+
+    path: Path
+    views: Sequence[ListedView]
+    unpaired: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise InputError(f"{self.path}: no colour image has a depth image", remedy=_WHOLE)
+
+    def moved(self, change: Callable[[Float64], Float64]) -> "Pairs":
+        """With `change` of the pose of each view that has one."""
+        views = [v if v.matrix is None else replace(v, matrix=change(v.matrix)) for v in self.views]
+        return replace(self, views=views)
+
+
+def paired_by_name(
     path: Path,
+    colors: Mapping[Key, Path],
+    depths: Mapping[Key, Path],
+    pose: Callable[[Key], Float64 | None],
+    name: Callable[[Key], str] = str,
+) -> Pairs:
+    """Files that have one key, with the pose and the name of it."""
+    views = [
+        ListedView(name=name(key), color=color, depth=depths[key], matrix=pose(key))
+        for key, color in colors.items()
+        if key in depths
+    ]
+    return Pairs(path=path, views=views, unpaired=(len(colors) - len(views), len(depths) - len(views)))
+
+
+def paired_by_stamp(
+    path: Path,
+    colors: Sequence[tuple[int, Path]],
+    depths: Sequence[tuple[int, Path]],
+    pose_at: Callable[[int], Float64 | None],
+    options: SourceOptions,
+) -> Pairs:
+    """Stamps [ns] and files that lie within the pairing tolerance, posed at the colour's stamp."""
+    tolerance_ns = round(options.pairing_tolerance_s * 1e9)
+    pairs = pair_by_stamp([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns)
+    views = [
+        ListedView(
+            name=f"{colors[i][0] / 1e9:.6f}",
+            color=colors[i][1],
+            depth=depths[j][1],
+            matrix=pose_at(colors[i][0]),
+            stamp_ns=colors[i][0],
+        )
+        for i, j in pairs
+    ]
+    return Pairs(path=path, views=views, unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)))
+
+
+def described(
+    pairs: Pairs,
     root: Path,
-    views: Sequence[ListedView],
+    options: SourceOptions,
     *,
     poses: PosesTable,
-    camera: CameraTable | None = None,
+    lens: Callable[[Path], CameraTable] | None = None,
     depth_camera: CameraTable | None = None,
     depth: DepthTable | None = None,
     has_stamps: bool = False,
     is_depth_resized: bool = False,
-    unpaired: tuple[int, int] = (0, 0),
     notes: tuple[str, ...] = (),
 ) -> Description:
-    """The description of listed views, of `camera` where they name no lens of their own.
-
-    Raises InputError where there is none, or the camera is impossible.
+    """The description of paired views, all of the lens that --intrinsics gives, else of `lens` (of the first image);
+    without `lens` of one each. Raises InputError where a camera is impossible.
     """
-    if not views:
-        raise InputError(f"{path}: no colour image has a depth image", remedy="check that the folder is whole")
+    first = pairs.views[0]
+    camera = first.camera if lens is None else given_lens(options, first.color) or lens(first.color)
     for table in (camera, depth_camera):
         if table is not None:
-            check_camera(table, str(path))
+            check_camera(table, str(pairs.path))
     return Description(
-        path=path,
+        path=pairs.path,
         root=root,
         poses=poses,
-        camera=camera or views[0].camera,
+        camera=camera,
         depth_camera=depth_camera,
         frames=None,
         depth=depth or DepthTable(),
         stamps=StampsTable(names=has_stamps),
         split=SplitTable(),
-        listed=tuple(views),
+        listed=tuple(pairs.views),
         is_depth_resized=is_depth_resized,
-        unpaired=unpaired,
+        unpaired=pairs.unpaired,
         notes=notes,
     )
 
@@ -118,6 +180,17 @@ def pinhole(values: Sequence[float], image: Path, distortion: Sequence[float] = 
     return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=list(distortion))
 
 
+def read_K(path: Path) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a text file with a 3x3 matrix."""
+    values = read_numbers(path)
+    if len(values) != 9:
+        raise InputError(
+            f"{path}: expected a 3x3 matrix, got {len(values)} numbers",
+            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
+        )
+    return values[0], values[4], values[2], values[5]
+
+
 def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
     """The depth camera with its place in the colour camera; None where it is the colour camera."""
     if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= SAME:
@@ -130,9 +203,9 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         pixels = decode_file(path.read_bytes(), color=False)
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}", remedy="check that the folder is whole") from None
+        raise InputError(f"{path}: {error.strerror}", remedy=_WHOLE) from None
     if pixels is None:
-        raise InputError(f"{path}: not an image that can be read", remedy="check that the folder is whole")
+        raise InputError(f"{path}: not an image that can be read", remedy=_WHOLE)
     return int(pixels.shape[1]), int(pixels.shape[0])
 
 
@@ -152,9 +225,14 @@ def pose_or_none(matrix: Float64) -> Float64 | None:
     return matrix if np.isfinite(matrix).all() else None
 
 
+def read_pose(path: Path) -> Float64 | None:
+    """The matrix (4, 4) of a pose file, None where there is no file or tracking was lost."""
+    return pose_or_none(read_matrix_file(path)) if path.is_file() else None
+
+
 def read_json(path: Path) -> Any:
     """The content of a JSON file. Raises InputError where it is none."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
-        raise InputError(f"{path}: not readable JSON: {error}", remedy="check that the folder is whole") from None
+        raise InputError(f"{path}: not readable JSON: {error}", remedy=_WHOLE) from None

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import Layout, Lenses, described, images_of
-from splatctrl_cli.datasets.layout_tum import paired_views
+from splatctrl_cli.datasets.layout import Layout, Lenses, described, images_of, paired_by_stamp
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_rows, stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
@@ -37,22 +36,21 @@ def read(folder: Path, options: SourceOptions) -> Description:
     assert root is not None
     colors, depths = _by_stamp(root / "lowres_wide"), _by_stamp(root / "lowres_depth")
     trajectory = Trajectory(_poses(root / TRAJECTORY))
-    views, unpaired = paired_views(colors, depths, trajectory.at, options)
+    pairs = paired_by_stamp(root / TRAJECTORY, colors, depths, trajectory.at, options)
     lenses = Lenses()
     pincams = {
         stamp: path
         for path in sorted((root / "lowres_wide_intrinsics").glob("*.pincam"))
         if (stamp := _stamp_ns(path))
     }
-    views = [replace(view, camera=lenses.named(_lens(pincams, view), str(root))) for view in views]
+    views = [replace(view, camera=lenses.named(_lens(pincams, view), str(root))) for view in pairs.views]
     return described(
-        root / TRAJECTORY,
+        replace(pairs, views=views),
         root,
-        views,
+        options,
         poses=PosesTable(format="rotation-vectors", file=TRAJECTORY),
         has_stamps=True,
         is_depth_resized=True,
-        unpaired=unpaired,
     )
 
 

@@ -16,6 +16,7 @@ from splatctrl_cli.datasets.layout import (
     MILLIMETRE,
     Layout,
     Lenses,
+    Pairs,
     described,
     image_size,
     images_of,
@@ -54,11 +55,10 @@ def read(folder: Path, options: SourceOptions) -> Description:
         num_colors, num_depths = num_colors + len(colors), num_depths + len(depths)
     name = FILE if len(files) == 1 else f"{Path(FILE).stem}*.json"
     return described(
-        files[0],
+        Pairs(path=files[0], views=views, unpaired=(num_colors - len(views), num_depths - len(views))),
         folder,
-        views,
+        options,
         poses=PosesTable(format="bop", file=files[0].name if len(files) == 1 else name, convention="world_to_camera"),
-        unpaired=(num_colors - len(views), num_depths - len(views)),
     )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ListedView, PosesTable
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
 from splatctrl_cli.datasets.layout import (
     MILLIMETRE,
     Layout,
@@ -23,12 +23,13 @@ from splatctrl_cli.datasets.layout import (
     described,
     given_lens,
     own_depth_camera,
+    paired_by_name,
     pinhole,
-    pose_or_none,
+    read_K,
+    read_pose,
 )
-from splatctrl_cli.datasets.layout_sens import find_info, read_info
-from splatctrl_cli.datasets.poses import read_matrix_file, read_numbers, rigid
-from splatctrl_cli.errors import InputError
+from splatctrl_cli.datasets.layout_scannet import find_info, read_info
+from splatctrl_cli.datasets.poses import rigid
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -75,28 +76,16 @@ def read(folder: Path, options: SourceOptions) -> Description:
     sequence = next(s for s in _SEQUENCES if next(folder.glob(f"{s}frame-*.pose.txt"), None) is not None)
     colors = _files(folder, f"{sequence}frame-*.color.*", ".color")
     depths = _files(folder, f"{sequence}frame-*.depth.*", ".depth")
-    names = [name for name in colors if name in depths]
-    if not names:
-        return described(folder, folder, [], poses=PosesTable(format="matrix-files", file=""))
-    cameras = _cameras(folder, colors[names[0]], depths[names[0]], options)
-    views = [
-        ListedView(
-            name=name,
-            color=colors[name],
-            depth=depths[name],
-            matrix=_pose(folder / f"{name}.pose.txt", cameras.T_pose_color),
-        )
-        for name in names
-    ]
+    pairs = paired_by_name(folder, colors, depths, lambda name: read_pose(folder / f"{name}.pose.txt"))
+    cameras = _cameras(folder, pairs.views[0].color, pairs.views[0].depth, options)
     return described(
+        pairs.moved(lambda T: T @ cameras.T_pose_color),
         folder,
-        folder,
-        views,
+        options,
         poses=PosesTable(format="matrix-files", file=f"{sequence}frame-*.pose.txt"),
-        camera=cameras.color,
+        lens=lambda _: cameras.color,
         depth_camera=cameras.depth,
         depth=DepthTable(scale=cameras.depth_scale, invalid=NO_DEPTH),
-        unpaired=(len(colors) - len(views), len(depths) - len(views)),
         notes=cameras.notes,
     )
 
@@ -105,12 +94,6 @@ def _files(folder: Path, pattern: str, kind: str) -> dict[str, Path]:
     """Files by their path up to `kind`, in the order of their numbers."""
     paths = sorted(folder.glob(pattern), key=lambda p: by_numbers(p.relative_to(folder).as_posix()))
     return {path.relative_to(folder).as_posix().partition(kind)[0]: path for path in paths}
-
-
-def _pose(path: Path, T_pose_color: Float64) -> Float64 | None:
-    """T_world_color, None where the frame has no pose."""
-    matrix = pose_or_none(read_matrix_file(path)) if path.is_file() else None
-    return None if matrix is None else matrix @ T_pose_color
 
 
 def _cameras(folder: Path, color: Path, depth: Path, options: SourceOptions) -> _Cameras:
@@ -122,7 +105,8 @@ def _cameras(folder: Path, color: Path, depth: Path, options: SourceOptions) -> 
         scale = calibration.depth_scale
         return _Cameras(color=lens, depth=own, T_pose_color=calibration.T_base_color, depth_scale=scale)
     given = given_lens(options, color)
-    values = _published(folder) or DEPTH_LENS
+    published = (folder / "camera-intrinsics.txt", folder.parent / "camera-intrinsics.txt")
+    values = next((read_K(file) for file in published if file.is_file()), DEPTH_LENS)
     if given is not None or values != DEPTH_LENS:
         return _Cameras(color=given or pinhole(values, color))
     lens = pinhole(COLOR_LENS, color)
@@ -132,19 +116,6 @@ def _cameras(folder: Path, color: Path, depth: Path, options: SourceOptions) -> 
         T_pose_color=invert_transform(T_COLOR_DEPTH),
         notes=(_NOTE,),
     )
-
-
-def _published(folder: Path) -> tuple[float, ...] | None:
-    """fx, fy, cx, cy of a camera-intrinsics.txt, None where there is none."""
-    for file in (folder / "camera-intrinsics.txt", folder.parent / "camera-intrinsics.txt"):
-        if file.is_file():
-            values = read_numbers(file)
-            if len(values) != 9:
-                raise InputError(
-                    f"{file}: expected a 3x3 matrix, got {len(values)} numbers", remedy="correct the file"
-                )
-            return values[0], values[4], values[2], values[5]
-    return None
 
 
 _DOCS = """

@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import Layout, described, given_lens, images_of, read_json
+from splatctrl_cli.datasets.layout import Layout, Pairs, described, images_of, read_json
 from splatctrl_cli.datasets.poses import read_trajectory_log
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
@@ -58,12 +58,11 @@ def read(folder: Path, options: SourceOptions) -> Description:
         for place, (color, depth) in enumerate(pairs)
     ]
     return described(
-        trajectory,
+        Pairs(path=trajectory, views=views, unpaired=(len(colors) - len(pairs), len(depths) - len(pairs))),
         folder,
-        views,
+        options,
         poses=PosesTable(format="trajectory-log", file=trajectory.relative_to(folder).as_posix()),
-        camera=_lens(folder, options, views[0].color) if views else None,
-        unpaired=(len(colors) - len(pairs), len(depths) - len(pairs)),
+        lens=lambda _: _lens(folder),
     )
 
 
@@ -87,10 +86,7 @@ def _number(name: str) -> int:
     return int(found[0]) if found else -1
 
 
-def _lens(folder: Path, options: SourceOptions, image: Path) -> CameraTable:
-    given = given_lens(options, image)
-    if given is not None:
-        return given
+def _lens(folder: Path) -> CameraTable:
     for file in (parent / name for parent in (folder, folder.parent) for name in INTRINSICS):
         if file.is_file():
             content = read_json(file)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ListedView, PosesTable
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
 from splatctrl_cli.datasets.layout import (
     MILLIMETRE,
     Layout,
@@ -19,13 +19,13 @@ from splatctrl_cli.datasets.layout import (
     described,
     given_lens,
     image_size,
+    paired_by_name,
     pinhole,
     read_json,
 )
 from splatctrl_cli.datasets.poses import read_matrix_lines
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.records import Float64
 
 PARAMETERS = "cam_params.json"
 NICE_SLAM: Mapping[str, float] = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
@@ -47,20 +47,21 @@ def read(folder: Path, options: SourceOptions) -> Description:
     name, color_pattern, depth_pattern = form
     colors, depths = _by_number(folder, color_pattern), _by_number(folder, depth_pattern)
     poses = read_matrix_lines(folder / name)
-    views = [
-        ListedView(name=colors[number].stem, color=colors[number], depth=depths[number], matrix=_pose(poses, number))
-        for number in colors
-        if number in depths
-    ]
-    lens, scale = (None, MILLIMETRE) if not views else _lens(folder, name, views[0].color, options)
-    return described(
+    pairs = paired_by_name(
         folder / name,
+        colors,
+        depths,
+        lambda number: poses[number] if number < len(poses) else None,
+        lambda number: colors[number].stem,
+    )
+    lens, scale = _lens(folder, name, pairs.views[0].color, options)
+    return described(
+        pairs,
         folder,
-        views,
+        options,
         poses=PosesTable(format="matrix-lines", file=name),
-        camera=lens,
+        lens=lambda _: lens,
         depth=DepthTable(scale=scale),
-        unpaired=(len(colors) - len(views), len(depths) - len(views)),
     )
 
 
@@ -71,10 +72,6 @@ def _form(folder: Path) -> tuple[str, str, str] | None:
 def _by_number(folder: Path, pattern: str) -> dict[int, Path]:
     found = sorted(folder.glob(pattern), key=lambda path: by_numbers(path.name))
     return {numbers[-1]: path for path in found if (numbers := by_numbers(path.stem)[0])}
-
-
-def _pose(poses: list[Float64], number: int) -> Float64 | None:
-    return poses[number] if number < len(poses) else None
 
 
 def _lens(folder: Path, trajectory: str, image: Path, options: SourceOptions) -> tuple[CameraTable, float]:

@@ -5,13 +5,13 @@ left by three, in millimetres, registered to colour; the depth nearest in time b
 ``extrinsics/`` holds a 3x4 matrix for each image in order, camera to world; the first pixel's centre is at 1.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
-from splatctrl_cli.datasets.layout import Layout, described, given_lens, image_size, images_of, pose_or_none
-from splatctrl_cli.datasets.layout_tum import paired_views
+from splatctrl_cli.datasets.folder_description import DepthTable, Description, PosesTable
+from splatctrl_cli.datasets.layout import Layout, described, images_of, paired_by_stamp, pinhole, pose_or_none, read_K
 from splatctrl_cli.datasets.poses import read_numbers, stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
@@ -30,16 +30,14 @@ def read(folder: Path, options: SourceOptions) -> Description:
     extrinsics = sorted((folder / "extrinsics").glob("*.txt"))
     poses = _poses(extrinsics[-1]) if extrinsics else []
     at = {stamp_ns: pose_or_none(poses[index]) for index, (stamp_ns, _) in enumerate(colors) if index < len(poses)}
-    views, unpaired = paired_views(colors, depths, at.get, options)
     return described(
+        paired_by_stamp(folder, colors, depths, at.get, options),
         folder,
-        folder,
-        views,
+        options,
         poses=PosesTable(format="matrix-rows", file="extrinsics/*.txt"),
-        camera=given_lens(options, views[0].color) or _lens(folder, views[0].color) if views else None,
+        lens=lambda image: replace(pinhole(read_K(folder / "intrinsics.txt"), image), pixel_center=1.0),
         depth=DepthTable(encoding="uint16-rotated3"),
         has_stamps=True,
-        unpaired=unpaired,
     )
 
 
@@ -56,19 +54,6 @@ def _poses(path: Path) -> list[Float64]:
     rows = np.array(values).reshape(-1, 3, 4)
     bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 4))
     return list(np.concatenate([rows, bottom], axis=1))
-
-
-def _lens(folder: Path, image: Path) -> CameraTable:
-    file = folder / "intrinsics.txt"
-    values = read_numbers(file)
-    if len(values) != 9:
-        raise InputError(
-            f"{file}: expected a 3x3 matrix, got {len(values)} numbers",
-            remedy="correct the file, or give --intrinsics camera=FX,FY,CX,CY",
-        )
-    width, height = image_size(image)
-    fx, _, cx, _, fy, cy = values[:6]
-    return CameraTable(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, pixel_center=1.0)
 
 
 _DOCS = """

@@ -8,17 +8,28 @@ to the colour image as it was taken, so both are undistorted alike.
 Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): its page gives the lens, and the camera in the frame of the markers
 that groundtruth.txt follows, T_camera = T_ros^-1 T_groundtruth T_ros T_m. The rotation of T_m has a scale of 1.059
 there, which is left out. ETH3D SLAM (Schöps et al., CVPR 2019): ``calibration.txt`` with fx, fy, cx, cy.
+
+ICL-NUIM in its TUM-compatible form: ``rgb/N.png``, ``depth/N.png`` and a ``*.gt.freiburg``, all by the number N. The
+renderer's camera is left-handed, which its page writes as a negative focal length (481.20, -480.00, 319.50, 239.50):
+y points up, in the camera and in the world. Both are mirrored here, so that poses stay rigid and fy is positive, as
+in theNded/MeshHashing (src/io/config_manager.cc). The trajectory begins with image 1; image 0 has no pose.
 """
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ListedView, PosesTable
-from splatctrl_cli.datasets.layout import Layout, described, given_lens, pinhole
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
+from splatctrl_cli.datasets.layout import (
+    Layout,
+    described,
+    images_of,
+    paired_by_name,
+    paired_by_stamp,
+    pinhole,
+)
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.image_stamps import pair_by_stamp
@@ -26,6 +37,9 @@ from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Float64
 
 SCALE = 1.0 / 5000.0  # [m] per count
+ICL_LENS = (481.2, 480.0, 319.5, 239.5)
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_TRAJECTORY = "*.gt.freiburg"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +69,17 @@ SERIES = (
         distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0),
     ),
 )
+
+
 _BONN = SERIES[-1]
+
+
 _BONN_T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
 _BONN_SCALE = 1.0593  # of the rotation below, as published
+
+
 _BONN_T_M = np.array(
     [
         [1.0157 / _BONN_SCALE, 0.1828 / _BONN_SCALE, -0.2389 / _BONN_SCALE, 0.0113],
@@ -66,6 +88,8 @@ _BONN_T_M = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
+
+
 _BONN_NOTE = (
     "Bonn: poses are moved from the markers to the camera as its page says, without the scale of 1.059 in that"
     " transform; depth is as published (--depth-scale 2.1186e-4 scales it by as much)"
@@ -83,42 +107,17 @@ def read(folder: Path, options: SourceOptions) -> Description:
     series = _series(folder)
     file = folder / "groundtruth.txt"
     trajectory = Trajectory(read_tum(file) if file.is_file() else {})
-    views, unpaired = paired_views(colors, depths, trajectory.at, options)
-    if series is _BONN:
-        views = [_from_markers(view) for view in views]
+    pairs = paired_by_stamp(folder / "rgb.txt", colors, depths, trajectory.at, options)
     return described(
-        folder / "rgb.txt",
+        pairs.moved(marker_to_camera) if series is _BONN else pairs,
         folder,
-        views,
+        options,
         poses=PosesTable(format="tum", file=file.name),
-        camera=_lens(folder, series, options, views[0].color) if views else None,
+        lens=lambda image: _lens(folder, series, image),
         depth=DepthTable(scale=SCALE),
         has_stamps=True,
-        unpaired=unpaired,
         notes=(_BONN_NOTE,) if series is _BONN else (),
     )
-
-
-def paired_views(
-    colors: list[tuple[int, Path]],
-    depths: list[tuple[int, Path]],
-    pose_at: Callable[[int], Float64 | None],
-    options: SourceOptions,
-) -> tuple[list[ListedView], tuple[int, int]]:
-    """Views of stamps [ns] and files, posed where a pose is known, and how many files have no partner."""
-    tolerance_ns = round(options.pairing_tolerance_s * 1e9)
-    pairs = pair_by_stamp([stamp for stamp, _ in colors], [stamp for stamp, _ in depths], tolerance_ns)
-    views = [
-        ListedView(
-            name=f"{colors[i][0] / 1e9:.6f}",
-            color=colors[i][1],
-            depth=depths[j][1],
-            matrix=pose_at(colors[i][0]),
-            stamp_ns=colors[i][0],
-        )
-        for i, j in pairs
-    ]
-    return views, (len(colors) - len(pairs), len(depths) - len(pairs))
 
 
 def listed(path: Path) -> list[tuple[int, Path]]:
@@ -145,10 +144,7 @@ def _series(folder: Path) -> Series | None:
     return next((series for name, series in pairs if re.search(rf"(?<![a-z]){series.pattern}(?!\d)", name)), None)
 
 
-def _lens(folder: Path, series: Series | None, options: SourceOptions, image: Path) -> CameraTable:
-    given = given_lens(options, image)
-    if given is not None:
-        return given
+def _lens(folder: Path, series: Series | None, image: Path) -> CameraTable:
     calibration = folder / "calibration.txt"
     if calibration.is_file():
         values = read_numbers(calibration)
@@ -167,15 +163,45 @@ def _lens(folder: Path, series: Series | None, options: SourceOptions, image: Pa
     )
 
 
-def _from_markers(view: ListedView) -> ListedView:
-    return view if view.matrix is None else replace(view, matrix=marker_to_camera(view.matrix))
-
-
 def marker_to_camera(T_ground_truth: Float64) -> Float64:
     """T_world_camera (4, 4) of a pose in Bonn's groundtruth.txt."""
     T_world_camera: Float64 = _BONN_T_ROS.T @ T_ground_truth @ _BONN_T_ROS @ rigid(_BONN_T_M, "Bonn's T_m")
     return T_world_camera
 
+
+def is_icl(folder: Path) -> bool:
+    """Whether the folder is a sequence of ICL-NUIM."""
+    has_images = all((folder / name).is_dir() for name in ("rgb", "depth"))
+    return has_images and next(folder.glob(_TRAJECTORY), None) is not None
+
+
+def read_icl(folder: Path, options: SourceOptions) -> Description:
+    """The folder as a description, right-handed."""
+    colors, depths = images_of(folder / "rgb"), images_of(folder / "depth")
+    file = sorted(folder.glob(_TRAJECTORY))[0]
+    poses = {_number(name): MIRROR @ T @ MIRROR for name, T in read_tum(file).items()}
+    return described(
+        paired_by_name(file, colors, depths, lambda name: poses.get(_number(name))),
+        folder,
+        options,
+        poses=PosesTable(format="tum", file=file.name),
+        lens=lambda image: pinhole(ICL_LENS, image),
+        depth=DepthTable(scale=SCALE),
+    )
+
+
+def _number(name: str) -> int:
+    """The number that a stem or a stamp is, -1 where it is none."""
+    try:
+        return int(float(name))
+    except (ValueError, OverflowError):
+        return -1
+
+
+_ICL_DOCS = """
+ICL-NUIM, TUM-compatible | `rgb/`, `depth/`, `*.gt.freiburg` | by number; mirrored to right-handed | 1/5000 m |
+    481.2, 480, 319.5, 239.5
+"""
 
 _DOCS = """
 TUM RGB-D | `rgb.txt`, `depth.txt` | `groundtruth.txt`, interpolated at the colour's stamp | 1/5000 m, paired
@@ -187,4 +213,9 @@ Bonn RGB-D Dynamic | the same, `bonn` in the name | moved from the markers to th
 
 ETH3D SLAM | the same, `calibration.txt` | as TUM | as TUM | fx, fy, cx, cy
 """
-ENTRIES = (Layout(name="TUM RGB-D", order=0, matches=matches, read=read, docs=_DOCS),)
+
+
+ENTRIES = (
+    Layout(name="TUM RGB-D", order=0, matches=matches, read=read, docs=_DOCS),
+    Layout(name="ICL-NUIM", order=5, matches=is_icl, read=read_icl, docs=_ICL_DOCS),
+)

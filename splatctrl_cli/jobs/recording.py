@@ -6,8 +6,8 @@ from pathlib import Path
 from splatctrl_cli.captures.capture import is_capture
 from splatctrl_cli.containers.bag_log import is_bag_folder
 from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
-from splatctrl_cli.datasets.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.jobs.reconstruct import check_pose_jumps
 from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP
 from splatctrl_cli.logs.options import SourceOptions

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.datasets.dtu_source import DtuSource
-from splatctrl_cli.datasets.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.evaluate.recording import changed_files, differences
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.recording import RecordingRequest, open_dtu, open_held_out, refuse_scan_options

@@ -10,9 +10,8 @@ from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
-from splatctrl_cli.datasets.image_folder import ImageFolderSource
+from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
 from splatctrl_cli.datasets.layouts import layout_of, open_layout, readable_in
-from splatctrl_cli.datasets.rig_folder import RigFolderSource, open_image_folder
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import files_below, names_in
 from splatctrl_cli.files.summary import Grid, Summary

@@ -7,8 +7,8 @@ from splatctrl_cli.captures.capture import CaptureSource, is_capture
 from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.containers.session_log import SessionLog
+from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.datasets.layouts import open_layout
-from splatctrl_cli.datasets.rig_folder import open_image_folder
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.ros_log import RosLogSource

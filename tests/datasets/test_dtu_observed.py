@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.datasets.dtu_observed import cloud_of_scan, read_observed
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.protocols import cloud_of_scan, read_observed
 from tests.files.make_observed import RESOLUTION, write_observed
 
 LOW, HIGH = np.array([-30.0, -20.0, 500.0]), np.array([30.0, 20.0, 560.0])

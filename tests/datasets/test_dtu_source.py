@@ -8,8 +8,8 @@ import pytest
 
 from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.datasets.dtu_source import DtuSource, shrunk, view_numbers
-from splatctrl_cli.datasets.protocols import score_protocol
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.geometry import project
 from splatctrl_cli.records import Intrinsics, RgbdFrame
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from splatctrl_cli.datasets.protocols import score_protocol
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.protocols import score_protocol
 
 DTU = range(49)
 

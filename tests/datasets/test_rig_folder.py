@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.captures.capture import CaptureSource, write_capture
-from splatctrl_cli.datasets.rig_folder import open_image_folder
+from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import RgbdFrame

@@ -15,9 +15,9 @@ from splatctrl_cli.cli.score_report import lines_of
 from splatctrl_cli.datasets.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.datasets.dtu_source import DtuSource
 from splatctrl_cli.datasets.idr import write_idr
-from splatctrl_cli.datasets.protocols import score_protocol
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.cloud import spaced
+from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.jobs.recording import RecordingRequest, is_folder_of_views
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.score_cloud import CloudSettings
