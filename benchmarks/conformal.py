@@ -26,12 +26,12 @@ from benchmarks.random_tabletop import random_things
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.evaluate.conformal import FEWEST, autocorrelation_time, conformal_rank, stretch_scores, stretches
-from splatctrl_cli.jobs.lockstep import from_log
 from splatctrl_cli.jobs.progress import SILENT
-from splatctrl_cli.jobs.replay_evidence import Misses, misses_of
-from splatctrl_cli.jobs.replay_record import ReplayRecord
-from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay_states import read_states
+from splatctrl_cli.jobs.replays.evidence import Misses, misses_of
+from splatctrl_cli.jobs.replays.inputs import read_states
+from splatctrl_cli.jobs.replays.lockstep import from_log
+from splatctrl_cli.jobs.replays.record import ReplayRecord
+from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Float64, JointState

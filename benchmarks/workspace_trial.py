@@ -16,7 +16,7 @@ from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.control.scene_field import SceneStep, rate_of
 from splatctrl_cli.control.standstill import BoxZone, StopZone, Zone, monitored_standstill
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.jobs.known_scene import splat_fields
+from splatctrl_cli.jobs.replays.known_scene import splat_fields
 from splatctrl_cli.records import Bool, Box, DistanceField, Float64
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import posture_of

@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
 from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.replay import ReplayResult, replay
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Box, Label

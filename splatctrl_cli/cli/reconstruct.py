@@ -23,7 +23,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.recording import open_to_train
-from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP
+from splatctrl_cli.jobs.replays.request import DEFAULT_POSE_JUMP
 from splatctrl_cli.records import Box, RecordSource
 
 DECIDING_OPTIONS = (

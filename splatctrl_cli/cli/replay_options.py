@@ -10,8 +10,8 @@ from splatctrl_cli.cli.robot_options import locked_joints
 from splatctrl_cli.cli.source_options import source_options
 from splatctrl_cli.config.declared import shown
 from splatctrl_cli.control.presets import with_preset
-from splatctrl_cli.jobs.replay_goal import checked_pose
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replays.goal import checked_pose
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 
 MODES = ("audit", "open-loop", "closed-loop")
 BASELINES = ("standstill", "birrt", "birrt-ik")

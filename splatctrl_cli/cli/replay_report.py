@@ -4,11 +4,10 @@ from collections.abc import Iterator
 
 from splatctrl_cli.cli.common import long_table, table
 from splatctrl_cli.jobs.replay import ReplayResult
-from splatctrl_cli.jobs.replay_baseline import FIGURES
-from splatctrl_cli.jobs.replay_columns import chunks_of
-from splatctrl_cli.jobs.replay_compare import MOTION, PLAN, Comparison, figures_of
-from splatctrl_cli.jobs.replay_files import when_and_why
-from splatctrl_cli.jobs.replay_modes import Replay
+from splatctrl_cli.jobs.replays.compare import MOTION, PLAN, figures_of
+from splatctrl_cli.jobs.replays.files import chunks_of, when_and_why
+from splatctrl_cli.jobs.replays.people import FIGURES
+from splatctrl_cli.jobs.replays.result import Comparison, Replay
 
 HEADLINE = (
     *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),

@@ -7,7 +7,7 @@ from typing import Any
 from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared import carried_words
 from splatctrl_cli.scene.audit import AuditRow

@@ -9,7 +9,7 @@ from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.jobs.reconstruct import check_pose_jumps
-from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP
+from splatctrl_cli.jobs.replays.request import DEFAULT_POSE_JUMP
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.sources.source import open_source

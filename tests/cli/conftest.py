@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from splatctrl_cli.jobs import lockstep, replay_files, replay_robot, replay_states
+from splatctrl_cli.jobs.replays import files, inputs, lockstep
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot import coverage
 from splatctrl_cli.robot.model import RobotModel
@@ -33,13 +33,13 @@ def coverage_once(monkeypatch: pytest.MonkeyPatch) -> None:
             MEASURED[key] = measure(urdf, spheres, **how)
         return MEASURED[key]
 
-    monkeypatch.setattr(replay_robot, "coverage_deficit", known)
+    monkeypatch.setattr(inputs, "coverage_deficit", known)
 
 
 @pytest.fixture
 def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of other files of the output."""
-    monkeypatch.setattr(replay_files, "draw_replay", lambda *_: None)
+    monkeypatch.setattr(files, "draw_replay", lambda *_: None)
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def desk(tmp_path: Path, sample_data: Path, monkeypatch: pytest.MonkeyPatch, cov
     robot = ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
     desk = Desk(folder=tmp_path, source=FakeSource(states=logged()), robot=robot)
     opened = state_source.open_states
-    for module in (replay_states, lockstep):
+    for module in (inputs, lockstep):
         monkeypatch.setattr(
             module,
             "open_states",

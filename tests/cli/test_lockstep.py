@@ -12,11 +12,11 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, load_config
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.jobs import known_scene
-from splatctrl_cli.jobs.known_scene import KnownFields, from_splats
-from splatctrl_cli.jobs.lockstep import from_log
 from splatctrl_cli.jobs.progress import SILENT
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replays import known_scene
+from splatctrl_cli.jobs.replays.known_scene import KnownFields, from_splats
+from splatctrl_cli.jobs.replays.lockstep import from_log
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene

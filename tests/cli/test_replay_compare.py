@@ -10,8 +10,8 @@ import pytest
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.grid_files.grid import write_npz
-from splatctrl_cli.jobs.replay_compare import certified_distance, figure_names
-from splatctrl_cli.jobs.replay_metrics import metric_names
+from splatctrl_cli.jobs.replays.compare import certified_distance, figure_names
+from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, grid_seen, splats_of, write_scene
@@ -130,7 +130,7 @@ def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_fiel
     """Beside and between splats of many sizes: certified <= the exact distance in float64 everywhere, which is
     1-Lipschitz; the controller's own field is steeper than that somewhere, so nothing follows from its samples.
     """
-    from splatctrl_cli.jobs.known_scene import splat_fields
+    from splatctrl_cli.jobs.replays.known_scene import splat_fields
 
     steepest = 0.0
     for seed in range(12):

@@ -13,11 +13,11 @@ from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.jobs import replay_evidence
-from splatctrl_cli.jobs.lockstep import from_log
 from splatctrl_cli.jobs.progress import SILENT
-from splatctrl_cli.jobs.replay_evidence import apart_from_robot, held_out, open_evidence, trained
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replays import evidence
+from splatctrl_cli.jobs.replays.evidence import apart_from_robot, held_out, open_evidence, trained
+from splatctrl_cli.jobs.replays.lockstep import from_log
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics, Record, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
@@ -46,8 +46,8 @@ class FilmedSource(FakeSource):
 
 
 def test_what_is_within_reach_of_a_sphere_anywhere_in_its_cell_is_near() -> None:
-    swept = replay_evidence.Swept(np.zeros((1, 3)), np.array([0.05]), reach=0.1)
-    corners = replay_evidence.CELL * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 1]])
+    swept = evidence.Swept(np.zeros((1, 3)), np.array([0.05]), reach=0.1)
+    corners = evidence.CELL * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 1]])
     reached = corners + 0.149 * np.array([[-1.0, 0, 0], [1, 0, 0], [3**-0.5] * 3])
     assert len(swept.near(reached)) == 3
     assert len(swept.near(np.array([[0.22, 0.0, 0.0]]))) == 0
@@ -83,7 +83,7 @@ def scene(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> list[str]:
                 raise InputError(f"{path}: no camera {name!r}", remedy="use one of: cam0, cam9")
         return replace(desk.source, cameras=names)
 
-    monkeypatch.setattr(replay_evidence, "open_states", opened)
+    monkeypatch.setattr(evidence, "open_states", opened)
     folder = write_scene(desk.folder / "scene", (0, splats_of(BALL)), (SECOND, splats_of(BALL)))
     return ["--scene", str(folder), *FAR, "-q"]
 
@@ -295,7 +295,7 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
 
 
 def test_every_set_either_trains_or_is_evidence(recording: Path) -> None:
-    source = replay_evidence.open_states(recording / "log.mcap", SourceOptions(), ())
+    source = evidence.open_states(recording / "log.mcap", SourceOptions(), ())
     steps = [s.stamp_ns for s in time_steps(source.records(), source.cameras, has_clock=True)]
     for every in (2, 3, 5):
         given = list(time_steps(source.records(), source.cameras, has_clock=True))

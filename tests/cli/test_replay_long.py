@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.files import rows
-from splatctrl_cli.jobs import replay_columns, replay_record, replay_store
+from splatctrl_cli.jobs.replays import files, record, store
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.records import JointState
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, splats_of, write_scene
@@ -18,8 +18,8 @@ FILES = ("steps.csv", "events.json", "summary.json", "states.json")
 
 
 def in_blocks_of(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
-    for module in (replay_columns, replay_record, replay_store, rows, state_columns):
-        monkeypatch.setattr(module, "CHUNK" if module is replay_columns else "BLOCK", num)
+    for module in (files, record, store, rows, state_columns):
+        monkeypatch.setattr(module, "CHUNK" if module is files else "BLOCK", num)
 
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
@@ -77,7 +77,7 @@ def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
 
 
 def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None:
-    stored: replay_store.StoredObjects[int] = replay_store.StoredObjects()
+    stored: store.StoredObjects[int] = store.StoredObjects()
     for block in ([0, 1], [], [2, 3, 4], [5]):
         stored.extend(block)
     whole = list(range(6))

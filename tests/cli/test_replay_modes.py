@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.jobs import replay_columns
-from splatctrl_cli.jobs.replay_metrics import metric_names
+from splatctrl_cli.jobs.replays import files
+from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.records import JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, logged, splats_of, write_scene
@@ -345,7 +345,7 @@ def test_steps_are_the_same_however_many_are_written_at_once(
     moving(desk)
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     for chunk, out in ((4096, "whole"), (3, "chunked")):
-        monkeypatch.setattr(replay_columns, "CHUNK", chunk)
+        monkeypatch.setattr(files, "CHUNK", chunk)
         assert desk.replay("--scene", str(scene), "-q", "--mode", mode, out=out) == 0
     whole, chunked = ((desk.folder / out / "steps.csv").read_bytes() for out in ("whole", "chunked"))
     assert whole == chunked

@@ -10,8 +10,8 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.geometry import transform_points
-from splatctrl_cli.jobs.replay_request import ReplayRequest
-from splatctrl_cli.jobs.replay_robot import doubts_of, read_robot
+from splatctrl_cli.jobs.replays.inputs import doubts_of, read_robot
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.coverage import coverage_deficit, refined
 from splatctrl_cli.robot.model import RobotModel

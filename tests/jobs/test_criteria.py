@@ -11,8 +11,8 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs import evidence_criteria as evidence
-from splatctrl_cli.jobs.motion_criteria import controller, surface_clearance
+from splatctrl_cli.jobs.replays import evidence_criteria as evidence
+from splatctrl_cli.jobs.replays.motion_criteria import controller, surface_clearance
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.jobs.known_scene import KnownScene, fields_at, known_space
+from splatctrl_cli.jobs.replays.known_scene import KnownScene, fields_at, known_space
 from splatctrl_cli.records import SWEPT, OccupancyGrid
 
 SECOND = 1_000_000_000

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.jobs.replay_metrics import _largest, _least
+from splatctrl_cli.jobs.replays.metrics import _largest, _least
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import START, Desk

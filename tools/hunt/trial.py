@@ -11,10 +11,10 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import SplatCtrlError
-from splatctrl_cli.jobs import replay_files, replay_robot
 from splatctrl_cli.jobs.reconstruct import ReconstructRequest, reconstruct
 from splatctrl_cli.jobs.replay import ReplayResult, replay
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replays import files, inputs
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Intrinsics, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, coverage_deficit
@@ -283,8 +283,8 @@ def _zoomed(camera: Camera, zoom: float) -> Camera:
 def _quick() -> Iterator[None]:
     """Replays without their plots, which nobody looks at, and with the coverage of a robot measured once."""
     with (
-        patch.object(replay_files, "draw_replay", lambda *args, **kwargs: None),
-        patch.object(replay_robot, "coverage_deficit", _coverage),
+        patch.object(files, "draw_replay", lambda *args, **kwargs: None),
+        patch.object(inputs, "coverage_deficit", _coverage),
     ):
         yield
 

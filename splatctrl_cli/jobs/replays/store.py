@@ -287,7 +287,7 @@ class StoredLoop:
         return Rows(self._position)
 
     @property
-    def steps(self) -> "Sequence[ControlStep]":
+    def steps(self) -> Sequence[ControlStep]:
         """The steps; none is None."""
         self._flush()
         return self.kept.stored  # type: ignore[return-value]

@@ -7,11 +7,11 @@ import numpy as np
 
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs.replay_metrics import Metrics
-from splatctrl_cli.jobs.replay_modes import Replay
-from splatctrl_cli.jobs.replay_record import SLIGHT
-from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay_states import LoggedStates
+from splatctrl_cli.jobs.replays.inputs import LoggedStates
+from splatctrl_cli.jobs.replays.metrics import Metrics
+from splatctrl_cli.jobs.replays.record import SLIGHT
+from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.result import Replay
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
 SLOW = "log joint states more often"
@@ -54,12 +54,12 @@ def held(criterion: str, sentence: str, value: float, threshold: float, unit: st
     )
 
 
-def least_of(values: "np.ndarray[tuple[int], np.dtype[np.float64]]") -> float | None:
+def least_of(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float | None:
     there = values[~np.isnan(values)]
     return float(there.min()) if len(there) else None
 
 
-def time_of_least(judged: Judged, values: "np.ndarray[tuple[int], np.dtype[np.float64]]") -> float:
+def time_of_least(judged: Judged, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
     return seconds_at(judged, int(np.nanargmin(values)))
 
 

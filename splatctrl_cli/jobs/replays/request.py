@@ -7,8 +7,8 @@ from pathlib import Path
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.jobs.evidence import Mismatch
-from splatctrl_cli.jobs.known_scene import KnownScene
+from splatctrl_cli.jobs.replays.belonging import Mismatch
+from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource

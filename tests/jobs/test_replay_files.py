@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.report.replay_output import write_steps
+from splatctrl_cli.jobs.replays.files import write_steps
 
 
 def test_a_row_per_step_with_nothing_where_there_is_no_value(tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.files.rows import ranges
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.reconstruction import SAME_MOMENT_NS, training_cameras
-from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay_store import StoredAudit
+from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.store import StoredAudit
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel

@@ -3,7 +3,6 @@
 from bisect import bisect_right
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +12,11 @@ from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
-from splatctrl_cli.jobs.known_scene import (
+from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.reconstruct import check_pose_jumps
+from splatctrl_cli.jobs.reconstruction import Reconstruction
+from splatctrl_cli.jobs.replays.evidence import EVERY, every_of, trained, training_options
+from splatctrl_cli.jobs.replays.known_scene import (
     KnownFields,
     KnownScene,
     fields_at,
@@ -22,10 +25,7 @@ from splatctrl_cli.jobs.known_scene import (
     known_space,
     splat_fields,
 )
-from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.reconstruct import check_pose_jumps
-from splatctrl_cli.jobs.replay_evidence import EVERY, every_of, trained, training_options
-from splatctrl_cli.jobs.replay_request import DEFAULT_POSE_JUMP, ReplayRequest
+from splatctrl_cli.jobs.replays.request import DEFAULT_POSE_JUMP, ReplayRequest
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.shot import ShotSource
 from splatctrl_cli.records import Float64, UInt8
@@ -34,9 +34,6 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.splat_files.splats import read_ply
 from splatctrl_cli.states.state_source import open_states
-
-if TYPE_CHECKING:
-    from splatctrl_cli.jobs.reconstruction import Reconstruction
 
 FOLDER = "scene"  # within the replay's
 
@@ -85,8 +82,6 @@ def from_log(
 
     Raises InputError for a log without frames or a clock.
     """
-    from splatctrl_cli.jobs.reconstruction import Reconstruction
-
     source = _open(request, model)
     check_pose_jumps(source, request.max_pose_jump)
     place = folder / FOLDER
@@ -123,15 +118,14 @@ class Lockstep:
 
     def __init__(
         self,
-        fitted: "Reconstruction",
-        config: "Config",
+        fitted: Reconstruction,
+        config: Config,
         latency_ns: int,
         console: Progress,
         *,
         ends_with_log: bool,
         held_out_every: int | None = None,
     ) -> None:
-
         self._fitted, self._config, self._console = fitted, config, console
         self._latency_ns, self._ends_with_log = latency_ns, ends_with_log
         self._stopwatch = Stopwatch()
@@ -195,11 +189,10 @@ class Lockstep:
             self._files.append(snapshot.path)
 
     def _fields(self, file: Path) -> KnownFields:
-
         balls = read_unrepresented(file.with_suffix(".npz"))
         return splat_fields(read_ply(file)[0], self._config, self._fitted.threads, balls)
 
-    def _observed(self, points: "Float64") -> "UInt8":
+    def _observed(self, points: Float64) -> UInt8:
         """The known space of the log, or of as much of it as the replay has passed."""
         while self._ends_with_log and self._next is not None:
             self._take()
@@ -212,7 +205,6 @@ class Lockstep:
 
     def _finish(self) -> None:
         """Leave a scene folder as `reconstruct` writes it, of the frame sets that were taken in."""
-
         fitted = self._fitted
         with self._stopwatch.stage("write"):
             fitted.finish()
@@ -229,9 +221,8 @@ class Lockstep:
         self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")
 
 
-def _open(request: ReplayRequest, model: "RobotModel") -> "ShotSource":
+def _open(request: ReplayRequest, model: RobotModel) -> ShotSource:
     """The log once more: its frames are read in step with the replay."""
-
     source = open_states(request.log, request.options, model.joint_names)
     if not source.cameras:
         raise InputError(

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,15 +10,13 @@ from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.replay import Outcome
 from splatctrl_cli.control.step import RowKind
 from splatctrl_cli.evaluate.clearance import least
-from splatctrl_cli.jobs.replay_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
-from splatctrl_cli.jobs.replay_compare import figure_names, figures_of
-from splatctrl_cli.jobs.replay_states import LOG_FIGURES
-from splatctrl_cli.jobs.replay_twists import FIGURES as TWIST_FIGURES
+from splatctrl_cli.jobs.replays.compare import figure_names, figures_of
+from splatctrl_cli.jobs.replays.goal import TWIST_FIGURES
+from splatctrl_cli.jobs.replays.inputs import LOG_FIGURES
+from splatctrl_cli.jobs.replays.people import BESIDE, FIGURES, STANDSTILL, separation_figures
+from splatctrl_cli.jobs.replays.result import Replay
+from splatctrl_cli.jobs.replays.store import RUNGS, Figures
 from splatctrl_cli.records import Bool, Float64
-
-if TYPE_CHECKING:
-    from splatctrl_cli.jobs.replay_modes import Replay
-    from splatctrl_cli.jobs.replay_store import Figures
 
 Metrics = dict[str, float | None]
 
@@ -70,9 +67,8 @@ def metric_names(
     return tuple(names)
 
 
-def metrics_of(replay: "Replay") -> Metrics:
+def metrics_of(replay: Replay) -> Metrics:
     """Every figure that is printed, written and gated on, by name; None where there is no value."""
-
     audit = replay.audit
     exact = audit.clearance["exact"].distance
     metrics: Metrics = {
@@ -128,7 +124,7 @@ def metrics_of(replay: "Replay") -> Metrics:
     return metrics
 
 
-def _map_error(replay: "Replay") -> Metrics:
+def _map_error(replay: Replay) -> Metrics:
     """By held-out depth; None without, or where that is too little."""
     bound = None if replay.map_error is None else replay.map_error.bound
     return {
@@ -138,7 +134,7 @@ def _map_error(replay: "Replay") -> Metrics:
     }
 
 
-def first_time(replay: "Replay", metric: str, holds: Callable[[float], bool]) -> float | None:
+def first_time(replay: Replay, metric: str, holds: Callable[[float], bool]) -> float | None:
     """The first time [s] at which a metric, taken over the states until then, does not hold; None where it is no
     figure of single states.
     """
@@ -153,7 +149,7 @@ def first_time(replay: "Replay", metric: str, holds: Callable[[float], bool]) ->
     return None if first is None else float(stamps[first] - stamps[0]) * 1e-9
 
 
-def _running(replay: "Replay", metric: str) -> "tuple[float, Float64] | None":
+def _running(replay: Replay, metric: str) -> tuple[float, Float64] | None:
     """What a metric is before the first state, and over the states up to each (T,)."""
     low, high, flags = _lows(replay).get(metric), _highs(replay).get(metric), _flags(replay).get(metric)
     if low is not None:
@@ -163,7 +159,7 @@ def _running(replay: "Replay", metric: str) -> "tuple[float, Float64] | None":
     return None if flags is None else (0.0, np.cumsum(flags()).astype(np.float64))
 
 
-def _lows(replay: "Replay") -> "Mapping[str, Callable[[], Float64]]":
+def _lows(replay: Replay) -> Mapping[str, Callable[[], Float64]]:
     """Reads the states' values (T,) of which a metric is the least."""
     audit, truth, steps, asked = replay.audit, replay.true_clearance, replay.kept_steps, replay.open_loop
     lows: dict[str, Callable[[], Float64]] = {
@@ -182,23 +178,21 @@ def _lows(replay: "Replay") -> "Mapping[str, Callable[[], Float64]]":
     return lows
 
 
-def _highs(replay: "Replay") -> "Mapping[str, Callable[[], Float64]]":
+def _highs(replay: Replay) -> Mapping[str, Callable[[], Float64]]:
     """Reads the states' values (T,) of which a metric is the largest."""
     of, asked = replay.divergence, replay.open_loop
     highs: dict[str, Callable[[], Float64]] = {"max_map_age_s": lambda: np.asarray(replay.map_age_s)}
     if of is not None:
-        highs["max_divergence_joints"] = lambda: np.asarray(of.joints)
-        highs["max_divergence_position"] = lambda: np.asarray(of.position)
-        highs["max_divergence_rotation_deg"] = lambda: np.degrees(np.asarray(of.rotation))
+        highs["max_divergence_joints"] = lambda: of["joints"]
+        highs["max_divergence_position"] = lambda: of["position"]
+        highs["max_divergence_rotation_deg"] = lambda: np.degrees(of["rotation"])
     if asked is not None:
         highs["max_velocity_difference"] = lambda: asked.figures["largest"]
     return highs
 
 
-def _flags(replay: "Replay") -> "Mapping[str, Callable[[], Bool]]":
+def _flags(replay: Replay) -> Mapping[str, Callable[[], Bool]]:
     """Reads the states (T,) that a count counts."""
-    from splatctrl_cli.jobs.replay_store import RUNGS
-
     exact, steps, asked = replay.audit.clearance["exact"], replay.kept_steps, replay.open_loop
     flags: dict[str, Callable[[], Bool]] = {
         "num_below_margin": lambda: exact.distance < replay.margin,
@@ -207,7 +201,7 @@ def _flags(replay: "Replay") -> "Mapping[str, Callable[[], Bool]]":
     }
     if steps is not None:
 
-        def is_on(rung: Rung) -> "Bool":
+        def is_on(rung: Rung) -> Bool:
             return np.asarray(steps.figures["rung"] == RUNGS.index(rung))
 
         for rung in (Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD):
@@ -218,9 +212,7 @@ def _flags(replay: "Replay") -> "Mapping[str, Callable[[], Bool]]":
     return flags
 
 
-def _step_metrics(replay: "Replay", figures: "Figures") -> Metrics:
-    from splatctrl_cli.jobs.replay_store import RUNGS
-
+def _step_metrics(replay: Replay, figures: Figures) -> Metrics:
     first, rung = first_intervention(replay.events), figures["rung"]
     return {
         "intervention_share": _mean(figures["shaped"]),
@@ -237,7 +229,7 @@ def _step_metrics(replay: "Replay", figures: "Figures") -> Metrics:
     }
 
 
-def _open_loop_metrics(replay: "Replay") -> Metrics:
+def _open_loop_metrics(replay: Replay) -> Metrics:
     assert replay.open_loop is not None
     figures = replay.open_loop.figures
     size = figures["size"]
@@ -252,8 +244,7 @@ def _open_loop_metrics(replay: "Replay") -> Metrics:
     }
 
 
-def _closed_loop_metrics(replay: "Replay") -> Metrics:
-
+def _closed_loop_metrics(replay: Replay) -> Metrics:
     trace, of = replay.closed_loop, replay.divergence
     assert trace is not None
     assert of is not None
@@ -269,40 +260,40 @@ def _closed_loop_metrics(replay: "Replay") -> Metrics:
         "num_scene_hits": sum(change.is_hit for change in trace.scene_changes),
         "num_anchors": len(trace.anchored),
         "num_detours": len(trace.detours),
-        "max_divergence_joints": _largest(np.asarray(of.joints)),
-        "max_divergence_position": _largest(np.asarray(of.position)),
-        "max_divergence_rotation_deg": _largest(np.degrees(np.asarray(of.rotation))),
-        "end_divergence_joints": _last(np.asarray(of.joints)),
-        "end_divergence_position": _last(np.asarray(of.position)),
-        "end_divergence_rotation_deg": _last(np.degrees(np.asarray(of.rotation))),
+        "max_divergence_joints": _largest(of["joints"]),
+        "max_divergence_position": _largest(of["position"]),
+        "max_divergence_rotation_deg": _largest(np.degrees(of["rotation"])),
+        "end_divergence_joints": _last(of["joints"]),
+        "end_divergence_position": _last(of["position"]),
+        "end_divergence_rotation_deg": _last(np.degrees(of["rotation"])),
     }
 
 
-def _is_blank(replay: "Replay") -> "Bool":
+def _is_blank(replay: Replay) -> Bool:
     blank = np.zeros(len(replay.audit.stamp_ns), dtype=np.bool_)
     for of in replay.audit.clearance.values():
         blank |= np.isnan(of.distance)
     return blank
 
 
-def _mean(values: "Float64") -> float | None:
+def _mean(values: Float64) -> float | None:
     """Over the states that have a value."""
     there = values[~np.isnan(values)]
     return float(np.mean(there)) if len(there) else None
 
 
-def _least(values: "Float64") -> float | None:
+def _least(values: Float64) -> float | None:
     """Over the states that have a value."""
     there = values[~np.isnan(values)]
     return float(np.min(there)) if len(there) else None
 
 
-def _largest(values: "Float64") -> float | None:
+def _largest(values: Float64) -> float | None:
     """The largest value; None where one is infinite or none is there."""
     there = values[~np.isnan(values)]
     return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
 
 
-def _last(values: "Float64") -> float | None:
+def _last(values: Float64) -> float | None:
     there = values[np.isfinite(values)]
     return float(there[-1]) if len(there) else None

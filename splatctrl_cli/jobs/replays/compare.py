@@ -1,10 +1,10 @@
 """The methods of ``--baseline`` beside the closed loop and the log: one task, one scene, one table."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,16 +15,15 @@ from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.goal import goal_waypoints
+from splatctrl_cli.jobs.replays.known_scene import KnownFields
+from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.result import Comparison, Replay
 from splatctrl_cli.planner.comparison import Motion, MotionFigures, Yardstick
 from splatctrl_cli.planner.planned import PlannedPath, planned_detours, planned_path
 from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.records import Float64
 from splatctrl_cli.report.methods_picture import methods_picture
-
-if TYPE_CHECKING:
-    from splatctrl_cli.jobs.known_scene import KnownFields
-    from splatctrl_cli.jobs.replay_modes import Replay
 
 BIRRT, BIRRT_IK = "birrt", "birrt-ik"
 ALWAYS = ("closed_loop", "log")  # what stands in every comparison
@@ -34,20 +33,6 @@ MOTION = (
     *("min_clearance_barrier", "min_clearance", "min_clearance_proved", "min_clearance_true", "num_interventions"),
 )
 PLAN = ("planning_time_s", "planned_margin", "planned_self_margin", "num_edges", "num_edges_proved")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Motions and their figures by method, and plans of the methods that plan; without a path there is no motion."""
-
-    motions: "Mapping[str, Motion]" = field(default_factory=dict)
-    figures: "Mapping[str, MotionFigures]" = field(default_factory=dict)
-    plans: "Mapping[str, PlannedPath]" = field(default_factory=dict)
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """Every method, in the order in which they stand side by side."""
-        return tuple(dict.fromkeys((*self.motions, *self.plans)))
 
 
 def method_named(baseline: str) -> str:
@@ -95,7 +80,6 @@ def document_of(comparison: Comparison) -> dict[str, Any]:
 
 def draw_methods(folder: Path, comparison: Comparison, period: float, margin: float) -> None:
     """Write methods.png, where there is more than the replay itself."""
-
     if comparison.figures:
         barrier = {method: figures.barrier for method, figures in comparison.figures.items()}
         methods_picture(folder / "methods.png", barrier, period, margin)
@@ -117,16 +101,15 @@ def check_comparable(request: ReplayRequest, baselines: Sequence[str]) -> None:
 def compared(
     request: ReplayRequest,
     baselines: Sequence[str],
-    inputs: "ReplayInputs",
-    replay: "Replay",
-    config: "Config",
+    inputs: ReplayInputs,
+    replay: Replay,
+    config: Config,
     console: Progress,
 ) -> Comparison:
     """The closed loop, the log and every baseline, each in the scene as it was known at its time.
 
     Planned paths are those of the scene known at the start; they begin there and then, as if planning took no time.
     """
-
     trace = replay.closed_loop
     if not baselines or trace is None:
         return Comparison()
@@ -158,10 +141,9 @@ def compared(
 
 
 def _planned(
-    baselines: Sequence[str], inputs: "ReplayInputs", task: "ReplayTask", config: "Config", console: Progress
-) -> "tuple[dict[str, PlannedPath], dict[str, Motion]]":
+    baselines: Sequence[str], inputs: ReplayInputs, task: ReplayTask, config: Config, console: Progress
+) -> tuple[dict[str, PlannedPath], dict[str, Motion]]:
     """One plan for both ways to follow it, and how each went."""
-
     scene, control, planner = inputs.scene, config.control, config.planner
     known = _Certified(distance=certified_distance(scene.at(task.stamp_ns)))
     plan = planned_path(inputs.model, known, task, planner, control)
@@ -187,7 +169,7 @@ def _planned(
     return plans, motions
 
 
-def planned_ways_out(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> "PlanDetour | None":
+def planned_ways_out(inputs: ReplayInputs, task: ReplayTask, config: Config) -> PlanDetour | None:
     """What plans the closed loop's ways out of local minima; None where it may take none."""
 
     def scene_at(stamp_ns: int) -> _Certified:
@@ -202,10 +184,10 @@ def planned_ways_out(inputs: "ReplayInputs", task: "ReplayTask", config: "Config
 class _Certified:
     """A scene to plan in: a lower bound of the exact distance to the splats."""
 
-    distance: "DistanceFunction"
+    distance: DistanceFunction
 
 
-def certified_distance(fields: "KnownFields") -> "DistanceFunction":
+def certified_distance(fields: KnownFields) -> DistanceFunction:
     """A lower bound of a 1-Lipschitz distance: of a grid its certified one, of splats the exact one less rounding.
 
     Both bound the exact distance to the splats, so what is proved of an edge is proved of that. Of the kernel fields
@@ -218,18 +200,17 @@ def certified_distance(fields: "KnownFields") -> "DistanceFunction":
     return lambda points: exact(points) - ROUNDING
 
 
-def _yardstick(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> "Yardstick":
-
+def _yardstick(inputs: ReplayInputs, task: ReplayTask, config: Config) -> Yardstick:
     scene, truth = inputs.scene, inputs.truth
     known: list[tuple[KnownFields, DistanceFunction]] = []  # the scene in use
 
-    def certified_at(stamp_ns: int) -> "DistanceFunction":
+    def certified_at(stamp_ns: int) -> DistanceFunction:
         fields = scene.at(stamp_ns)
         if not known or known[0][0] is not fields:
             known[:] = [(fields, certified_distance(fields))]
         return known[0][1]
 
-    def true_distance(points: "Float64", stamp_ns: int) -> "Float64":
+    def true_distance(points: Float64, stamp_ns: int) -> Float64:
         assert truth is not None
         return truth.closest(points, stamp_ns)[0]
 
@@ -245,11 +226,9 @@ def _yardstick(inputs: "ReplayInputs", task: "ReplayTask", config: "Config") -> 
 
 
 def _task(
-    request: ReplayRequest, inputs: "ReplayInputs", start: "Float64", stamp_ns: int, logged_end: "Float64"
-) -> "ReplayTask":
+    request: ReplayRequest, inputs: ReplayInputs, start: Float64, stamp_ns: int, logged_end: Float64
+) -> ReplayTask:
     """What the closed loop was asked for; without a posture the logged one at the end is where goals are sought."""
-    from splatctrl_cli.jobs.replay_goal import goal_waypoints
-
     frame = request.frame or inputs.model.frame_names[-1]
     goal = goal_waypoints(request, inputs.model, frame, logged_end)[-1]
     return ReplayTask(
@@ -262,11 +241,10 @@ def _task(
 
 
 def _stamps(start_ns: int, num: int, period: float) -> Any:
-
     return start_ns + np.round(np.arange(num) * period * 1e9).astype(np.int64)
 
 
-def _motion_values(figures: "MotionFigures | None") -> dict[str, float | None]:
+def _motion_values(figures: MotionFigures | None) -> dict[str, float | None]:
     if figures is None:
         return {"success": 0, "goal_reached": 0, **dict.fromkeys(MOTION[2:])}
     return {
@@ -284,7 +262,7 @@ def _motion_values(figures: "MotionFigures | None") -> dict[str, float | None]:
     }
 
 
-def _plan_values(plan: "PlannedPath") -> dict[str, float | None]:
+def _plan_values(plan: PlannedPath) -> dict[str, float | None]:
     values = (plan.seconds, _finite(plan.margin), _finite(plan.self_margin), plan.num_edges, plan.num_proved)
     return dict(zip(PLAN, values, strict=True))
 

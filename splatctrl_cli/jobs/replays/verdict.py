@@ -2,7 +2,8 @@
 
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Reason, Verdict, verdict_of
-from splatctrl_cli.jobs.evidence_criteria import (
+from splatctrl_cli.jobs.replays.counts import counts_of
+from splatctrl_cli.jobs.replays.evidence_criteria import (
     belonging,
     bound_words,
     calibration,
@@ -12,7 +13,10 @@ from splatctrl_cli.jobs.evidence_criteria import (
     known_space,
     map_error,
 )
-from splatctrl_cli.jobs.motion_criteria import (
+from splatctrl_cli.jobs.replays.golden import Golden, golden_reason
+from splatctrl_cli.jobs.replays.judged import CONTACT, SAFE, Judged, nearby
+from splatctrl_cli.jobs.replays.metrics import first_time
+from splatctrl_cli.jobs.replays.motion_criteria import (
     clearance,
     controller,
     motion_limits,
@@ -20,10 +24,6 @@ from splatctrl_cli.jobs.motion_criteria import (
     static_clearance,
     surface_clearance,
 )
-from splatctrl_cli.jobs.replay_counts import counts_of
-from splatctrl_cli.jobs.replay_golden import Golden, golden_reason
-from splatctrl_cli.jobs.replay_judged import CONTACT, SAFE, Judged, nearby
-from splatctrl_cli.jobs.replay_metrics import first_time
 from splatctrl_cli.robot.declared import carried_words
 
 ASKED = ("--require", "golden")  # criteria that the request itself asked for

@@ -2,7 +2,6 @@
 
 import fnmatch
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,13 +19,11 @@ from splatctrl_cli.control.standstill import (
     separation_of,
 )
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.jobs.replay_compare import BIRRT, BIRRT_IK, check_comparable
-from splatctrl_cli.jobs.replay_request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.compare import BIRRT, BIRRT_IK, check_comparable
+from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.records import Box, Float64
 from splatctrl_cli.simulate.truth import distance_to
-
-if TYPE_CHECKING:
-    from splatctrl_cli.jobs.replay_modes import Replay
 
 PEOPLE = ("human*", "person*")  # names of a truth's primitives
 FIGURES = (
@@ -47,12 +44,11 @@ def read_baselines(request: ReplayRequest) -> tuple[str, ...]:
     return names
 
 
-def read_zone(request: ReplayRequest) -> "StopZone | None":
+def read_zone(request: ReplayRequest) -> StopZone | None:
     """The zone of --zone or --zone-box, None without a standstill.
 
     Raises UsageError as `read_baselines`, or for a zone that is none.
     """
-
     if STANDSTILL not in read_baselines(request):
         return None
     try:
@@ -66,10 +62,9 @@ def read_zone(request: ReplayRequest) -> "StopZone | None":
 
 
 def separations(
-    request: ReplayRequest, zone: "StopZone | None", inputs: "ReplayInputs", replay: "Replay", config: "Config"
-) -> "Mapping[str, Separation]":
+    request: ReplayRequest, zone: StopZone | None, inputs: ReplayInputs, replay: Replay, config: Config
+) -> Mapping[str, Separation]:
     """The closed loop and the standstill beside people, from the same moment; empty without a standstill."""
-
     trace = replay.closed_loop
     if zone is None or trace is None:
         return {}
@@ -97,9 +92,8 @@ def separations(
     return dict(zip(BESIDE, (driven, held), strict=True))
 
 
-def separation_figures(separation: "Separation", period: float) -> dict[str, float | None]:
+def separation_figures(separation: Separation, period: float) -> dict[str, float | None]:
     """`FIGURES` of one motion; distances over the states at which a person is there, None where nobody ever is."""
-
     there = separation.distance[np.isfinite(separation.distance)]
     stops = [(end - first) * period for first, end in runs_of(separation.is_stopped)]
     values = (
@@ -114,9 +108,8 @@ def separation_figures(separation: "Separation", period: float) -> dict[str, flo
     return dict(zip(FIGURES, values, strict=True))
 
 
-def _people(request: ReplayRequest, inputs: "ReplayInputs", memory: float) -> "DistanceToPeople":
+def _people(request: ReplayRequest, inputs: ReplayInputs, memory: float) -> DistanceToPeople:
     """The people of the truth where it is given, else those that the scene labels human, for `memory` [s]."""
-
     scene = inputs.scene
     if inputs.truth is not None:
         names = [primitive.name for primitive in inputs.truth.primitives]
@@ -139,7 +132,7 @@ def _people(request: ReplayRequest, inputs: "ReplayInputs", memory: float) -> "D
             remedy="reconstruct from a log with masks of people, or give --truth and --human",
         )
 
-    def distance(points: "Float64", stamp_ns: int) -> "Float64":
+    def distance(points: Float64, stamp_ns: int) -> Float64:
         human = scene.at(stamp_ns).human
         return np.full(len(points), np.inf) if human is None else human.query(points)[0]
 

@@ -7,7 +7,7 @@ import numpy as np
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs.replay_judged import SLOW, Judged, counted, events_of, held, least_of, mm, nearby, seconds_at
+from splatctrl_cli.jobs.replays.judged import SLOW, Judged, counted, events_of, held, least_of, mm, nearby, seconds_at
 
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
 AHEAD = 0.02  # [s] that the frames of one time step may lie apart

@@ -55,12 +55,12 @@ class KnownFields:
     splats_alone: the exact distance without voxels that no splat represents, None where there are no such voxels.
     """
 
-    barrier: "DistanceField"
-    distances: "Mapping[str, DistanceFunction]"
+    barrier: DistanceField
+    distances: Mapping[str, DistanceFunction]
     median_radius: float
-    obstacles: "Callable[[Float64], tuple[Obstacle, ...]]"
-    human: "DistanceField | None" = None
-    splats_alone: "DistanceFunction | None" = None
+    obstacles: Callable[[Float64], tuple[Obstacle, ...]]
+    human: DistanceField | None = None
+    splats_alone: DistanceFunction | None = None
 
 
 def _nothing(_: int) -> None:
@@ -88,7 +88,7 @@ class KnownScene:
     """
 
     at: Callable[[int], KnownFields]
-    observed: "Observed | None"
+    observed: Observed | None
     first_ns: int | None
     cameras: tuple[str, ...] | None
     digests: dict[str, str]
@@ -96,7 +96,7 @@ class KnownScene:
     latency_ns: int = 0
     advance: Callable[[int], None] = _nothing
     finish: Callable[[], None] = lambda: None
-    box: "Box | None" = None
+    box: Box | None = None
     moment_ns: int | None = None
     seen_at: Callable[[int], Seen | None] = _nothing_known
     has_seen_times: bool = True
@@ -112,9 +112,8 @@ class KnownScene:
         index = self._index_at(stamp_ns)
         return math.nan if index < 0 else (stamp_ns - self.stamps_ns[index]) * 1e-9
 
-    def step_at(self, stamp_ns: int) -> "SceneStep | None":
+    def step_at(self, stamp_ns: int) -> SceneStep | None:
         """The two newest scenes at a stamp, None where there is only one."""
-
         index = self._index_at(stamp_ns)
         if index < 1:
             return None
@@ -155,7 +154,6 @@ def fields_at(
 
 def from_grid(path: Path) -> KnownScene:
     """The scene of a baked grid: one field for all times. `path` is a field folder or a ``field.npz``."""
-
     file = path / "field.npz" if path.is_dir() else path
     grid = read_npz(Parts.beside(file).checked(file))
     barrier = GridField(grid)
@@ -190,12 +188,11 @@ def from_grid(path: Path) -> KnownScene:
     )
 
 
-def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int = 0) -> KnownScene:
+def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0) -> KnownScene:
     """The scene of a reconstruction: at each stamp the fields of its newest snapshot that is as old as the latency.
 
     Known space is what a camera saw, and what the robot itself was in at some time of the log.
     """
-
     scene = open_scene(path)
     stamps = sorted({snapshot.stamp_ns for snapshot in scene.snapshots} | {scene.stamp_ns})
     has_times = scene.has_clock and bool(scene.snapshots)
@@ -236,20 +233,16 @@ def from_splats(path: Path, config: "Config", threads: int, *, latency_ns: int =
     )
 
 
-def known_space(occupancy: "OccupancyGrid") -> "Observed":
+def known_space(occupancy: OccupancyGrid) -> Observed:
     """What a camera saw or the robot was in, of an occupancy grid."""
-
     known = (occupancy.num_updates > 0) | ((occupancy.entity & SWEPT) > 0)
     return observed_lookup(known.astype("uint8"), occupancy.origin, occupancy.voxel)
 
 
-def splat_fields(
-    splats: "SplatSet", config: "Config", threads: int, unrepresented: Balls | None = None
-) -> KnownFields:
+def splat_fields(splats: SplatSet, config: Config, threads: int, unrepresented: Balls | None = None) -> KnownFields:
     """Exact and barrier field of the splats and of the occupied voxels without one, the robot's own left out; in the
     latter people count as much nearer as `control.human_margin` asks.
     """
-
     obstacles = obstacle_spheres(splats, unrepresented)
     chosen = obstacles.splats
     spheres = Spheres.of(chosen.centers, chosen.radii)
@@ -297,9 +290,8 @@ def _nearest_spheres(obstacles: ObstacleSpheres, index: Index, points: Float64) 
     )
 
 
-def _nearest_cells(grid: "DistanceGrid", field: "GridField", points: "Float64") -> "tuple[Obstacle, ...]":
+def _nearest_cells(grid: DistanceGrid, field: GridField, points: Float64) -> tuple[Obstacle, ...]:
     """The cells that hold the nearest surface to points (Q, 3), as the gradient points to it."""
-
     distance, gradient = field.query(points)
     length = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
     surface = points - gradient * (distance / length)[:, None]
@@ -312,12 +304,12 @@ def _nearest_cells(grid: "DistanceGrid", field: "GridField", points: "Float64") 
     )
 
 
-def _place(point: "Float64") -> tuple[float, float, float]:
+def _place(point: Float64) -> tuple[float, float, float]:
     return float(point[0]), float(point[1]), float(point[2])
 
 
-def _distance(field: "DistanceField") -> "DistanceFunction":
-    def distance(points: "Float64") -> "Float64":
+def _distance(field: DistanceField) -> DistanceFunction:
+    def distance(points: Float64) -> Float64:
         return field.query(points)[0]
 
     return distance

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from splatctrl_cli.errors import GateFailed, InputError, UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs.replay_modes import Replay
-from splatctrl_cli.jobs.replay_request import ReplayRequest
+from splatctrl_cli.jobs.replays.request import ReplayRequest
+from splatctrl_cli.jobs.replays.result import Replay
 
 TOLERANCE = 1e-6  # [rad/s]: steps.csv keeps nine digits; another machine or solver needs more
 

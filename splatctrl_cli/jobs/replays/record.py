@@ -15,8 +15,8 @@ from splatctrl_cli.control.motion_limits import MotionLimits
 from splatctrl_cli.control.near_space import NearSpace
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.jobs.known_scene import KnownFields, KnownScene
-from splatctrl_cli.jobs.replay_store import BLOCK, Figures, StoredAudit, StoredObjects
+from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene
+from splatctrl_cli.jobs.replays.store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel

@@ -1,103 +1,34 @@
 """The replays themselves: audit, open loop and closed loop over what was read, and the truth beside them."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.checks import StaticViolation, check_within_limits, static_violations
-from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
 from splatctrl_cli.control.rows import scene_margin
-from splatctrl_cli.control.signals import clearance_signals
-from splatctrl_cli.control.standstill import Separation
-from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.evaluate.clearance import ClearanceAgreement, clearance_agreement, mark_seen
-from splatctrl_cli.files.rows import RowFile, Rows, ranges
-from splatctrl_cli.jobs.known_scene import KnownScene
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.replay_baseline import read_baselines, read_zone, separations
-from splatctrl_cli.jobs.replay_compare import Comparison, compared, planned_ways_out
-from splatctrl_cli.jobs.replay_evidence import MapError
-from splatctrl_cli.jobs.replay_goal import goal_waypoints
-from splatctrl_cli.jobs.replay_record import ReplayRecord
-from splatctrl_cli.jobs.replay_request import FIRST_MAP, ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replay_states import check_inside
-from splatctrl_cli.jobs.replay_store import Figures, StoredAudit, StoredLoop, StoredOpenLoop, StoredSteps
-from splatctrl_cli.jobs.replay_twists import twist_figures, twist_track
+from splatctrl_cli.jobs.replays.compare import compared, planned_ways_out
+from splatctrl_cli.jobs.replays.goal import goal_waypoints, twist_figures, twist_track
+from splatctrl_cli.jobs.replays.inputs import check_inside
+from splatctrl_cli.jobs.replays.known_scene import KnownScene
+from splatctrl_cli.jobs.replays.people import read_baselines, read_zone, separations
+from splatctrl_cli.jobs.replays.record import ReplayRecord
+from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.result import Replay
+from splatctrl_cli.jobs.replays.store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.records import Float64, FloatRows, RgbdFrame
+from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.simulate.truth import distance_to
 
 
-@dataclass(frozen=True, kw_only=True)
-class Divergence:
-    """How far a closed loop is from the log at each of T states: joints (T,) [rad], position [m], rotation [rad]."""
-
-    joints: FloatRows
-    position: FloatRows
-    rotation: FloatRows
-
-
-@dataclass(frozen=True, kw_only=True)
-class Replay:
-    """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
-
-    num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
-    the first state in the log [s]; between, near, strain and statics: as `ReplayRecord` has them; obstacles (T,):
-    what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps: of a controller;
-    map_error: where the request names evidence of it; separations: with a standstill the distances from people, by
-    name of the motion, sampled at `period` [s]; comparison: every motion of --baseline and its figures.
-    """
-
-    model: "RobotModel"
-    margin: float
-    audit: StoredAudit
-    num_before_scene: int
-    lead_in_s: float
-    median_radius: float
-    static_violations: tuple[StaticViolation, ...]
-    obstacles: Sequence[str]
-    map_age_s: FloatRows
-    start_time_s: float
-    between: Figures
-    near: Figures
-    strain: Figures
-    statics: "Mapping[str, tuple[float, float]]"
-    open_loop: StoredOpenLoop | None = None
-    closed_loop: ReplayTrace | None = None
-    divergence: Divergence | None = None
-    kept_steps: StoredSteps | None = None
-    true_clearance: FloatRows | None = None
-    agreement: "Mapping[str, ClearanceAgreement]" = field(default_factory=dict)
-    events: tuple[Event, ...] = ()
-    separations: "Mapping[str, Separation]" = field(default_factory=dict)
-    comparison: Comparison = field(default_factory=Comparison)
-    twist_figures: "Mapping[str, float | None]" = field(default_factory=dict)
-    map_error: MapError | None = None
-    period: float = 0.0
-
-    @property
-    def mode(self) -> str:
-        """As --mode has it."""
-        return "closed-loop" if self.closed_loop else "open-loop" if self.open_loop else "audit"
-
-    @property
-    def steps(self) -> Sequence[ControlStep | None]:
-        """What the controller decided at each state; empty in an audit."""
-        trace = self.closed_loop or self.open_loop
-        return () if trace is None else trace.steps
-
-
-def replayed(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
+def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     """The replay that --mode asks for, with its events."""
     if inputs.scene.box is not None:
         check_inside(inputs.model, inputs.states.position[0], inputs.scene.box)
@@ -112,75 +43,7 @@ def replayed(request: ReplayRequest, inputs: ReplayInputs, config: "Config", con
     return replace(replay, comparison=compared(request, read_baselines(request), inputs, replay, config, console))
 
 
-def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
-    """The true clearance of every state, and how an audit agrees with it near surfaces that a camera saw."""
-    if inputs.truth is None:
-        return replay
-    model, trace = inputs.model, replay.audit
-    moving = np.flatnonzero(model.moving_spheres)
-    radii = model.sphere_set.radii[moving]
-    clearances, surfaces, nearest_spheres = RowFile(), RowFile((3,)), RowFile()
-    for first, last in ranges(len(trace.stamp_ns)):
-        clearance, surface = np.zeros(last - first), np.zeros((last - first, 3))
-        spheres = np.zeros(last - first)
-        stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
-        for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
-            distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
-            gap = _unexpected(inputs, moving, distance - radii, points, stamp, replay.margin)
-            nearest = int(np.argmin(gap))
-            clearance[index], surface[index] = gap[nearest], points[nearest]
-            spheres[index] = moving[nearest]
-        clearances.append(clearance)
-        nearest_spheres.append(spheres)
-        surfaces.append(surface)
-    truth, seen = Rows(clearances), np.zeros(len(clearances), dtype=np.bool_)
-    events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
-    for record in inputs.source.records() if inputs.source.cameras else ():
-        if isinstance(record, RgbdFrame) and (inputs.scene.cameras is None or record.camera in inputs.scene.cameras):
-            mark_seen(seen, Rows(surfaces), trace.stamp_ns, record, has_clock=inputs.source.has_clock)
-    agreement = {
-        name: clearance_agreement(of.distance, np.asarray(truth), seen, replay.median_radius)
-        for name, of in trace.clearance.items()
-    }
-    merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
-    return replace(replay, true_clearance=truth, agreement=agreement, events=merged)
-
-
-def _unexpected(
-    inputs: ReplayInputs, moving: NDArray[np.intp], gap: Float64, points: Float64, stamp_ns: int, margin: float
-) -> Float64:
-    """True clearances (M,) of the moving spheres to points (M, 3), infinite where the contact is declared."""
-    if not inputs.declared.expected_contact:
-        return gap
-    links, seconds = inputs.model.sphere_set.links, (stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
-    is_meant = [
-        bool(gap[k] < margin and inputs.declared.expects(links[sphere], points[k], seconds))
-        for k, sphere in enumerate(moving)
-    ]
-    return np.where(is_meant, np.inf, gap)
-
-
-def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spheres: Rows) -> tuple[Event, ...]:
-    """Intervals (of T states) below the margin, and in contact, by the truth."""
-    model, truth, audit = inputs.model, inputs.truth, replay.audit
-    assert truth is not None
-    names = sphere_names(model.sphere_set)
-    nearest = np.asarray(spheres[: len(clearance)], np.int64)
-    fold = EventFold()
-
-    def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
-        stamp, center = int(audit.stamp_ns[at]), model.sphere_centers(audit.position[at])[[names.index(name)]]
-        distance, surface = truth.closest(center, stamp)
-        there = [p for p in truth.primitives if p.is_present(stamp)]
-        least = min(there, key=lambda p: float(distance_to([p], center, stamp)[0]))
-        x, y, z = (float(v) for v in surface[0])
-        return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
-
-    fold.add(audit.stamp_ns, clearance_signals("true", clearance, nearest, replay.margin, names), near)
-    return fold.events()
-
-
-def _audited(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
+def _audited(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     """The audit of every logged state for which a scene was known."""
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
     for stamps, positions, velocities in _blocks(record, inputs.states, first):
@@ -188,7 +51,7 @@ def _audited(request: ReplayRequest, inputs: ReplayInputs, config: "Config", con
     return _logged(request, inputs, config, record, first)
 
 
-def _asked(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
+def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     """The audit, and the controller's command at every state of it."""
     scene, model, states = inputs.scene, inputs.model, inputs.states
     first, record = _first_judged(request, inputs), _record(request, inputs, config)
@@ -231,7 +94,7 @@ def _with_next_scene(trace: ReplayTrace, scene: KnownScene, model: RobotModel) -
     return replace(trace, scene_changes=(*trace.scene_changes, change))
 
 
-def _driven(request: ReplayRequest, inputs: ReplayInputs, config: "Config", console: Progress) -> Replay:
+def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, console: Progress) -> Replay:
     """The closed loop, the audit of the states it went through, and how far they are from the log."""
     scene, model, record = inputs.scene, inputs.model, _record(request, inputs, config)
     motion = inputs.motion()
@@ -263,16 +126,14 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: "Config", cons
         _replay(request, inputs, config, record, trace.static_violations, radius_of=0),
         closed_loop=trace,
         kept_steps=loop.kept,
-        divergence=Divergence(
-            joints=apart.rows("joints"), position=apart.rows("position"), rotation=apart.rows("rotation")
-        ),
+        divergence=apart,
         twist_figures=twist_figures(
             model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
         ),
     )
 
 
-def _record(request: ReplayRequest, inputs: ReplayInputs, config: "Config") -> ReplayRecord:
+def _record(request: ReplayRequest, inputs: ReplayInputs, config: Config) -> ReplayRecord:
     return ReplayRecord(
         inputs.model,
         inputs.scene,
@@ -291,9 +152,7 @@ def _blocks(record: ReplayRecord, states: StateColumns, start: int) -> Iterator[
         yield states.stamp_ns[part], states.position[part], states.velocity[part]
 
 
-def _logged(
-    request: ReplayRequest, inputs: ReplayInputs, config: "Config", record: ReplayRecord, first: int
-) -> Replay:
+def _logged(request: ReplayRequest, inputs: ReplayInputs, config: Config, record: ReplayRecord, first: int) -> Replay:
     """The replay of logged states from `first` on, whose static violations are those at the end."""
     states, model = inputs.states, inputs.model
     last = inputs.scene.at(int(states.stamp_ns[-1]))
@@ -304,7 +163,7 @@ def _logged(
 def _replay(
     request: ReplayRequest,
     inputs: ReplayInputs,
-    config: "Config",
+    config: Config,
     record: ReplayRecord,
     statics: tuple[StaticViolation, ...],
     *,

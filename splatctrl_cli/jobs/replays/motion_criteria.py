@@ -7,7 +7,7 @@ import numpy as np
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs.replay_judged import (
+from splatctrl_cli.jobs.replays.judged import (
     CONTACT,
     CONTROL,
     LIMITS,

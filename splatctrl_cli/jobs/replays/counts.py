@@ -1,17 +1,13 @@
 """How many states, intervals, spheres or points each figure of a replay rests on."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.motion_limits import WINDOW
-from splatctrl_cli.jobs.replay_metrics import Metrics
-from splatctrl_cli.jobs.replay_states import LoggedStates
+from splatctrl_cli.jobs.replays.inputs import LoggedStates
+from splatctrl_cli.jobs.replays.metrics import Metrics
+from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.records import Float64
-
-if TYPE_CHECKING:
-    from splatctrl_cli.jobs.replay_modes import Replay
 
 Counts = dict[str, int]
 
@@ -37,7 +33,7 @@ _OF_OPEN_LOOP = {
 """Metrics by the column that they fold."""
 
 
-def counts_of(replay: "Replay", logged: LoggedStates, metrics: Metrics, config: ControlConfig) -> Counts:
+def counts_of(replay: Replay, logged: LoggedStates, metrics: Metrics, config: ControlConfig) -> Counts:
     """Of every metric; where nothing else is known of it, the states that were judged."""
     found = dict.fromkeys(metrics, len(replay.audit.stamp_ns)) | _of_robot(replay) | _of_states(replay, config)
     if replay.kept_steps is not None:
@@ -62,7 +58,7 @@ def counts_of(replay: "Replay", logged: LoggedStates, metrics: Metrics, config: 
     return {name: found[name] for name in metrics}
 
 
-def _of_robot(replay: "Replay") -> Counts:
+def _of_robot(replay: Replay) -> Counts:
     model = replay.model
     covered = 0 if model.coverage is None else len(model.coverage.links)
     return {
@@ -73,7 +69,7 @@ def _of_robot(replay: "Replay") -> Counts:
     }
 
 
-def _of_states(replay: "Replay", config: ControlConfig) -> Counts:
+def _of_states(replay: Replay, config: ControlConfig) -> Counts:
     audit, truth, error = replay.audit, replay.true_clearance, replay.map_error
     stamps = audit.stamp_ns
     seen = _known(audit.clearance["exact"].distance)

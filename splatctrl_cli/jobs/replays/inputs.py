@@ -1,0 +1,215 @@
+"""What a replay reads: the robot's model and what its spheres leave uncovered, and the states of a log."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.checks.state_check import PoseAgreement, check_angles, check_states, pose_agreement
+from splatctrl_cli.checks.state_motion import ImageMotion
+from splatctrl_cli.checks.state_offset import ClockOffset, RobotPoints, estimate_clock_offset, states_asked
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.replays.request import ReplayRequest
+from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
+from splatctrl_cli.records import Box, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.robot.coverage import LinkCoverage, coverage_deficit
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import never_apart, without_disabled
+from splatctrl_cli.robot.srdf import read_srdf
+from splatctrl_cli.states.state_source import StateSource, open_states
+
+MAX_NOTES = 10  # printed
+LOG_FIGURES = (
+    *("num_poses", "max_pose_position", "max_pose_rotation", "max_pose_rest_position", "max_pose_rest_rotation"),
+    *("clock_offset_s", "clock_uncertainty_s"),
+)
+FR3_LIMITS = (
+    "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to keep "
+    "the published ones"
+)
+COARSE = 0.02  # [m] of areas, which a replay does not report; the deficit is as exact as ever
+
+
+def read_robot(request: ReplayRequest, config: ControlConfig) -> RobotModel:
+    """The model of the arguments, its spheres measured against the URDF's collision geometry where that can be read.
+
+    Raises InputError where `config.coverage` is "margin" and no distance bounds what is uncovered.
+    """
+    T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
+    model = RobotModel.from_urdf(
+        request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked, packages=request.packages
+    )
+    if request.srdf is not None:
+        disabled, _ = read_srdf(request.srdf, model.urdf)
+        model = model.with_self_pairs(without_disabled(model, disabled))
+    model = _measured(model, list(request.packages))
+    if config.coverage == "margin":
+        _check_bounded(model)
+    return model
+
+
+def doubts_of(request: ReplayRequest, model: RobotModel, config: ControlConfig) -> list[str]:
+    """What a person should know of the robot before trusting this replay; a sentence each."""
+    if request.mode == "audit":
+        return list(model.doubts)
+    found = never_apart(model, config.self_margin)
+    is_fr3 = all(name.startswith("fr3_joint") for name in model.joint_names)
+    return [
+        *model.doubts,
+        *([FR3_LIMITS] if is_fr3 and config.velocity_limits == "urdf" else []),
+        *(
+            f"{' and '.join(pair.links)}: their spheres are no farther than {1e3 * pair.largest_gap:.1f} mm apart in "
+            f"any posture sampled: control.self_margin = {1e3 * config.self_margin:g} mm cannot be kept; lower it, "
+            "or leave the pair out (--srdf)"
+            for pair in found
+        ),
+    ]
+
+
+def coverage_words(model: RobotModel, config: ControlConfig) -> str:
+    """What the spheres leave uncovered, or why that is not known, and the margin that then holds for the surface."""
+    report = model.coverage
+    if report is None:
+        return f"how much of the surface the spheres cover is not known: {model.coverage_unknown}"
+    if not report.bare_links and report.max_deficit == 0:
+        return "the spheres cover all of the collision surface (proven): the margin is that of the surface"
+    far = max((link for link in report.links if link.deficit is not None), key=_proven, default=None)
+    words = "no link has spheres" if far is None else f"the spheres leave up to {1e3 * _proven(far):.2f} mm uncovered"
+    words += "" if far is None else f" ({far.link})"
+    if config.coverage == "margin":
+        words += (
+            f"; their rows keep that much more, link by link, so that the surface keeps {1e3 * config.margin:g} mm"
+        )
+    else:
+        left = 1e3 * (config.margin - (0.0 if far is None else _proven(far)))
+        words += f"; where they keep {1e3 * config.margin:g} mm the surface keeps " + (
+            f"{left:.2f} mm" if left > 0 else "nothing for certain"
+        )
+    bare = f", and nothing of {', '.join(report.bare_links)}, which have no sphere" if report.bare_links else ""
+    return words + bare
+
+
+def _measured(model: RobotModel, packages: list[Path]) -> RobotModel:
+    try:
+        return model.with_coverage(
+            coverage_deficit(model.urdf, model.sphere_set, folders=packages, resolution=COARSE)
+        )
+    except InputError as error:
+        return model.with_coverage(None, str(error))
+
+
+def _check_bounded(model: RobotModel) -> None:
+    """Raise InputError where a link that moves has no sphere, or nothing was measured."""
+    wanted = "control.coverage = margin"
+    if model.coverage is None:
+        raise InputError(
+            f"{wanted}: {model.coverage_unknown}", remedy="or set control.coverage = report, which needs no meshes"
+        )
+    bodies = model.urdf.rigid_bodies()
+    children = {child for _, child in model.urdf.parents}
+    bare = [link for link in model.coverage.bare_links if bodies[link][0] in children]
+    if bare:
+        raise InputError(
+            f"{wanted}: expected spheres on every link that moves, got none on {', '.join(bare)}",
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {model.urdf.path.name}",
+        )
+
+
+def _proven(link: LinkCoverage) -> float:
+    return 0.0 if link.deficit is None else max(0.0, link.deficit.proven)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoggedStates:
+    """States in the model's joint order, where they are from, and what was found about them.
+
+    poses: beside forward kinematics, None where the log has no end-effector poses; clock: of cameras against the
+    robot, None where the log has no frames.
+    """
+
+    source: RecordSource
+    states: StateColumns
+    poses: PoseAgreement | None
+    clock: ClockOffset | None
+
+    def as_dict(self) -> Mapping[str, Any]:
+        """For states.json."""
+        return {
+            "num_states": len(self.states),
+            "loss": asdict(self.source.loss),
+            "end_effector_poses": None
+            if self.poses is None
+            else asdict(self.poses) | {"offset": self.poses.offset.tolist()},
+            "clock_offset": None if self.clock is None else asdict(self.clock),
+        }
+
+    def metrics(self) -> dict[str, float | None]:
+        """`LOG_FIGURES`: None where the log has no poses, or the offset cannot be told."""
+        poses, clock = self.poses, self.clock
+        values = (
+            0 if poses is None else poses.num_poses,
+            None if poses is None else poses.difference.max_position,
+            None if poses is None else poses.difference.max_rotation,
+            None if poses is None else poses.rest.max_position,
+            None if poses is None else poses.rest.max_rotation,
+            None if clock is None else clock.offset_s,
+            None if clock is None else clock.uncertainty_s,
+        )
+        return dict(zip(LOG_FIGURES, values, strict=True))
+
+    def lines(self) -> list[str]:
+        """A line for each thing that a person should know."""
+        notes = self.source.loss.notes
+        more = [f"and {len(notes) - MAX_NOTES} more notes in states.json"] if len(notes) > MAX_NOTES else []
+        found = [check.sentence for check in (self.poses, self.clock) if check is not None]
+        return [f"log: {line}" for line in (*notes[:MAX_NOTES], *more, *found)]
+
+
+def read_states(request: ReplayRequest, model: RobotModel) -> LoggedStates:
+    """The states of the robot's joints in a log. Raises InputError where there are none, or none that can be its."""
+    source = open_states(request.log, request.options, model.joint_names)
+    if not source.joint_names:
+        raise InputError(
+            f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
+        )
+    order = model.joint_order(source.joint_names)
+    collector, motion = StateCollector(len(source.joint_names)), ImageMotion()
+    for record in () if isinstance(source, StateSource) else source.records():
+        if isinstance(record, JointState):
+            collector.add(record)
+        elif isinstance(record, RgbdFrame):
+            motion.add(record)
+    logged = source.states if isinstance(source, StateSource) else collector.columns()
+    states = logged.of_joints(order)
+    check_states(states, model.joint_names)
+    check_angles(model, states, source.name)
+    clock = _clock(model, states, motion) if motion.cameras and source.has_clock and len(states) else None
+    return LoggedStates(source=source, states=states, poses=pose_agreement(model, states), clock=clock)
+
+
+def check_inside(model: RobotModel, q: Float64, box: Box) -> None:
+    """Raise NotEvaluableError for a posture (J,) of which no moving sphere is in the box of a baked field."""
+    centers = model.sphere_centers(q)[np.flatnonzero(model.moving_spheres)]
+    beyond = np.maximum(box.lower - centers, centers - box.upper).max(axis=1)
+    if not len(centers) or beyond.min() <= 0:
+        return
+    lower, upper = ("(" + ", ".join(f"{v:.2f}" for v in corner) + ")" for corner in (box.lower, box.upper))
+    raise NotEvaluableError(
+        f"--field: expected the robot in the grid from {lower} to {upper} m, got all {len(centers)} moving spheres "
+        f"outside it, the nearest by {beyond.min():.2f} m",
+        remedy="check --base and the frame of the field, or bake a --box around the robot",
+    )
+
+
+def _clock(model: RobotModel, states: StateColumns, motion: ImageMotion) -> ClockOffset:
+    """Of the states that it looks at."""
+    asked = states.select(states_asked(states.stamp_ns, motion))
+    centers = model.sphere_centers_batch(asked.position[: len(asked)])
+    moving = model.moving_spheres
+    return estimate_clock_offset(
+        asked, motion, RobotPoints(centers=centers[:, moving], radii=model.sphere_set.radii[moving])
+    )

@@ -1,0 +1,82 @@
+"""What a replay found: the audit of its states, the trace of its mode, and what stands beside them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from splatctrl_cli.control.checks import StaticViolation
+from splatctrl_cli.control.events import Event
+from splatctrl_cli.control.replay import ReplayTrace
+from splatctrl_cli.control.standstill import Separation
+from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.evaluate.clearance import ClearanceAgreement
+from splatctrl_cli.jobs.replays.evidence import MapError
+from splatctrl_cli.jobs.replays.store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
+from splatctrl_cli.planner.comparison import Motion, MotionFigures
+from splatctrl_cli.planner.planned import PlannedPath
+from splatctrl_cli.records import FloatRows
+from splatctrl_cli.robot.model import RobotModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Motions and their figures by method, and plans of the methods that plan; without a path there is no motion."""
+
+    motions: Mapping[str, Motion] = field(default_factory=dict)
+    figures: Mapping[str, MotionFigures] = field(default_factory=dict)
+    plans: Mapping[str, PlannedPath] = field(default_factory=dict)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Every method, in the order in which they stand side by side."""
+        return tuple(dict.fromkeys((*self.motions, *self.plans)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
+
+    num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
+    the first state in the log [s]; between, near, strain and statics: as `ReplayRecord` has them; obstacles (T,):
+    what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps: of a controller;
+    divergence: of a closed loop from the log, by columns joints [rad], position [m], rotation [rad]; map_error: where
+    the request names evidence of it; separations: with a standstill the distances from people, by name of the motion,
+    sampled at `period` [s]; comparison: every motion of --baseline and its figures.
+    """
+
+    model: RobotModel
+    margin: float
+    audit: StoredAudit
+    num_before_scene: int
+    lead_in_s: float
+    median_radius: float
+    static_violations: tuple[StaticViolation, ...]
+    obstacles: Sequence[str]
+    map_age_s: FloatRows
+    start_time_s: float
+    between: Figures
+    near: Figures
+    strain: Figures
+    statics: Mapping[str, tuple[float, float]]
+    open_loop: StoredOpenLoop | None = None
+    closed_loop: ReplayTrace | None = None
+    divergence: Figures | None = None
+    kept_steps: StoredSteps | None = None
+    true_clearance: FloatRows | None = None
+    agreement: Mapping[str, ClearanceAgreement] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
+    separations: Mapping[str, Separation] = field(default_factory=dict)
+    comparison: Comparison = field(default_factory=Comparison)
+    twist_figures: Mapping[str, float | None] = field(default_factory=dict)
+    map_error: MapError | None = None
+    period: float = 0.0
+
+    @property
+    def mode(self) -> str:
+        """As --mode has it."""
+        return "closed-loop" if self.closed_loop else "open-loop" if self.open_loop else "audit"
+
+    @property
+    def steps(self) -> Sequence[ControlStep | None]:
+        """What the controller decided at each state; empty in an audit."""
+        trace = self.closed_loop or self.open_loop
+        return () if trace is None else trace.steps

@@ -1,0 +1,84 @@
+"""The true clearance of a replay's states, where the log was simulated."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.arm import sphere_names
+from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle
+from splatctrl_cli.control.signals import clearance_signals
+from splatctrl_cli.evaluate.clearance import clearance_agreement, mark_seen
+from splatctrl_cli.files.rows import RowFile, Rows, ranges
+from splatctrl_cli.jobs.replays.request import ReplayInputs
+from splatctrl_cli.jobs.replays.result import Replay
+from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.simulate.truth import distance_to
+
+
+def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
+    """The true clearance of every state, and how an audit agrees with it near surfaces that a camera saw."""
+    if inputs.truth is None:
+        return replay
+    model, trace = inputs.model, replay.audit
+    moving = np.flatnonzero(model.moving_spheres)
+    radii = model.sphere_set.radii[moving]
+    clearances, surfaces, nearest_spheres = RowFile(), RowFile((3,)), RowFile()
+    for first, last in ranges(len(trace.stamp_ns)):
+        clearance, surface = np.zeros(last - first), np.zeros((last - first, 3))
+        spheres = np.zeros(last - first)
+        stamps, positions = trace.stamp_ns[first:last].tolist(), trace.position[first:last]
+        for index, (stamp, q) in enumerate(zip(stamps, positions, strict=True)):
+            distance, points = inputs.truth.closest(model.sphere_centers(q)[moving], stamp)
+            gap = _unexpected(inputs, moving, distance - radii, points, stamp, replay.margin)
+            nearest = int(np.argmin(gap))
+            clearance[index], surface[index] = gap[nearest], points[nearest]
+            spheres[index] = moving[nearest]
+        clearances.append(clearance)
+        nearest_spheres.append(spheres)
+        surfaces.append(surface)
+    truth, seen = Rows(clearances), np.zeros(len(clearances), dtype=np.bool_)
+    events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
+    for record in inputs.source.records() if inputs.source.cameras else ():
+        if isinstance(record, RgbdFrame) and (inputs.scene.cameras is None or record.camera in inputs.scene.cameras):
+            mark_seen(seen, Rows(surfaces), trace.stamp_ns, record, has_clock=inputs.source.has_clock)
+    agreement = {
+        name: clearance_agreement(of.distance, np.asarray(truth), seen, replay.median_radius)
+        for name, of in trace.clearance.items()
+    }
+    merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
+    return replace(replay, true_clearance=truth, agreement=agreement, events=merged)
+
+
+def _unexpected(
+    inputs: ReplayInputs, moving: NDArray[np.intp], gap: Float64, points: Float64, stamp_ns: int, margin: float
+) -> Float64:
+    """True clearances (M,) of the moving spheres to points (M, 3), infinite where the contact is declared."""
+    if not inputs.declared.expected_contact:
+        return gap
+    links, seconds = inputs.model.sphere_set.links, (stamp_ns - int(inputs.states.stamp_ns[0])) * 1e-9
+    is_meant = [
+        bool(gap[k] < margin and inputs.declared.expects(links[sphere], points[k], seconds))
+        for k, sphere in enumerate(moving)
+    ]
+    return np.where(is_meant, np.inf, gap)
+
+
+def _true_events(inputs: ReplayInputs, replay: Replay, clearance: Float64, spheres: Rows) -> tuple[Event, ...]:
+    """Intervals (of T states) below the margin, and in contact, by the truth."""
+    model, truth, audit = inputs.model, inputs.truth, replay.audit
+    assert truth is not None
+    names = sphere_names(model.sphere_set)
+    nearest = np.asarray(spheres[: len(clearance)], np.int64)
+    fold = EventFold()
+
+    def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
+        stamp, center = int(audit.stamp_ns[at]), model.sphere_centers(audit.position[at])[[names.index(name)]]
+        distance, surface = truth.closest(center, stamp)
+        there = [p for p in truth.primitives if p.is_present(stamp)]
+        least = min(there, key=lambda p: float(distance_to([p], center, stamp)[0]))
+        x, y, z = (float(v) for v in surface[0])
+        return Obstacle(distance=float(distance[0]), position=(x, y, z), name=least.name)
+
+    fold.add(audit.stamp_ns, clearance_signals("true", clearance, nearest, replay.margin, names), near)
+    return fold.events()
