@@ -20,8 +20,11 @@ from splatctrl_cli.config.declared import OneOf, Section
 from splatctrl_cli.config.load import type_name
 from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.datasets.layouts import LAYOUTS
+from splatctrl_cli.evaluate.verdict import Criterion
 from splatctrl_cli.grid_files.grid_format import GridFormat
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
+from splatctrl_cli.jobs.replays.judged import Judged
+from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.splat_files.splat_format import SplatFormat
 from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
 
@@ -31,10 +34,11 @@ SHARED_BY = 3  # commands with the same option, in the same words, from which on
 INPUT = "input"  # the group of options that say how a recording is read
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:\|.*\n)*)")
-REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout]]] = {
+REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout | Criterion[Judged]]]] = {
     "splat_files": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
     "grid_files": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
     "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
+    "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
 }
 
 
@@ -46,7 +50,7 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """The text of each generated page, by file name."""
-    tabled = {name: (DOCS / name).read_text(encoding="utf-8") for name in ("artefacts.md", "input.md")}
+    tabled = {name: (DOCS / name).read_text(encoding="utf-8") for name in ("artefacts.md", "input.md", "verdict.md")}
     filled = {name: TABLE.sub(_filled, text) for name, text in tabled.items()}
     return {"cli.md": cli_page(), "config.md": config_page(), **filled}
 

@@ -1,10 +1,14 @@
 """What a judging command concludes: one outcome, and each criterion that it rests on."""
 
+import inspect
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
-from typing import Any
+from functools import partial
+from typing import Any, Generic, TypeVar
+
+E = TypeVar("E")  # what a criterion looks at
 
 
 class Outcome(StrEnum):
@@ -22,7 +26,7 @@ _WORST_FIRST = (Outcome.FAILED, Outcome.NOT_EVALUABLE, Outcome.PASSED)  # a defi
 
 @dataclass(frozen=True, kw_only=True)
 class Reason:
-    """What one criterion found.
+    """What one criterion found; `criterion` is empty until `Criterion.reasons` names it.
 
     value and threshold in `unit`, None where there is none; time_s: when [s], counted as in the output's files;
     place (3,): where [m], world; who: the link, sphere, joint or camera; cause: what is there; remedy: what a person
@@ -30,7 +34,7 @@ class Reason:
     decides it, such as "contact". is_note: worth a line though it decides nothing.
     """
 
-    criterion: str
+    criterion: str = ""
     outcome: Outcome
     sentence: str
     value: float | None = None
@@ -51,6 +55,39 @@ class Reason:
         near = f", {self.cause}" if self.cause else ""
         remedy = f"; {self.remedy}" if self.remedy else ""
         return f"{self.criterion}: {self.sentence}{when}{near}{remedy}"
+
+
+failed = partial(Reason, outcome=Outcome.FAILED)
+lacking = partial(Reason, outcome=Outcome.NOT_EVALUABLE)
+"""The evidence does not reach."""
+
+
+def held(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
+    """The criterion holds, which is not worth a line."""
+    return Reason(outcome=Outcome.PASSED, sentence=sentence, value=value, threshold=threshold, unit=unit, count=count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Criterion(Generic[E]):
+    """One thing that a verdict asks of what a command found.
+
+    find: its reasons, none where it does not apply; what it asks is the first paragraph of its docstring. broken:
+    what it comes to where that does not hold, as the documentation's table has it.
+    """
+
+    name: str
+    find: Callable[[E], Iterable[Reason]]
+    broken: str
+
+    def reasons(self, found: E) -> Iterator[Reason]:
+        """With its name, unless they have a narrower one of their own."""
+        return (replace(reason, criterion=reason.criterion or self.name) for reason in self.find(found))
+
+    @property
+    def docs(self) -> str:
+        """The row of the table, its cells separated by |."""
+        asked = " ".join((inspect.getdoc(self.find) or "").split("\n\n")[0].split()).removesuffix(".")
+        return f"{self.name} | {asked[0].lower()}{asked[1:]} | {self.broken}"
 
 
 @dataclass(frozen=True, kw_only=True)

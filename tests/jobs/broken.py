@@ -193,3 +193,7 @@ ALONE: dict[str, Broken] = {
     "starved map": (without_a_splat, (), "clearance", "not evaluable", "raise --max-splats"),
 }
 """By name: what breaks it, arguments, and the criterion, label and words of the verdict."""
+ELSEWHERE = {  # criteria that take more than a broken thing: each has a test of its own
+    *("certified clearance", "true clearance", "acceleration limits", "controller", "scene hits", "goal", "clocks"),
+    *("clearance of people", "map error", "evidence", "calibration"),
+}

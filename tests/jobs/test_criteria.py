@@ -92,7 +92,7 @@ def bodied(deficit: tuple[float, float], surface: float) -> Any:
 @pytest.mark.parametrize(("surface", "outcome"), [(0.015, Outcome.NOT_EVALUABLE), (0.025, Outcome.PASSED)])
 def test_what_the_spheres_leave_uncovered_must_keep_the_margin_too(surface: float, outcome: Outcome) -> None:
     (reason,) = surface_clearance(bodied((0.0, 0.005), surface))
-    assert (reason.criterion, reason.outcome) == ("surface clearance", outcome)
+    assert reason.outcome is outcome
 
 
 def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
@@ -103,14 +103,14 @@ def test_one_sphere_of_unknown_cover_is_enough_to_know_nothing() -> None:
 
 def test_one_state_judged_by_an_old_map_is_enough() -> None:
     ages = np.array([0.1] * 10 + [1.5])
-    assert outcomes(evidence.evidence_age, judged(map_age_s=ages, events=[event(EventKind.STALE_MAP)])) == [
+    assert outcomes(evidence.map_age, judged(map_age_s=ages, events=[event(EventKind.STALE_MAP)])) == [
         Outcome.NOT_EVALUABLE
     ]
 
 
 def test_old_evidence_about_the_arm_counts_under_a_new_map() -> None:
     near = NOTHING_NEAR | {"age": np.full(NUM, 1.5)}
-    assert outcomes(evidence.evidence_age, judged(near=near)) == [Outcome.NOT_EVALUABLE, Outcome.PASSED]
+    assert outcomes(evidence.evidence_age, judged(near=near)) == [Outcome.NOT_EVALUABLE]
 
 
 def test_a_state_without_a_distance_in_one_field_is_not_judged() -> None:

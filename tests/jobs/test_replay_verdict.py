@@ -12,11 +12,13 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.grid_files.grid import read_npz, write_npz
 from splatctrl_cli.jobs import replay as job
+from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.records import Box, VoxelState
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.jobs.broken import (
     ALONE,
+    ELSEWHERE,
     beside_the_mount,
     dropped_states,
     gap_in_the_log,
@@ -44,6 +46,14 @@ def test_a_run_with_nothing_broken_is_safe(stage: Stage, mode: str) -> None:
         reason["criterion"] for reason in verdict["reasons"]
     }
     assert "map error not measured" in verdict["sentence"]
+
+
+def test_every_criterion_is_shown_to_turn_the_verdict() -> None:
+    names = [criterion.name for criterion in CRITERIA]
+    assert len(set(names)) == len(names) and set(names) == ELSEWHERE | {of for _, _, of, _, _ in ALONE.values()} - {
+        "judged states"
+    }
+    assert all(criterion.docs.count(" | ") == 2 for criterion in CRITERIA)
 
 
 CODES = {"not evaluable": 5}

@@ -6,8 +6,19 @@ import numpy as np
 
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
-from splatctrl_cli.evaluate.verdict import Outcome, Reason
-from splatctrl_cli.jobs.replays.judged import SLOW, Judged, counted, events_of, held, least_of, mm, nearby, seconds_at
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, held, lacking
+from splatctrl_cli.jobs.replays.judged import (
+    SLOW,
+    UNKNOWN,
+    Judged,
+    counted,
+    events_of,
+    least_of,
+    mm,
+    nearby,
+    seconds_at,
+)
+from splatctrl_cli.jobs.replays.metrics import is_blank
 
 CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
 AHEAD = 0.02  # [s] that the frames of one time step may lie apart
@@ -17,16 +28,18 @@ MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a 
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Space that no camera ever saw: where the arm's spheres are, and about them where the motion newly comes."""
+    """At most half of the space just outside of the arm that the motion comes to was never seen; at most 11 % of the
+    moving spheres come to space of which less than a tenth was; no place within the margin that cameras looked at
+    and got no depth from; at most `--max-unknown` of the sphere centres; a baked field says so by its channel
+    `observed`.
+    """
     for column, allowed, words in (
         ("unseen", UNSEEN, "of the space about the arm that the motion comes to was never seen by a camera"),
         ("blind", BLIND, "of the moving spheres come to space of which a camera never saw more than a tenth"),
     ):
         near = nearby(judged, column)
         if near is not None and near[0] > allowed:
-            yield Reason(
-                criterion="known space",
-                outcome=Outcome.NOT_EVALUABLE,
+            yield lacking(
                 sentence=f"{100 * near[0]:.0f} % {words}, allowed {100 * allowed:g} %",
                 value=near[0],
                 threshold=allowed,
@@ -35,28 +48,22 @@ def known_space(judged: Judged) -> Iterator[Reason]:
                 count=near[2],
             )
         elif near is not None:
-            yield held("known space", f"{100 * near[0]:.0f} % {words}", near[0], allowed, "", near[2])
+            yield held(f"{100 * near[0]:.0f} % {words}", near[0], allowed, "", near[2])
     yield from _unanswered(judged)
+    yield from _unknown_share(judged)
+
+
+def _unknown_share(judged: Judged) -> Iterator[Reason]:
+    """Of the sphere centres, in space that no camera saw and the robot never was in."""
     share, allowed = judged.metrics["unknown_share"], judged.request.max_unknown
     if share is None:
-        yield Reason(
-            criterion="known space", outcome=Outcome.NOT_EVALUABLE, sentence="what cameras saw is not recorded"
-        )
+        yield lacking(sentence="what cameras saw is not recorded")
         return
     if share <= allowed:
-        yield held(
-            "known space",
-            f"{100 * share:.2g} % of sphere centres in unseen space",
-            share,
-            allowed,
-            "",
-            judged.num_states,
-        )
+        yield held(f"{100 * share:.2g} % of sphere centres in unseen space", share, allowed, "", judged.num_states)
         return
     first = int(np.argmax(judged.replay.audit.unknown_share > allowed))
-    yield Reason(
-        criterion="known space",
-        outcome=Outcome.NOT_EVALUABLE,
+    yield lacking(
         sentence=f"{100 * share:.1f} % of the sphere centres lie in space no camera ever saw, allowed "
         f"{100 * allowed:g} %, first",
         value=share,
@@ -73,9 +80,7 @@ def _unanswered(judged: Judged) -> Iterator[Reason]:
     if not np.any(distance < margin):
         return
     worst = int(np.nanargmin(distance))
-    yield Reason(
-        criterion="known space",
-        outcome=Outcome.NOT_EVALUABLE,
+    yield lacking(
         sentence=f"cameras looked at a place {mm(distance[worst])} from the arm and got no depth from it, margin "
         f"{mm(margin)}",
         value=float(distance[worst]),
@@ -90,12 +95,12 @@ def _unanswered(judged: Judged) -> Iterator[Reason]:
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
-    """How old the map was that a state was judged by, and the evidence about the arm."""
+    """The depth about the arm is at most `--max-map-age` old, and none is newer than the state that it judges.
+    Frames without depth renew nothing; a baked field does not say when it was seen (a note).
+    """
     ahead = nearby(judged, "ahead")
     if ahead is not None and ahead[0] > AHEAD:
-        yield Reason(
-            criterion="evidence age",
-            outcome=Outcome.NOT_EVALUABLE,
+        yield lacking(
             sentence=f"depth from about the arm was returned {ahead[0]:.2f} s after the state that it judges",
             value=-ahead[0],
             threshold=-AHEAD,
@@ -106,9 +111,7 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
         )
     near = nearby(judged, "age")
     if near is not None and near[0] > judged.request.max_map_age:
-        yield Reason(
-            criterion="evidence age",
-            outcome=Outcome.NOT_EVALUABLE,
+        yield lacking(
             sentence=f"the cameras last returned depth from about the arm {near[0]:.2f} s before, allowed "
             f"{judged.request.max_map_age:g} s",
             value=near[0],
@@ -120,14 +123,16 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
         )
     elif near is not None:
         words = f"depth from about the arm at most {near[0]:.2f} s before"
-        yield held("evidence age", words, near[0], judged.request.max_map_age, "s", near[2])
+        yield held(words, near[0], judged.request.max_map_age, "s", near[2])
+
+
+def map_age(judged: Judged) -> Iterator[Reason]:
+    """The map is at most `--max-map-age` old; of a baked field, the time from its moment."""
     ages, allowed = np.asarray(judged.replay.map_age_s), judged.request.max_map_age
     known = ages[np.isfinite(ages)]
     if not len(known):
         if judged.request.field is not None and judged.inputs.source.has_clock:
-            yield Reason(
-                criterion="map age",
-                outcome=Outcome.NOT_EVALUABLE,
+            yield lacking(
                 sentence="the field does not say of what time it is",
                 remedy="give --scene, or bake a reconstruction instead of bare splats",
                 count=judged.num_states,
@@ -135,12 +140,10 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
         return
     most = float(known.max())
     if most <= allowed:
-        yield held("map age", f"at most {most:.2f} s", most, allowed, "s", len(known))
+        yield held(f"at most {most:.2f} s", most, allowed, "s", len(known))
         return
     worst = max(events_of(judged.replay, EventKind.STALE_MAP), key=lambda event: event.worst)
-    yield Reason(
-        criterion="map age",
-        outcome=Outcome.NOT_EVALUABLE,
+    yield lacking(
         sentence=f"the map is up to {most:.2f} s old, allowed {allowed:g} s, from {worst.start_s:.2f} to "
         f"{worst.end_s:.2f} s",
         value=most,
@@ -153,16 +156,14 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
 
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
-    """Times of the motion for which nothing was measured: gaps, states without a distance, dropped states."""
-    replay, config = judged.replay, judged.request.config.verdict
-    stamps = replay.audit.stamp_ns
-    blank = np.zeros(len(stamps), dtype=np.bool_)
-    for of in replay.audit.clearance.values():
-        blank |= np.isnan(of.distance)
+    """No gap longer than `verdict.longest_interval` that the velocity limits could use to reach the margin, no state
+    without a distance, none dropped for its stamp (*judged states*), at most `verdict.lead_in` before the first map.
+    """
+    config, stamps = judged.request.config.verdict, judged.replay.audit.stamp_ns
+    blank = is_blank(judged.replay)
     if blank.any():
-        yield Reason(
+        yield lacking(
             criterion="judged states",
-            outcome=Outcome.NOT_EVALUABLE,
             sentence=f"the path leaves known space: at {int(blank.sum())} of {len(stamps)} states a sphere is where "
             "the field has no distance, first",
             value=float(blank.mean()),
@@ -171,29 +172,11 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
             remedy="bake with field.unknown = free or obstacle, over a box that holds the motion",
             count=len(stamps),
         )
-    unbounded = replay.between["unbounded"]
-    duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
-    share = float(unbounded.sum()) / duration
-    if share > config.unjudged:
-        gaps = events_of(replay, EventKind.NOT_BOUNDED)
-        worst = max(gaps, key=lambda event: event.worst)
-        yield Reason(
-            criterion="judged time",
-            outcome=Outcome.NOT_EVALUABLE,
-            sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
-            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {worst.worst:.2f} s, ending",
-            value=share,
-            threshold=config.unjudged,
-            time_s=worst.worst_s,
-            cause=f"expected at most {config.longest_interval:g} s)",
-            remedy=SLOW,
-            count=len(stamps),
-        )
+    yield from _gaps(judged)
     dropped = judged.inputs.source.loss.conflicting_states
     if dropped > config.unjudged * (dropped + len(stamps)):
-        yield Reason(
+        yield lacking(
             criterion="judged states",
-            outcome=Outcome.NOT_EVALUABLE,
             sentence=f"{dropped} logged states were dropped: they repeat a stamp with other positions",
             value=float(dropped),
             threshold=config.unjudged,
@@ -203,14 +186,32 @@ def judged_time(judged: Judged) -> Iterator[Reason]:
     yield from _lead_in(judged)
 
 
+def _gaps(judged: Judged) -> Iterator[Reason]:
+    """Between states too far apart to bound the motion."""
+    replay, config = judged.replay, judged.request.config.verdict
+    stamps, unbounded = replay.audit.stamp_ns, replay.between["unbounded"]
+    duration = max(float(stamps[-1] - stamps[0]) * 1e-9, 1e-9)
+    share = float(unbounded.sum()) / duration
+    if share > config.unjudged:
+        worst = max(events_of(replay, EventKind.NOT_BOUNDED), key=lambda event: event.worst)
+        yield lacking(
+            sentence=f"{float(unbounded.sum()):.2f} s of {duration:.2f} s lie between states too far apart to bound "
+            f"the motion ({counted(int((unbounded > 0).sum()), 'gap')}, the longest {worst.worst:.2f} s, ending",
+            value=share,
+            threshold=config.unjudged,
+            time_s=worst.worst_s,
+            cause=f"expected at most {config.longest_interval:g} s)",
+            remedy=SLOW,
+            count=len(stamps),
+        )
+
+
 def _lead_in(judged: Judged) -> Iterator[Reason]:
     """States before the first map."""
     replay = judged.replay
     if not replay.lead_in_s > judged.request.config.verdict.lead_in:
         return
-    yield Reason(
-        criterion="judged time",
-        outcome=Outcome.NOT_EVALUABLE,
+    yield lacking(
         sentence=f"the first {replay.lead_in_s:.2f} s ({replay.num_before_scene} states) come before the first map",
         value=replay.lead_in_s,
         threshold=judged.request.config.verdict.lead_in,
@@ -221,25 +222,18 @@ def _lead_in(judged: Judged) -> Iterator[Reason]:
 
 
 def map_error(judged: Judged) -> Iterator[Reason]:
-    """What the map itself may miss, as held-out depth bounds it: surface clearance less the bound is at least 0.
+    """With `--evidence`: the surface clearance less the bound on the map's error is at least 0.
 
-    A smaller clearance is no contact that was seen, but one that the map cannot exclude: not evaluable, unless
-    another measure fails. So is evidence that is too little for a bound.
+    A smaller clearance is no contact that was seen, but one that the map cannot exclude: not
+    evaluable, unless another measure fails. So is evidence that is too little for a bound.
     """
     found, surface = judged.replay.map_error, least_of(judged.replay.between["surface"])
     if found is None:
         if judged.request.require_evidence:
-            yield Reason(
-                criterion="map error",
-                outcome=Outcome.NOT_EVALUABLE,
-                sentence="not measured",
-                remedy="give --evidence a camera that did not train the map",
-            )
+            yield lacking(sentence="not measured", remedy="give --evidence a camera that did not train the map")
         return
     if found.bound is None:
-        yield Reason(
-            criterion="map error",
-            outcome=Outcome.NOT_EVALUABLE,
+        yield lacking(
             sentence=f"not bounded: of {found.num_sets} held-out frame sets in the judged time {found.num_seen} show "
             "surface near the motion, too few for two independent stretches",
             who=found.source,
@@ -251,11 +245,9 @@ def map_error(judged: Judged) -> Iterator[Reason]:
     if surface is None:
         return  # no distance at any state, which is said of them
     if surface >= value:
-        yield held("map error", bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
+        yield held(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
-    yield Reason(
-        criterion="map error",
-        outcome=Outcome.NOT_EVALUABLE,
+    yield lacking(
         sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), and keeps {mm(surface)}; "
         "it missed so much",
         value=surface - value,
@@ -279,18 +271,16 @@ def bound_words(bound: ConformalBound) -> str:
 
 
 def clocks(judged: Judged) -> Iterator[Reason]:
-    """The cameras' clock against the robot's."""
+    """Cameras and robot agree within 50 ms beyond the estimate's own uncertainty."""
     clock = judged.logged.clock
     if clock is None or clock.offset_s is None or clock.uncertainty_s is None:
         return
     offset, uncertainty = float(clock.offset_s), float(clock.uncertainty_s)
     apart = abs(offset) - uncertainty
     if apart <= CLOCKS_APART:
-        yield held("clocks", f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
+        yield held(f"{1e3 * abs(offset):.0f} ms apart", abs(offset), CLOCKS_APART, "s", clock.num_intervals)
         return
-    yield Reason(
-        criterion="clocks",
-        outcome=Outcome.NOT_EVALUABLE,
+    yield lacking(
         sentence=f"the cameras' clock is {1e3 * abs(offset):.0f} ms {'ahead of' if offset > 0 else 'behind'} "
         f"the robot's (+- {1e3 * uncertainty:.0f} ms)",
         value=abs(offset),
@@ -302,30 +292,25 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def belonging(judged: Judged) -> Iterator[Reason]:
-    """Whether scene, log and robot belong together."""
+    """Scene, log and robot belong together: digests, first frames, times, joints; files as written; splats that
+    agree with their occupancy grid.
+    """
     for mismatch in judged.inputs.mismatches:
-        yield Reason(
-            criterion="evidence",
-            outcome=Outcome.NOT_EVALUABLE,
-            sentence=mismatch.sentence,
-            remedy=mismatch.remedy,
-        )
+        yield lacking(sentence=mismatch.sentence, remedy=mismatch.remedy)
 
 
 def calibration(judged: Judged) -> Iterator[Reason]:
-    """Whether the cameras see the robot where its joints put it: what is off there is off for everything."""
+    """The cameras see the robot within 5 mm of where its joints put it."""
     figures = judged.inputs.scene.figures()
     residual, by_link = figures.get("self_mask_residual_mm"), figures.get("self_mask")
     if residual is None or not isinstance(by_link, dict):
         return
     value = 1e-3 * float(residual)
     if value <= MISPLACED:
-        yield held("calibration", f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
+        yield held(f"the robot is seen within {mm(value)}", value, MISPLACED, "m", len(by_link))
         return
     link, worst = max(by_link.items(), key=lambda item: abs(float(item[1]["median_mm"])))
-    yield Reason(
-        criterion="calibration",
-        outcome=Outcome.NOT_EVALUABLE,
+    yield lacking(
         sentence=f"the cameras see {link} {mm(value)} {'behind' if worst['sign'] > 0 else 'before'} where its "
         f"joints put it, allowed {mm(MISPLACED)}",
         value=value,
@@ -335,3 +320,15 @@ def calibration(judged: Judged) -> Iterator[Reason]:
         remedy="calibrate the cameras ('splatctrl check'), or correct URDF, joint zeros or depth scale",
         count=int(worst["num_pixels"]),
     )
+
+
+OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
+    Criterion(name="map error", find=map_error, broken=UNKNOWN),
+    Criterion(name="evidence", find=belonging, broken=f"{UNKNOWN}; a changed file is refused (exit 4)"),
+    Criterion(name="calibration", find=calibration, broken=UNKNOWN),
+    Criterion(name="judged time", find=judged_time, broken=f"{UNKNOWN}; `--start-time first-map` judges the rest"),
+    Criterion(name="known space", find=known_space, broken=UNKNOWN),
+    Criterion(name="evidence age", find=evidence_age, broken=UNKNOWN),
+    Criterion(name="map age", find=map_age, broken=UNKNOWN),
+    Criterion(name="clocks", find=clocks, broken=UNKNOWN),
+)

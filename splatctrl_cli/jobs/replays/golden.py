@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 
 from splatctrl_cli.errors import GateFailed, InputError, UsageError
-from splatctrl_cli.evaluate.verdict import Outcome, Reason
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 
@@ -56,9 +56,8 @@ def golden_reason(golden: Golden, replay: Replay, tolerance: float) -> Reason:
     try:
         check_golden(golden, replay, tolerance)
     except GateFailed as error:
-        return Reason(
+        return failed(
             criterion="golden",
-            outcome=Outcome.FAILED,
             sentence=error.message,
             remedy=error.remedy,
             count=len(golden.velocity),

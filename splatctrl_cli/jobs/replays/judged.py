@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.control.events import Event, EventKind
-from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replays.inputs import LoggedStates
 from splatctrl_cli.jobs.replays.metrics import Metrics
 from splatctrl_cli.jobs.replays.record import SLIGHT
@@ -14,6 +13,7 @@ from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
+BROKEN, UNKNOWN = "failed", "*not evaluable*"  # as the table of the criteria has them
 SLOW = "log joint states more often"
 
 
@@ -40,18 +40,6 @@ class Judged:
 
 def events_of(replay: Replay, kind: EventKind, source: str = "") -> Sequence[Event]:
     return [event for event in replay.events if event.kind is kind and event.source == source]
-
-
-def held(criterion: str, sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
-    return Reason(
-        criterion=criterion,
-        outcome=Outcome.PASSED,
-        sentence=sentence,
-        value=value,
-        threshold=threshold,
-        unit=unit,
-        count=count,
-    )
 
 
 def least_of(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float | None:

@@ -97,7 +97,7 @@ def metrics_of(replay: Replay) -> Metrics:
         "max_evidence_age_s": _largest(replay.near["age"]),
         "unjudged_s": float(replay.between["unbounded"].sum()) + replay.lead_in_s,
         "unknown_share": _mean(audit.unknown_share),
-        "num_without_distance": int(np.sum(_is_blank(replay))),
+        "num_without_distance": int(np.sum(is_blank(replay))),
         "num_static_violations": len(replay.static_violations),
         "max_map_age_s": _largest(np.asarray(replay.map_age_s)),
         **_map_error(replay),
@@ -197,7 +197,7 @@ def _flags(replay: Replay) -> Mapping[str, Callable[[], Bool]]:
     flags: dict[str, Callable[[], Bool]] = {
         "num_below_margin": lambda: exact.distance < replay.margin,
         "num_in_collision": lambda: exact.distance < 0,
-        "num_without_distance": lambda: _is_blank(replay),
+        "num_without_distance": lambda: is_blank(replay),
     }
     if steps is not None:
 
@@ -269,7 +269,8 @@ def _closed_loop_metrics(replay: Replay) -> Metrics:
     }
 
 
-def _is_blank(replay: Replay) -> Bool:
+def is_blank(replay: Replay) -> Bool:
+    """(T,) True where a field has no distance."""
     blank = np.zeros(len(replay.audit.stamp_ns), dtype=np.bool_)
     for of in replay.audit.clearance.values():
         blank |= np.isnan(of.distance)

@@ -1,48 +1,20 @@
 """The verdict of a replay: every criterion of *safe*, with what it found, when, where and what to do about it."""
 
 from splatctrl_cli.evaluate.gates import gate_reasons
-from splatctrl_cli.evaluate.verdict import Reason, Verdict, verdict_of
+from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
 from splatctrl_cli.jobs.replays.counts import counts_of
 from splatctrl_cli.jobs.replays.evidence_criteria import (
-    belonging,
+    OF_EVIDENCE,
     bound_words,
-    calibration,
-    clocks,
-    evidence_age,
-    judged_time,
-    known_space,
-    map_error,
 )
 from splatctrl_cli.jobs.replays.golden import Golden, golden_reason
 from splatctrl_cli.jobs.replays.judged import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replays.metrics import first_time
-from splatctrl_cli.jobs.replays.motion_criteria import (
-    clearance,
-    controller,
-    motion_limits,
-    self_clearance,
-    static_clearance,
-    surface_clearance,
-)
+from splatctrl_cli.jobs.replays.motion_criteria import OF_MOTION
 from splatctrl_cli.robot.declared import carried_words
 
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
-CRITERIA = (
-    clearance,
-    self_clearance,
-    static_clearance,
-    motion_limits,
-    controller,
-    surface_clearance,
-    map_error,
-    belonging,
-    calibration,
-    judged_time,
-    known_space,
-    evidence_age,
-    clocks,
-)
-"""By weight: of several failures the first one is in the sentence."""
+CRITERIA = (*OF_MOTION, *OF_EVIDENCE)
 
 
 def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
@@ -50,9 +22,7 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     given.
     """
     replay, request = judged.replay, judged.request
-    reasons: list[Reason] = []
-    for criterion in CRITERIA:
-        reasons += criterion(judged)
+    reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
     counts = counts_of(replay, judged.logged, judged.metrics, request.config.control)
     reasons += gate_reasons(
