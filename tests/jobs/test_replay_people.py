@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from splatctrl_cli.jobs.replays.metrics import _largest, _least
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import START, Desk
@@ -78,10 +77,3 @@ def deceiving(arm: RobotModel, q: Float64) -> Ball:
         if (gaps - radii)[np.argmin(gaps)] > (gaps - radii).min() + 0.005 and (gaps - radii).min() > 0.15:
             return (float(point[0]), float(point[1]), float(point[2])), 0.05
     raise AssertionError
-
-
-def test_a_residual_that_is_infinite_is_not_left_out_of_the_largest() -> None:
-    assert _largest(np.array([1e-9, np.inf, np.nan])) is None
-    assert _largest(np.array([1e-9, 2e-9, np.nan])) == 2e-9
-    assert _largest(np.array([np.nan])) is None
-    assert _least(np.array([np.nan, -np.inf, 1.0])) == -np.inf

@@ -161,6 +161,12 @@ class LoggedStates:
         )
         return dict(zip(LOG_FIGURES, values, strict=True))
 
+    def counts(self) -> dict[str, int]:
+        """How many poses or intervals each of `metrics` rests on; the number of poses rests on the states."""
+        num_poses = 0 if self.poses is None else self.poses.num_poses
+        num_intervals = 0 if self.clock is None else self.clock.num_intervals
+        return {name: num_intervals if name.startswith("clock_") else num_poses for name in LOG_FIGURES[1:]}
+
     def lines(self) -> list[str]:
         """A line for each thing that a person should know."""
         notes = self.source.loss.notes

@@ -35,11 +35,7 @@ def replayed(request: ReplayRequest, inputs: ReplayInputs, config: Config, conso
     mode = {"audit": _audited, "open-loop": _asked, "closed-loop": _driven}[request.mode]
     zone = read_zone(request)
     replay = mode(request, inputs, config, console)
-    replay = replace(
-        replay,
-        separations=separations(request, zone, inputs, replay, config),
-        period=config.control.period,
-    )
+    replay = replace(replay, separations=separations(request, zone, inputs, replay, config))
     return replace(replay, comparison=compared(request, read_baselines(request), inputs, replay, config, console))
 
 
@@ -174,7 +170,7 @@ def _replay(
     before = logged[(logged >= requested) & (logged < stamps[0])]
     return Replay(
         model=inputs.model,
-        margin=config.control.margin,
+        config=config,
         audit=record.audit,
         num_before_scene=len(before),
         lead_in_s=float(int(stamps[0]) - int(before[0])) * 1e-9 if len(before) else 0.0,

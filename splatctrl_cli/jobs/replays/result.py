@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from splatctrl_cli.config import Config
 from splatctrl_cli.control.checks import StaticViolation
 from splatctrl_cli.control.events import Event
 from splatctrl_cli.control.replay import ReplayTrace
@@ -44,7 +45,7 @@ class Replay:
     """
 
     model: RobotModel
-    margin: float
+    config: Config
     audit: StoredAudit
     num_before_scene: int
     lead_in_s: float
@@ -68,7 +69,16 @@ class Replay:
     comparison: Comparison = field(default_factory=Comparison)
     twist_figures: Mapping[str, float | None] = field(default_factory=dict)
     map_error: MapError | None = None
-    period: float = 0.0
+
+    @property
+    def margin(self) -> float:
+        """Of clearance [m]."""
+        return self.config.control.margin
+
+    @property
+    def period(self) -> float:
+        """Of the controller [s]."""
+        return self.config.control.period
 
     @property
     def mode(self) -> str:

@@ -2,14 +2,13 @@
 
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
-from splatctrl_cli.jobs.replays.counts import counts_of
 from splatctrl_cli.jobs.replays.evidence_criteria import (
     OF_EVIDENCE,
     bound_words,
 )
 from splatctrl_cli.jobs.replays.golden import Golden, golden_reason
 from splatctrl_cli.jobs.replays.judged import CONTACT, SAFE, Judged, nearby
-from splatctrl_cli.jobs.replays.metrics import first_time
+from splatctrl_cli.jobs.replays.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replays.motion_criteria import OF_MOTION
 from splatctrl_cli.robot.declared import carried_words
 
@@ -24,7 +23,7 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     replay, request = judged.replay, judged.request
     reasons = [reason for criterion in CRITERIA for reason in criterion.reasons(judged)]
     reasons.sort(key=lambda reason: reason.label != CONTACT)  # by any measure, before what only broke a margin
-    counts = counts_of(replay, judged.logged, judged.metrics, request.config.control)
+    counts = counts_of(replay, judged.logged, judged.metrics)
     reasons += gate_reasons(
         request.require, judged.metrics, counts, first_time=lambda name, holds: first_time(replay, name, holds)
     )

@@ -1,0 +1,99 @@
+"""Metrics as they are declared: the value, what it rests on, and of a figure of states how it folds over them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from splatctrl_cli.evaluate.clearance import least
+from splatctrl_cli.records import Bool, Float64
+
+R = TypeVar("R")  # the result that has the metric
+Column = Callable[[R], Float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric(Generic[R]):
+    """One figure: its value, None where it has none, and how many states, views or points it rests on.
+
+    running: what it is before the first state, and over the states up to each (T,); None where it is not made of
+    single states.
+    """
+
+    name: str
+    value: Callable[[R], float | None]
+    count: Callable[[R], int]
+    running: Callable[[R], tuple[float, Float64]] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fold:
+    """What a column (T,) comes to; accumulate: up to each state, from `start` on; None where no order tells that."""
+
+    of: Callable[[Float64], float | None]
+    start: float = np.nan
+    accumulate: Callable[[Float64], Float64] | None = None
+
+
+def lowest(values: Float64) -> float | None:
+    """The least value that is not NaN, which may be infinite; None without one."""
+    there = values[~np.isnan(values)]
+    return float(np.min(there)) if len(there) else None
+
+
+def largest(values: Float64) -> float | None:
+    """The largest value; None where one is infinite or none is there."""
+    there = values[~np.isnan(values)]
+    return float(np.max(there)) if len(there) and np.isfinite(there).all() else None
+
+
+def mean(values: Float64) -> float | None:
+    """Over the values that are not NaN; None without one."""
+    there = values[~np.isnan(values)]
+    return float(np.mean(there)) if len(there) else None
+
+
+def p95(values: Float64) -> float | None:
+    """The 95th percentile of the values that are not NaN; None without one."""
+    there = values[~np.isnan(values)]
+    return float(np.percentile(there, 95)) if len(there) else None
+
+
+def last(values: Float64) -> float | None:
+    """The last finite value; None without one."""
+    there = values[np.isfinite(values)]
+    return float(there[-1]) if len(there) else None
+
+
+LEAST = Fold(of=least, start=np.inf, accumulate=np.fmin.accumulate)
+LOWEST = Fold(of=lowest, start=np.inf, accumulate=np.fmin.accumulate)
+LARGEST = Fold(of=largest, start=-np.inf, accumulate=np.fmax.accumulate)
+MEAN, P95, LAST = Fold(of=mean), Fold(of=p95), Fold(of=last)
+TOTAL = Fold(of=lambda values: int(np.nansum(values)))
+
+
+def known(values: Float64) -> int:
+    """How many are not NaN."""
+    return int(np.sum(~np.isnan(values)))
+
+
+def folded(name: str, fold: Fold, column: Column[R], count: Callable[[R], int] | None = None) -> Metric[R]:
+    """A column's fold, which rests on the values that are not NaN unless `count` says otherwise."""
+    accumulate = fold.accumulate
+    return Metric(
+        name=name,
+        value=lambda result: fold.of(column(result)),
+        count=count or (lambda result: known(column(result))),
+        running=None if accumulate is None else lambda result: (fold.start, accumulate(column(result))),
+    )
+
+
+def counted(name: str, column: Column[R], is_on: Callable[[R, Float64], Bool]) -> Metric[R]:
+    """How many values of a column are so."""
+    return Metric(
+        name=name,
+        value=lambda result: int(np.sum(is_on(result, column(result)))),
+        count=lambda result: known(column(result)),
+        running=lambda result: (0.0, np.cumsum(is_on(result, column(result))).astype(np.float64)),
+    )
