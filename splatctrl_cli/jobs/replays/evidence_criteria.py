@@ -28,7 +28,7 @@ MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a 
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """At most half of the space just outside of the arm that the motion comes to was never seen; at most 11 % of the
+    """At most half of the space just outside of the arm that the motion comes to was never seen; at most 9 % of the
     moving spheres come to space of which less than a tenth was; no place within the margin that cameras looked at
     and got no depth from; at most `--max-unknown` of the sphere centres; a baked field says so by its channel
     `observed`.
