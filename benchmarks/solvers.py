@@ -12,10 +12,9 @@ from collections.abc import Callable
 import numpy as np
 
 from splatctrl_cli.cli.common import table
-from splatctrl_cli.control.barriers import Barrier
 from splatctrl_cli.control.ladder import assemble
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QpSolver, QuadraticProgram
-from splatctrl_cli.control.tasks import posture_task, velocity_task
+from splatctrl_cli.control.terms import Barrier, reach_cost, stray_cost
 from splatctrl_cli.records import Float64
 
 JOINTS, SPEED, MAX_ROWS = 7, 1.0, 40
@@ -56,7 +55,7 @@ def main() -> int:
 def random_program(rng: np.random.Generator) -> QuadraticProgram:
     """One step's program."""
     jacobian, velocity = rng.normal(size=(6, JOINTS)), 0.3 * rng.normal(size=6)
-    costs = [velocity_task(jacobian, velocity, rng.uniform(1, 9, 6)), posture_task(np.full(JOINTS, 0.1), 1e-3)]
+    costs = [reach_cost(jacobian, velocity, rng.uniform(1, 9, 6)), stray_cost(np.full(JOINTS, 0.1), 1e-3)]
     num_rows = int(rng.integers(0, MAX_ROWS))
     bound = rng.uniform(-0.2, 0.6, num_rows)
     rows = Barrier(

@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 from benchmarks.random_tabletop import random_things
 from benchmarks.scenes import sample_robot
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.barriers import pair_distance
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.evaluate.visibility import seen_by
+from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Box, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import posture_of
@@ -196,7 +196,7 @@ def _free_posture(rng: np.random.Generator, T_world_hand: Float64, primitives: S
         centers, radii = model.sphere_centers(q), model.sphere_set.radii
         moving = model.moving_spheres
         clearance = np.min(distance_to(primitives, centers[moving], STAMP_NS) - radii[moving])
-        if clearance >= LEAST_CLEARANCE and np.min(pair_distance(centers, radii, model.self_pairs())[0]) >= 0.03:
+        if clearance >= LEAST_CLEARANCE and np.min(pair_gaps(centers, radii, model.self_pairs())[0]) >= 0.03:
             return q
     return None
 

@@ -18,6 +18,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
+Stamps = NDArray[np.int64]  # (T,) [ns]
 
 
 class FloatRows(Protocol):

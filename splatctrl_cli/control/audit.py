@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.barriers import pair_distance
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.kernels.chain import pair_gaps
+from splatctrl_cli.records import Float64, JointState, Stamps
 
-Stamps = NDArray[np.int64]
 Channel = NDArray[np.uint8]
 
 DistanceFunction = Callable[[Float64], Float64]
@@ -171,7 +170,7 @@ def _self_clearance(model: ArmModel, centers: Float64) -> Clearance:
     if not len(pairs):
         nothing = np.full(len(centers), -1, dtype=np.int64)
         return Clearance(distance=np.full(len(centers), np.inf), sphere=nothing)
-    distance = np.array([pair_distance(c, model.sphere_set.radii, pairs)[0] for c in centers])
+    distance = np.array([pair_gaps(c, model.sphere_set.radii, pairs)[0] for c in centers])
     nearest = distance.argmin(axis=1)
     return Clearance(distance=distance[np.arange(len(centers)), nearest], sphere=nearest)
 

@@ -1,49 +1,188 @@
-"""Control barrier rows of III-E: ``G v - s <= h``, one slack s >= 0 per row."""
-
-from dataclasses import dataclass, replace
+"""The barrier rows of III-E: of the moving spheres against the scene, and of the pairs of spheres of the arm."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel, sphere_names
+from splatctrl_cli.control.limits import braking_speed
+from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
+from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.kernels.chain import pair_gaps
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import DistanceField, Float64
 
-Index = NDArray[np.integer]
-
+MARGIN = "margin"
 IMMOVABLE = 1e-9  # [m/s] a row that the fastest allowed motion changes by less than this cannot be acted on
+BRAKING_SHARE = 0.5  # of what a row alone could brake with; 1 lost up to 6 mm where several rows brake at once
 
 
-@dataclass(frozen=True, kw_only=True)
-class Barrier:
-    """M barrier rows ``G v - s <= h`` with ``G = -dd/dq`` (M, J) and ``h = alpha (d - epsilon) + dd/dt`` (M,).
+class SceneRows(BarrierTerm):
+    """A row for each moving sphere against the nearest surface of a distance field."""
 
-    distance d (M,) [m]; index (M,) is each row's place in its catalogue of names (sphere, or sphere pair).
-    The cost of slack is ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
-    """
+    kind = RowKind.SCENE
 
-    index: Index
-    G: Float64
-    h: Float64
-    distance: Float64
-    slack_cost: float
-    slack_weight: float
+    def __init__(
+        self, model: ArmModel, config: ControlConfig, field: DistanceField, acceleration: Float64 | None
+    ) -> None:
+        """acceleration (J,) [rad/s^2]: what joints can brake with; None: they stop at once."""
+        self._config, self._field, self._acceleration = config, field, acceleration
+        self._moving = np.flatnonzero(model.moving_spheres)
+        self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)[self._moving]
+        self._margin = scene_margin(model, config)[self._moving]
+        names = sphere_names(model.sphere_set)
+        self.names = tuple(names[s] for s in self._moving)
 
-    def __len__(self) -> int:
-        return len(self.h)
+    @property
+    def margin(self) -> Float64:
+        """See `BarrierTerm`."""
+        return self._margin
 
-    def select(self, rows: NDArray[np.bool_]) -> "Barrier":
-        """The rows where `rows` (M,) is true, in order."""
-        return replace(self, index=self.index[rows], G=self.G[rows], h=self.h[rows], distance=self.distance[rows])
+    def in_field(self, field: DistanceField) -> "SceneRows":
+        """The same rows in another field."""
+        other = object.__new__(SceneRows)
+        other.__dict__.update(self.__dict__, _field=field)
+        return other
 
-    def joined(self, other: "Barrier") -> "Barrier":
-        """These rows and then those of `other`, at the same cost of slack."""
-        return replace(
-            self,
-            index=np.concatenate([self.index, other.index]),
-            G=np.concatenate([self.G, other.G]),
-            h=np.concatenate([self.h, other.h]),
-            distance=np.concatenate([self.distance, other.distance]),
+    def rows(self, state: State) -> Barrier:
+        """See `BarrierTerm`: gradient and distance come from one query of one function."""
+        centers, jacobians = state.spheres
+        distance, gradient = self._queried(centers)
+        G = -external_gradient(gradient, jacobians[self._moving])
+        h = distance_bound(self._config, self._acceleration, distance, self._margin, G, state.distance_rate)
+        return self._barrier(self._moving, G, h, distance)
+
+    def cut(self, state: State, velocity: Float64, chosen: NDArray[np.integer], distance: Float64) -> Barrier:
+        """One more for each of the `chosen` rows, which have a `distance` (M,) at the state: against what the
+        sphere is nearest to after a period of `velocity` (J,), which need not be what it is nearest to now.
+
+        That surface's distance is taken as linear about the place where it was met. Where it is convex seen from
+        there, as a ball is, it is farther than that in truth; and now it is no nearer than what is nearest now.
+        """
+        period, spheres = self._config.period, self._moving[chosen]
+        centers, jacobians = state.model.spheres_at(state.q + period * velocity)
+        later, gradient = self._field.query(np.ascontiguousarray(centers[spheres]))
+        G = -external_gradient(gradient, jacobians[spheres])
+        now = np.maximum(later - self._radii[chosen] + period * (G @ velocity), distance[chosen])
+        rate = np.broadcast_to(state.distance_rate, len(self.names))[chosen]
+        h = distance_bound(self._config, self._acceleration, now, self._margin[chosen], G, rate)
+        return self._barrier(chosen, G, h, now)
+
+    def room(self, state: State, velocity: Float64) -> Float64:
+        """See `BarrierTerm`."""
+        centers, jacobians = state.spheres
+        distance, gradient = self._queried(centers)
+        h = distance_bound(self._config, None, distance, self._margin, None, state.distance_rate)
+        return np.asarray(h + np.sum(gradient * (jacobians @ velocity)[self._moving], axis=1))
+
+    def distances(self, centers: Float64) -> Float64:
+        """See `BarrierTerm`; NaN where the field has none, which keeps no promise."""
+        return self._field.query(np.ascontiguousarray(centers[self._moving]))[0] - self._radii
+
+    def _barrier(self, index: NDArray[np.integer], G: Float64, h: Float64, distance: Float64) -> Barrier:
+        cost, weight = self._config.slack_cost, self._config.weight_slack
+        return Barrier(index=index, G=G, h=h, distance=distance, slack_cost=cost, slack_weight=weight)
+
+    def _queried(self, centers: Float64) -> tuple[Float64, Float64]:
+        """Distance (M,) of the moving spheres' surfaces and the field's gradient (M, 3) at their centres."""
+        points = np.ascontiguousarray(centers[self._moving])
+        distance, gradient = self._field.query(points)
+        bad = ~(np.isfinite(distance) & np.all(np.isfinite(gradient), axis=1))
+        if np.any(bad):
+            first = int(np.argmax(bad))
+            where = ", ".join(f"{v:.3f}" for v in points[first])
+            raise NotEvaluableError(
+                f"sphere {self.names[first]} at ({where}) m: the field has no distance there",
+                remedy="bake a field that covers the robot's reach",
+            )
+        return distance - self._radii, gradient
+
+
+class SelfRows(BarrierTerm):
+    """A row for each pair of spheres of the arm that could collide."""
+
+    kind = RowKind.SELF
+
+    def __init__(self, model: ArmModel, config: ControlConfig, acceleration: Float64 | None) -> None:
+        """acceleration as for `SceneRows`."""
+        self._config, self._acceleration = config, acceleration
+        self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
+        self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
+        self._margin = np.full(len(self._pairs), config.self_margin)
+        names = sphere_names(model.sphere_set)
+        self.names = tuple(f"{names[a]}~{names[b]}" for a, b in self._pairs)
+
+    @property
+    def margin(self) -> Float64:
+        """See `BarrierTerm`."""
+        return self._margin
+
+    def rows(self, state: State) -> Barrier:
+        """See `BarrierTerm`. Where joints stop at once, G is zero for pairs whose spheres are too slow to use up h:
+        no velocity of the box brings them to bind.
+        """
+        centers, jacobians = state.spheres
+        distance, direction = pair_gaps(centers, self._radii, self._pairs)
+        if self._acceleration is not None:
+            G = -pair_gradient(direction, jacobians, self._pairs)
+            h = distance_bound(self._config, self._acceleration, distance, self._margin, G)
+        else:
+            G = np.zeros((len(distance), jacobians.shape[2]))
+            h = distance_bound(self._config, None, distance, self._margin, G)
+            speed = fastest_spheres(jacobians, *state.box)
+            near = np.flatnonzero(h <= speed[self._pairs[:, 0]] + speed[self._pairs[:, 1]])
+            G[near] = -pair_gradient(direction[near], jacobians, self._pairs[near])
+        return Barrier(
+            index=np.arange(len(self._pairs)),
+            G=G,
+            h=h,
+            distance=distance,
+            slack_cost=self._config.self_slack_cost,
+            slack_weight=self._config.weight_slack,
         )
+
+    def room(self, state: State, velocity: Float64) -> Float64:
+        """See `BarrierTerm`."""
+        centers, jacobians = state.spheres
+        distance, direction = pair_gaps(centers, self._radii, self._pairs)
+        motion = jacobians @ velocity
+        apart = motion[self._pairs[:, 0]] - motion[self._pairs[:, 1]]
+        h = distance_bound(self._config, None, distance, self._margin, None)
+        return np.asarray(h + np.sum(direction * apart, axis=1))
+
+    def distances(self, centers: Float64) -> Float64:
+        """See `BarrierTerm`."""
+        return pair_gaps(centers, self._radii, self._pairs)[0]
+
+
+def scene_margin(model: ArmModel, config: ControlConfig) -> Float64:
+    """The distance (S,) [m] that every sphere keeps to the scene: epsilon, and where `config.coverage` is "margin"
+    also what the spheres leave uncovered of their body.
+
+    A point of the surface is no farther than that deficit from a sphere, so by the triangle inequality the surface
+    keeps epsilon where the spheres keep this, of any distance that changes by no more than a metre per metre.
+    """
+    deficit = np.asarray(model.sphere_deficit) if config.coverage == MARGIN else np.zeros(len(model.moving_spheres))
+    return config.margin + deficit
+
+
+def distance_bound(
+    config: ControlConfig,
+    acceleration: Float64 | None,
+    distance: Float64,
+    margin: Float64,
+    G: Float64 | None,
+    rate: float | Float64 = 0.0,
+) -> Float64:
+    """h (M,) of rows G (M, J), which counts only where joints cannot stop at once: then with the way that braking
+    takes. rate is dd/dt of a field that changes with time.
+
+    A row's approach G v can be braked by at most ``|G| a``; BRAKING_SHARE of it is counted on, for it changes on the
+    way and other rows want their part.
+    """
+    if acceleration is None or G is None:
+        return barrier_bound(distance, margin=margin, gain=config.barrier_gain, rate=rate)
+    deceleration = BRAKING_SHARE * (np.abs(G) @ acceleration)
+    return np.asarray(braking_speed(distance - margin, config.barrier_gain, deceleration, config.period) + rate)
 
 
 def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
@@ -51,15 +190,7 @@ def external_gradient(gradient: Float64, jacobians: Float64) -> Float64:
     return np.asarray(np.matmul(gradient[:, None, :], jacobians)[:, 0, :])
 
 
-def pair_distance(centers: Float64, radii: Float64, pairs: Index) -> tuple[Float64, Float64]:
-    """Distance (P,) [m] between sphere surfaces and the unit direction (P, 3) from the second to the first.
-
-    centers (S, 3), radii (S,) [m]; pairs (P, 2). The direction is zero where two centres coincide.
-    """
-    return pair_gaps(centers, radii, np.asarray(pairs, dtype=np.int64))
-
-
-def pair_gradient(direction: Float64, jacobians: Float64, pairs: Index) -> Float64:
+def pair_gradient(direction: Float64, jacobians: Float64, pairs: NDArray[np.integer]) -> Float64:
     """``dd/dq`` (P, J) of sphere pair distances; jacobians (S, 3, J)."""
     relative = jacobians[pairs[:, 0]] - jacobians[pairs[:, 1]]
     return np.asarray(np.matmul(direction[:, None, :], relative)[:, 0, :])

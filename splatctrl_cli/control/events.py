@@ -7,8 +7,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.control.audit import Stamps
-from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.records import Bool, Float64, Stamps
 
 UNREPRESENTED = "unrepresented voxel"  # label of an obstacle that is occupied and has no splat
 MAX_NAMES = 12  # of an event; how many there are is in num_names

@@ -12,9 +12,8 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.records import Bool, Float64, FloatRows
+from splatctrl_cli.records import Bool, Float64, FloatRows, Stamps
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,11 +7,9 @@ from enum import StrEnum
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control import tasks
-from splatctrl_cli.control.barriers import Barrier
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import QpSolution, QpSolver, QuadraticProgram
-from splatctrl_cli.control.tasks import Cost
+from splatctrl_cli.control.terms import Barrier, Cost, stray_cost, summed
 from splatctrl_cli.records import Float64
 
 
@@ -46,7 +44,7 @@ def is_usable(solution: QpSolution, max_residual: float) -> bool:
 
 def descend(
     solver: QpSolver,
-    costs: Sequence[tasks.Cost],
+    costs: Sequence[Cost],
     box: tuple[Float64, Float64],
     barriers: Sequence[Barrier],
     config: ControlConfig,
@@ -70,7 +68,7 @@ def descend(
             solution=firm,
             num_refused=0,
         )
-    least_violation = [tasks.posture_task(np.zeros(J), 1.0)]
+    least_violation = [stray_cost(np.zeros(J), 1.0)]
     for num_refused, (rung, terms) in enumerate(((Rung.SOLVED, costs), (Rung.MINIMUM_VIOLATION, least_violation))):
         solution = solver.solve(assemble(terms, *box, barriers))
         if is_usable(solution, config.max_residual):
@@ -85,14 +83,19 @@ def descend(
                 solution=solution,
                 num_refused=num_refused,
             )
+    return held(J, M, solution, num_refused=2)
+
+
+def held(num_joints: int, num_rows: int, solution: QpSolution, *, num_refused: int) -> Choice:
+    """To hold still, because no solution is usable."""
     return Choice(
-        velocity=np.zeros(J),
+        velocity=np.zeros(num_joints),
         rung=Rung.HOLD,
-        slack=np.zeros(M),
-        box_multipliers=np.zeros(2 * J),
-        row_multipliers=np.zeros(M),
+        slack=np.zeros(num_rows),
+        box_multipliers=np.zeros(2 * num_joints),
+        row_multipliers=np.zeros(num_rows),
         solution=solution,
-        num_refused=2,
+        num_refused=num_refused,
     )
 
 
@@ -104,21 +107,12 @@ def assemble_hard(
     Where it has a solution and no barrier's multiplier exceeds its slack cost, that is the solution of `assemble`,
     with all slacks zero: an L1 penalty above the multipliers is exact, and the slacks' signs take the rest.
     """
-    J = len(lowest)
-    H, c = _objective(costs, J)
+    H, c = summed(costs)
     G, h = box_rows(lowest, highest)
     rows = [barrier for barrier in barriers if len(barrier)]
     return QuadraticProgram(
         H=H, c=c, G=np.vstack([G, *(b.G for b in rows)]), h=np.concatenate([h, *(b.h for b in rows)])
     )
-
-
-def _objective(costs: Sequence[Cost], J: int) -> tuple[Float64, Float64]:
-    H, c = np.zeros((J, J)), np.zeros(J)
-    for cost_H, cost_c in costs:
-        H += cost_H
-        c += cost_c
-    return H, c
 
 
 def assemble(
@@ -130,7 +124,7 @@ def assemble(
     """
     J, M = len(lowest), sum(len(barrier) for barrier in barriers)
     H, c = np.zeros((J + M, J + M)), np.zeros(J + M)
-    H[:J, :J], c[:J] = _objective(costs, J)
+    H[:J, :J], c[:J] = summed(costs)
     slack = np.arange(J, J + M)
     H[slack, slack] = np.concatenate([np.full(len(b), 2.0 * b.slack_weight) for b in barriers] or [np.zeros(0)])
     c[J:] = np.concatenate([np.full(len(b), b.slack_cost) for b in barriers] or [np.zeros(0)])

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 
 WINDOW = 0.05  # [s] over which a motion is averaged, so that an encoder's steps are not taken for speed
 ENCODER = 1e-3  # [rad or m] that each position may be off
-Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)

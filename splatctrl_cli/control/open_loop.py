@@ -11,7 +11,8 @@ from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
-from splatctrl_cli.control.step import ControlStep, QpIkController, RowKind, VelocityMargin
+from splatctrl_cli.control.step import ControlStep, QpIkController, VelocityMargin
+from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 FieldAt = Callable[[int], DistanceField]

@@ -5,16 +5,15 @@ slack per external row, of either sign, and ``x - J v`` the paper's delta_x, whi
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from splatctrl_cli.config import Config, ControlConfig
-from splatctrl_cli.control.barriers import Barrier
-from splatctrl_cli.control.ladder import Choice, Rung, is_usable
+from splatctrl_cli.control.ladder import Choice, Rung, held, is_usable
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import QpSolver, QuadraticProgram
-from splatctrl_cli.control.tasks import Cost
+from splatctrl_cli.control.terms import Barrier, Cost, State, configured_weights
 from splatctrl_cli.records import Float64
 
 PAPER = "paper"
@@ -30,72 +29,48 @@ def with_preset(config: Config) -> Config:
     return replace(config, control=applied(config.control))
 
 
-@dataclass(frozen=True, kw_only=True)
-class PrintedTask:
-    """The first two terms of III-E: reference u (6,), jacobian J (6, J), diagonals of Q and R (6,)."""
-
-    reference: Float64
-    jacobian: Float64
-    weight_task: Float64
-    weight_kinematics: Float64
-
-
 def assemble_printed(
-    task: PrintedTask,
-    posture: Cost,
-    box: tuple[Float64, Float64],
-    external: Barrier,
-    own: Barrier,
+    state: State, weights: tuple[Float64, Float64], posture: Cost, external: Barrier, firm: Sequence[Barrier]
 ) -> QuadraticProgram:
-    """The program over ``z = (v, x, e)``; rows: upper and lower box (2 J), external rows (M), self-collision rows.
+    """The program over ``z = (v, x, e)``; rows: upper and lower box (2 J), external rows (M), firm rows.
 
-    As printed: an external row is ``grad d v >= -(d - epsilon) + e``, a self-collision row has no slack. posture is
-    the "home pose bias" of III-E, without which seven joints on six dimensions are undetermined.
+    As printed: an external row is ``grad d v >= -(d - epsilon) + e``, a self-collision row has no slack, nor has
+    a row of a further term. weights: the diagonals (6,) of Q and R; posture is the "home pose bias" of III-E, without
+    which seven joints on six dimensions are undetermined.
     """
-    J, M = len(box[0]), len(external)
+    J, M = len(state.q), len(external)
     v, x, e = slice(0, J), slice(J, J + 6), slice(J + 6, J + 6 + M)
     H, c = np.zeros((J + 6 + M, J + 6 + M)), np.zeros(J + 6 + M)
-    Q, R, A = np.diag(task.weight_task), np.diag(task.weight_kinematics), task.jacobian
+    Q, R, A = np.diag(weights[0]), np.diag(weights[1]), state.jacobian
     H[v, v] = 2.0 * A.T @ R @ A + posture[0]
     H[v, x] = -2.0 * A.T @ R
     H[x, v] = H[v, x].T
     H[x, x] = 2.0 * (Q + R)
     H[e, e] = 2.0 * external.slack_weight * np.eye(M)
-    c[v], c[x] = posture[1], -2.0 * Q @ task.reference
-    G, h = np.zeros((2 * J + M + len(own), len(c))), np.zeros(2 * J + M + len(own))
-    G[: 2 * J, v], h[: 2 * J] = box_rows(*box)
+    c[v], c[x] = posture[1], -2.0 * Q @ state.reference
+    num_rows = 2 * J + M + sum(len(rows) for rows in firm)
+    G, h = np.zeros((num_rows, len(c))), np.zeros(num_rows)
+    G[: 2 * J, v], h[: 2 * J] = box_rows(*state.box)
     rows, last = slice(2 * J, 2 * J + M), slice(2 * J + M, None)
     G[rows, v], G[rows, e], h[rows] = external.G, np.eye(M), external.h
-    G[last, v], h[last] = own.G, own.h
+    if firm:
+        G[last, v], h[last] = np.concatenate([b.G for b in firm]), np.concatenate([b.h for b in firm])
     return QuadraticProgram(H=H, c=c, G=G, h=h)
 
 
 def solve_printed(
-    solver: QpSolver,
-    task: PrintedTask,
-    posture: Cost,
-    box: tuple[Float64, Float64],
-    barriers: Sequence[Barrier],
-    config: ControlConfig,
+    solver: QpSolver, state: State, posture: Cost, barriers: Sequence[Barrier], config: ControlConfig
 ) -> Choice:
     """The printed program's answer where it is solved and checks, else standstill: the paper has no second rung.
 
     slack is what a row gave way by, ``-e``; a row may also be asked for more than it needs, which costs.
     """
-    external, own = barriers
-    J, M = len(box[0]), len(external)
-    solution = solver.solve(assemble_printed(task, posture, box, external, own))
+    external, *firm = barriers
+    J, M, num_firm = len(state.q), len(external), sum(len(rows) for rows in firm)
+    solution = solver.solve(assemble_printed(state, configured_weights(config), posture, external, firm))
     if not is_usable(solution, config.max_residual):
-        return Choice(
-            velocity=np.zeros(J),
-            rung=Rung.HOLD,
-            slack=np.zeros(M + len(own)),
-            box_multipliers=np.zeros(2 * J),
-            row_multipliers=np.zeros(M + len(own)),
-            solution=solution,
-            num_refused=1,
-        )
-    slack = np.concatenate([np.maximum(-solution.z[J + 6 :], 0.0), np.zeros(len(own))])
+        return held(J, M + num_firm, solution, num_refused=1)
+    slack = np.concatenate([np.maximum(-solution.z[J + 6 :], 0.0), np.zeros(num_firm)])
     return Choice(
         velocity=solution.z[:J],
         rung=Rung.RELAXED if np.any(slack > config.slack_tolerance) else Rung.SOLVED,

@@ -9,7 +9,7 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import Stamps
+from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.checks import (
     StaticViolation,
     check_free,
@@ -22,10 +22,9 @@ from splatctrl_cli.control.checks import (
 from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
-from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.records import DistanceField, Float64, FloatRows
+from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
 
 FieldAt = Callable[[int], DistanceField]
 

@@ -8,10 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Bool, Box, Float64
+from splatctrl_cli.records import Bool, Box, Float64, Stamps
 
 DistanceToPeople = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""

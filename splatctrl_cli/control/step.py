@@ -2,20 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control import tasks
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.checks import check_coverage, check_model, checked_posture
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import JointLimits
-from splatctrl_cli.control.presets import PAPER, PrintedTask, solve_printed
+from splatctrl_cli.control.presets import PAPER, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named
 from splatctrl_cli.control.rows import RowBuilder, Rows
+from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
 SCALES = (0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none
@@ -29,14 +28,6 @@ class RowSlack:
 
     name: str
     slack: float
-
-
-class RowKind(StrEnum):
-    """What a row of the program guards."""
-
-    LIMIT = "limit"
-    SCENE = "scene"
-    SELF = "self"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +97,10 @@ class QpIkController:
         frame: str,
         home: Float64 | None = None,
         solver: QpSolver | None = None,
+        terms: Sequence[CostTerm | BarrierTerm] = (),
     ) -> None:
-        """home (J,) [rad] is leant to where the task leaves the arm free (default: the middle of the limits).
+        """home (J,) [rad] is leant to where the task leaves the arm free (default: the middle of the limits); terms
+        are added to those of the paper.
 
         Raises InputError for a robot that no controller can run with.
         """
@@ -115,13 +108,15 @@ class QpIkController:
         check_coverage(model, config)
         self._model, self._config, self._frame = model, config, frame
         self._solver: QpSolver = solver_named(config.solver) if solver is None else solver
-        self._home = np.asarray(model.middle if home is None else home, dtype=np.float64)
         self._limits = JointLimits.of(model, config)
-        self._builder = RowBuilder(model, config, field, self._limits.acceleration)
+        further = [term for term in terms if isinstance(term, BarrierTerm)]
+        self._builder = RowBuilder(model, config, field, self._limits.acceleration, further)
         self._limit_names = tuple(f"{joint} {side}" for side in ("highest", "lowest") for joint in model.joint_names)
         self._row_names = self._builder.names
-        weight = np.repeat([config.weight_linear, config.weight_angular], 3)
-        self._weight = tasks.eliminated_weight(weight, config.weight_kinematics * weight)
+        costs = [term for term in terms if not isinstance(term, BarrierTerm)]
+        home = np.asarray(model.middle if home is None else home, dtype=np.float64)
+        self._costs: tuple[CostTerm, ...] = (*standard_costs(config, home), *costs)
+        self._reach = ReachGoal.of(config)
 
     def with_field(self, field: DistanceField) -> "QpIkController":
         """The same controller on another field (a newer scene)."""
@@ -148,15 +143,23 @@ class QpIkController:
         q = checked_posture(self._model, q)
         config = self._config
         error = pose_error(self._model.frame_pose(q, self._frame), T_world_goal)
-        box, rest = self._limits.box(q, last_velocity), self._limits.rest(last_velocity)
-        rows = self._builder.at(q, box, distance_rate)
-        bias = self._bias(q, guide, last_velocity)
-        reference = self._reference(error, guide)
+        rest = self._limits.rest(last_velocity)
+        state = State(
+            model=self._model,
+            frame=self._frame,
+            q=q,
+            box=self._limits.box(q, last_velocity),
+            reference=self._reference(error, guide),
+            guide=guide,
+            last_velocity=last_velocity,
+            distance_rate=distance_rate,
+        )
+        rows = self._builder.at(state)
+        costs = [term.rows(state) for term in self._costs]
         if config.preset == PAPER:
-            printed = self._printed(q, reference, bias, box, rows)
+            printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
             return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
-        task = tasks.velocity_task(self._model.frame_jacobian(q, self._frame), reference, self._weight)
-        rows, choice, is_kept = self._descended(q, [task, bias], box, rows, distance_rate)
+        rows, choice, is_kept = self._descended(state, [*costs, self._reach.rows(state)], rows)
         scale = 1.0 if is_kept else self._kept_scale(q, choice, rows, rest)
         return self._reported(error, rows, choice, rest, scale)
 
@@ -171,8 +174,9 @@ class QpIkController:
         counts. Raises as `step`.
         """
         q = checked_posture(self._model, q)
-        room = self._builder.room(q, velocity, distance_rate)
         lowest, highest = self._limits.box(q)
+        state = State(model=self._model, frame=self._frame, q=q, box=(lowest, highest), distance_rate=distance_rate)
+        room = self._builder.room(state, velocity)
         limits = np.concatenate([highest - velocity, velocity - lowest])
         row, limit = int(np.argmin(room)), int(np.argmin(limits))
         return VelocityMargin(
@@ -190,39 +194,7 @@ class QpIkController:
         )
         return reference if guide is None else reference + guide.twist
 
-    def _bias(self, q: Float64, guide: Guide | None, last_velocity: Float64 | None) -> tasks.Cost:
-        """The optional terms of III-E: lean to a posture (on top of its own motion), and change little."""
-        config = self._config
-        lean = config.posture_gain * ((self._home if guide is None else guide.posture) - q)
-        lean = lean if guide is None else lean + guide.velocity
-        H, c = tasks.posture_task(lean, config.posture_weight)
-        if config.smoothness_weight == 0 or last_velocity is None:
-            return H, c
-        H_change, c_change = tasks.posture_task(last_velocity, config.smoothness_weight)
-        return H + H_change, c + c_change
-
-    def _printed(
-        self, q: Float64, reference: Float64, bias: tasks.Cost, box: tuple[Float64, Float64], rows: Rows
-    ) -> Choice:
-        """The answer of the program as the paper prints it."""
-        config = self._config
-        weight = np.repeat([config.weight_linear, config.weight_angular], 3)
-        task = PrintedTask(
-            reference=reference,
-            jacobian=self._model.frame_jacobian(q, self._frame),
-            weight_task=weight,
-            weight_kinematics=config.weight_kinematics * weight,
-        )
-        return solve_printed(self._solver, task, bias, box, rows.for_qp, config)
-
-    def _descended(
-        self,
-        q: Float64,
-        costs: Sequence[tasks.Cost],
-        box: tuple[Float64, Float64],
-        rows: Rows,
-        distance_rate: float | Float64,
-    ) -> tuple[Rows, Choice, bool]:
+    def _descended(self, state: State, costs: Sequence[Cost], rows: Rows) -> tuple[Rows, Choice, bool]:
         """The ladder's answer, the rows that it answers to, and whether the distances after it are as promised.
 
         Where it would bring a sphere to something else than what its row is against (a corner, a second splat), that
@@ -230,17 +202,17 @@ class QpIkController:
         """
         num_external, max_cuts = self._builder.num_external, self._config.max_cuts
         for num_cuts in range(max_cuts + 1):
-            choice = descend(self._solver, costs, box, rows.for_qp, self._config)
+            choice = descend(self._solver, costs, state.box, rows.for_qp, self._config)
             if choice.rung is Rung.HOLD:
                 break
-            later = self._builder.distances(q + self._config.period * choice.velocity)
+            later = self._builder.distances(state.q + self._config.period * choice.velocity)
             broken = self._broken(choice, rows, later)
             if not np.any(broken):
                 return rows, choice, True
             can_be_cut = broken[:num_external] & np.isfinite(later[:num_external])
             if num_cuts == max_cuts or not np.any(can_be_cut):
                 break
-            rows = self._builder.cut(rows, q, choice.velocity, np.flatnonzero(can_be_cut), distance_rate)
+            rows = self._builder.cut(rows, state, choice.velocity, np.flatnonzero(can_be_cut))
         return rows, choice, False
 
     def _broken(self, choice: Choice, rows: Rows, later: Float64) -> Bool:
@@ -303,11 +275,10 @@ class QpIkController:
         """The limits and barrier rows whose multiplier is not zero."""
         multipliers = np.concatenate([choice.box_multipliers, rows.spread(choice.row_multipliers)])
         names, num_limits = (*self._limit_names, *self._row_names), len(self._limit_names)
-        num_scene = num_limits + self._builder.num_external
         return tuple(
             Intervention(
                 name=names[i],
-                kind=RowKind.LIMIT if i < num_limits else RowKind.SCENE if i < num_scene else RowKind.SELF,
+                kind=RowKind.LIMIT if i < num_limits else self._builder.kinds[i - num_limits],
                 multiplier=float(multipliers[i]),
             )
             for i in np.flatnonzero(multipliers > MULTIPLIER)

@@ -10,12 +10,12 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import CHUNK, DistanceFunction, DistancesAt, Stamps, audit
+from splatctrl_cli.control.audit import CHUNK, DistanceFunction, DistancesAt, audit
 from splatctrl_cli.control.events import runs_of
 from splatctrl_cli.control.goals import pose_error
 from splatctrl_cli.control.replay import is_at_goal
 from splatctrl_cli.planner.path import effector_length, joint_length
-from splatctrl_cli.records import Bool, Float64, JointState
+from splatctrl_cli.records import Bool, Float64, JointState, Stamps
 
 TrueDistance = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to what is really there."""

@@ -11,9 +11,9 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, pose_error
 from splatctrl_cli.control.replay import ReplayTask
-from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.planner.birrt import PlanOutcome, plan
 from splatctrl_cli.planner.clearance import Clearance, HasDistance
 from splatctrl_cli.planner.edges import check_edges

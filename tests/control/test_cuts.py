@@ -11,7 +11,7 @@ from splatctrl_cli.control.ladder import Rung, descend
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
 from splatctrl_cli.control.rows import RowBuilder
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.control.tasks import posture_task
+from splatctrl_cli.control.terms import State, stray_cost
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.robot.model import RobotModel
 from tests.control.fakes import Balls, PlanarArm, far_away
@@ -35,6 +35,10 @@ def sample_arm() -> RobotModel:
     return RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
 
 
+def state_at(q: np.ndarray, rate: float | np.ndarray = 0.0) -> State:
+    return State(model=ARM, frame="tip", q=q, box=BOX, distance_rate=rate)
+
+
 def test_an_arm_pressed_against_a_row_of_balls_keeps_its_margin() -> None:
     trace = closed_loop(ARM, CONFIG, TASK, lambda _: BEAM)
     assert min(step.clearance for step in trace.steps) >= CONFIG.margin - CONFIG.promise_tolerance
@@ -49,9 +53,9 @@ def test_without_cuts_the_same_steps_have_to_be_scaled_back() -> None:
 
 def test_a_cut_is_the_row_of_what_is_met_after_a_period() -> None:
     q, velocity = np.array([0.7, 0.5]), np.array([0.9, -0.4])
-    later = q + CONFIG.period * velocity
+    state, later = state_at(q), q + CONFIG.period * velocity
     builder = RowBuilder(ARM, CONFIG, BEAM)
-    rows = builder.cut(builder.at(q, BOX, 0.0), q, velocity, np.array([3]), 0.0)
+    rows = builder.cut(builder.at(state), state, velocity, np.array([3]))
     assert rows.cuts is not None and list(rows.cuts.index) == [3]
 
     def clearance(posture: np.ndarray) -> float:
@@ -70,7 +74,8 @@ def test_a_cut_counts_the_rate_of_its_own_sphere() -> None:
     builder, q, velocity = RowBuilder(ARM, CONFIG, BEAM), np.array([0.7, 0.5]), np.array([0.9, -0.4])
     rate = np.array([0.0, -0.1, -0.2, -0.3])
     still, moving = (
-        builder.cut(builder.at(q, BOX, r), q, velocity, np.array([1, 3]), r).cuts for r in (np.zeros(4), rate)
+        builder.cut(builder.at(state), state, velocity, np.array([1, 3])).cuts
+        for state in (state_at(q), state_at(q, rate))
     )
     assert still is not None and moving is not None
     np.testing.assert_allclose(moving.h - still.h, rate[[1, 3]])
@@ -78,9 +83,10 @@ def test_a_cut_counts_the_rate_of_its_own_sphere() -> None:
 
 def test_cuts_add_up_and_give_their_slack_to_the_row_they_belong_to() -> None:
     builder, q, velocity = RowBuilder(ARM, CONFIG, BEAM), np.array([0.7, 0.5]), np.array([0.9, -0.4])
-    rows = builder.at(q, BOX, 0.0)
+    state = state_at(q)
+    rows = builder.at(state)
     num_rows = int(rows.in_qp.sum())
-    rows = builder.cut(builder.cut(rows, q, velocity, np.array([3]), 0.0), q, velocity, np.array([2, 3]), 0.0)
+    rows = builder.cut(builder.cut(rows, state, velocity, np.array([3])), state, velocity, np.array([2, 3]))
     assert rows.cuts is not None and list(rows.cuts.index) == [3, 2, 3]
     spread = rows.spread(np.concatenate([np.zeros(num_rows), [0.1, 0.2, 0.3]]))
     assert spread[2] == 0.2 and spread[3] == 0.3 and np.count_nonzero(spread) == 2
@@ -130,12 +136,12 @@ def distances(q: np.ndarray, field: Balls) -> np.ndarray:
 def test_a_sphere_outside_its_margin_does_not_give_way_to_those_within(outside_later: float, is_broken: bool) -> None:
     """One sphere, 1 cm within its margin, gains 9 mm: all lack less even where another breaks its row."""
     controller = QpIkController(ARM, CONFIG, BEAM, frame="tip")
-    rows = controller._builder.at(TASK.start, BOX, 0.0)
+    rows = controller._builder.at(state_at(TASK.start))
     distance = np.full(len(rows.external), 0.5)
     distance[:2] = [0.01, 0.05]
     external = replace(rows.external, distance=distance, h=CONFIG.barrier_gain * (distance - CONFIG.margin))
-    rows = replace(rows, external=external)
-    choice = descend(controller._solver, [posture_task(np.zeros(2), 1.0)], BOX, rows.for_qp, CONFIG)
+    rows = replace(rows, barriers=(external, rows.own))
+    choice = descend(controller._solver, [stray_cost(np.zeros(2), 1.0)], BOX, rows.for_qp, CONFIG)
     choice = replace(choice, slack=np.zeros(int(rows.in_qp.sum())))
     later = rows.distance.copy()
     later[:2] = [0.019, outside_later]

@@ -19,7 +19,8 @@ from splatctrl_cli.control.events import (
 )
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.signals import audit_signals, stale_signal, step_signals
-from splatctrl_cli.control.step import ControlStep, Intervention, QpIkController, RowKind, RowSlack
+from splatctrl_cli.control.step import ControlStep, Intervention, QpIkController, RowSlack
+from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import JointState
 from tests.control.fakes import Balls, PlanarArm, far_away
 

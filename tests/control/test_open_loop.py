@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.open_loop import OpenLoopTask, OpenLoopTrace, is_shaped, open_loop
-from splatctrl_cli.control.step import RowKind
+from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import DistanceField, Float64
 from tests.control.fakes import PlanarArm, Plane, far_away
 

@@ -9,7 +9,8 @@ import pytest
 from splatctrl_cli.config import ControlConfig, load_config
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.presets import applied
-from splatctrl_cli.control.step import QpIkController, RowKind
+from splatctrl_cli.control.step import QpIkController
+from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel

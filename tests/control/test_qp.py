@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.barriers import Barrier, can_bind
+from splatctrl_cli.control.barriers import can_bind
 from splatctrl_cli.control.ladder import Rung, assemble, assemble_hard, descend
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QuadraticProgram, residuals, solver_named
-from splatctrl_cli.control.tasks import Cost, eliminated_weight, posture_task, velocity_task
+from splatctrl_cli.control.terms import Barrier, Cost, eliminated_weight, reach_cost, stray_cost
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import Float64
 from tests.reference.control import literal_program
@@ -21,7 +21,7 @@ def barrier(G: Float64, h: Float64) -> Barrier:
 
 def seven_joint_costs(rng: np.random.Generator) -> tuple[Float64, Float64, Float64, Float64, list[Cost]]:
     J, u, Q, R = rng.normal(size=(6, 7)), 0.3 * rng.normal(size=6), rng.uniform(1, 9, 6), rng.uniform(1, 9, 6)
-    costs = [velocity_task(J, u, eliminated_weight(Q, R)), posture_task(0.1 * np.ones(7), 1e-3)]
+    costs = [reach_cost(J, u, eliminated_weight(Q, R)), stray_cost(0.1 * np.ones(7), 1e-3)]
     return J, u, Q, R, costs
 
 
@@ -39,7 +39,7 @@ def test_eliminating_the_end_effector_velocity_leaves_the_literal_solution(seed:
 def test_slack_costs_what_its_barrier_says() -> None:
     slack = np.array([0.3, 0.0, 2.0])
     program = assemble(
-        [posture_task(np.zeros(2), 1.0)], -np.ones(2), np.ones(2), [barrier(np.ones((3, 2)), np.ones(3))]
+        [stray_cost(np.zeros(2), 1.0)], -np.ones(2), np.ones(2), [barrier(np.ones((3, 2)), np.ones(3))]
     )
     z = np.concatenate([np.zeros(2), slack])
     cost = 0.5 * z @ program.H @ z + program.c @ z
@@ -76,7 +76,7 @@ def test_the_slack_is_exact_where_the_rows_can_hold() -> None:
 def test_rows_that_contradict_each_other_give_way_by_what_is_missing() -> None:
     G, h = np.array([[1.0], [-1.0]]), np.array([-0.1, -0.3])
     solution = ClarabelSolver().solve(
-        assemble([posture_task(np.zeros(1), 1e-3)], np.array([-1.0]), np.array([1.0]), [barrier(G, h)])
+        assemble([stray_cost(np.zeros(1), 1e-3)], np.array([-1.0]), np.array([1.0]), [barrier(G, h)])
     )
     assert solution.is_solved
     assert solution.z[1] + solution.z[2] == pytest.approx(0.4, abs=1e-6)
@@ -84,7 +84,7 @@ def test_rows_that_contradict_each_other_give_way_by_what_is_missing() -> None:
 
 def test_one_row_dearer_than_its_slack_gives_way_whatever_the_others_cost() -> None:
     rows = replace(barrier(np.ones((2, 1)), np.array([0.0, 5.0])), slack_cost=0.1)
-    wanted = [posture_task(np.ones(1), 1e3)]
+    wanted = [stray_cost(np.ones(1), 1e3)]
     choice = descend(DaqpSolver(), wanted, (np.array([-1.0]), np.array([1.0])), [rows], ControlConfig())
     assert choice.rung is Rung.RELAXED
     assert choice.velocity[0] > 0.5
@@ -92,7 +92,7 @@ def test_one_row_dearer_than_its_slack_gives_way_whatever_the_others_cost() -> N
 
 def test_a_degenerate_box_is_solved() -> None:
     solution = ClarabelSolver().solve(
-        assemble([posture_task(np.zeros(2), 1.0)], np.array([-1.5, -1.0]), np.array([-1.5, 1.0]), [])
+        assemble([stray_cost(np.zeros(2), 1.0)], np.array([-1.5, -1.0]), np.array([-1.5, 1.0]), [])
     )
     assert solution.is_solved
     np.testing.assert_allclose(solution.z, [-1.5, 0.0], atol=1e-6)

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.barriers import BRAKING_SHARE, scene_margin
 from splatctrl_cli.control.limits import JointLimits, box_rows
-from splatctrl_cli.control.presets import PrintedTask, assemble_printed
-from splatctrl_cli.control.rows import BRAKING_SHARE, RowBuilder, Rows, scene_margin
+from splatctrl_cli.control.presets import assemble_printed
+from splatctrl_cli.control.rows import RowBuilder, Rows
 from splatctrl_cli.control.scene_field import SceneStep, distance_rate
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.control.tasks import posture_task
+from splatctrl_cli.control.terms import State, stray_cost
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
@@ -51,8 +52,12 @@ def wide(arm: RobotModel) -> tuple[Float64, Float64]:
     return np.full(arm.num_joints, -1e3), np.full(arm.num_joints, 1e3)
 
 
+def state_at(arm: RobotModel, q: Float64, rate: float | Float64 = 0.0) -> State:
+    return State(model=arm, frame=arm.frame_names[-1], q=q, box=wide(arm), distance_rate=rate)
+
+
 def rows_of(arm: RobotModel, field: Balls | Plane, q: Float64, rate: float = 0.0, **options: object) -> Rows:
-    return RowBuilder(arm, CONFIG, field, **options).at(q, wide(arm), rate)  # type: ignore[arg-type]
+    return RowBuilder(arm, CONFIG, field, **options).at(state_at(arm, q, rate))  # type: ignore[arg-type]
 
 
 def slopes(arm: RobotModel, field: Balls | Plane, q: Float64) -> Float64:
@@ -93,7 +98,7 @@ def test_what_is_left_of_a_row_is_its_promise_along_any_velocity(arm: RobotModel
         ahead, behind = builder.distances(q + STEP * velocity), builder.distances(q - STEP * velocity)
         margin = np.where(np.arange(len(ahead)) < builder.num_external, CONFIG.margin, CONFIG.self_margin)
         promise = 10.0 * (builder.distances(q) - margin) + (ahead - behind) / (2 * STEP)
-        np.testing.assert_allclose(builder.room(q, velocity, 0.0), promise, atol=1e-7)
+        np.testing.assert_allclose(builder.room(state_at(arm, q), velocity), promise, atol=1e-7)
 
 
 def test_a_row_with_limited_braking_asks_for_the_room_that_braking_takes(arm: RobotModel) -> None:
@@ -113,7 +118,7 @@ def test_a_row_with_limited_braking_asks_for_the_room_that_braking_takes(arm: Ro
         builder = RowBuilder(arm, CONFIG, ROOM, acceleration)
         velocity = np.full(arm.num_joints, 0.3)
         G_all = np.concatenate([rows.external.G, rows.own.G])
-        np.testing.assert_allclose(builder.room(q, velocity, 0.0), rows.h - G_all @ velocity, atol=1e-12)
+        np.testing.assert_allclose(builder.room(state_at(arm, q), velocity), rows.h - G_all @ velocity, atol=1e-12)
 
 
 def test_the_rate_of_a_row_is_the_derivative_of_its_distance_in_time(arm: RobotModel) -> None:
@@ -127,7 +132,7 @@ def test_the_rate_of_a_row_is_the_derivative_of_its_distance_in_time(arm: RobotM
     expected = -(away @ speed) / np.linalg.norm(away, axis=1)
     np.testing.assert_allclose(rate, np.minimum(expected, 0.0), atol=1e-3)
     assert np.min(expected) < -0.1 < 0.1 < np.max(expected)
-    still, coming = rows_of(arm, ROOM, q), RowBuilder(arm, CONFIG, ROOM).at(q, wide(arm), rate)
+    still, coming = rows_of(arm, ROOM, q), RowBuilder(arm, CONFIG, ROOM).at(state_at(arm, q, rate))
     np.testing.assert_allclose(coming.external.h - still.external.h, rate, atol=1e-12)
     np.testing.assert_array_equal(coming.own.h, still.own.h)
 
@@ -147,14 +152,9 @@ def test_a_limit_row_is_less_the_derivative_of_the_way_to_the_limit(arm: RobotMo
 
 def test_the_printed_rows_hold_the_same_derivatives_and_give_way_outside_alone(arm: RobotModel) -> None:
     q, J = postures(arm, 1)[0], arm.num_joints
-    rows, frame = rows_of(arm, ROOM, q), arm.frame_names[-1]
-    task = PrintedTask(
-        reference=np.zeros(6),
-        jacobian=arm.frame_jacobian(q, frame),
-        weight_task=np.ones(6),
-        weight_kinematics=np.ones(6),
-    )
-    program = assemble_printed(task, posture_task(np.zeros(J), 1e-3), wide(arm), rows.external, rows.own)
+    rows, state = rows_of(arm, ROOM, q), state_at(arm, q)
+    bias, ones = stray_cost(np.zeros(J), 1e-3), np.ones(6)
+    program = assemble_printed(state, (ones, ones), bias, rows.external, [rows.own])
     by_difference, M = slopes(arm, ROOM, q), len(rows.external)
     np.testing.assert_allclose(program.G[2 * J :, :J], -by_difference, atol=2e-8)
     np.testing.assert_array_equal(program.G[2 * J : 2 * J + M, J + 6 :], np.eye(M))
@@ -163,7 +163,7 @@ def test_the_printed_rows_hold_the_same_derivatives_and_give_way_outside_alone(a
     z = np.random.default_rng(0).normal(size=len(program.c))
     v, x = z[:J], z[J : J + 6]
     value = 0.5 * z @ program.H @ z + program.c @ z
-    gap = x - task.jacobian @ v
+    gap = x - state.jacobian @ v
     printed = x @ x + gap @ gap + CONFIG.weight_slack * z[J + 6 :] @ z[J + 6 :] + 1e-3 * v @ v
     assert value == pytest.approx(printed)
 
@@ -174,8 +174,8 @@ def test_the_margin_of_a_row_grows_by_what_its_body_leaves_uncovered_where_that_
     wanted = replace(CONFIG, coverage="margin")
     np.testing.assert_allclose(scene_margin(arm, CONFIG), 0.02)
     np.testing.assert_allclose(scene_margin(arm, wanted)[1:], [0.03, 0.03, 0.05, 0.02])
-    box = np.full(2, -9.0), np.full(2, 9.0)
-    plain, wider = (RowBuilder(arm, config, far_away()).at(q, box, 0.0) for config in (CONFIG, wanted))
+    state = State(model=arm, frame="tip", q=q, box=(np.full(2, -9.0), np.full(2, 9.0)))
+    plain, wider = (RowBuilder(arm, config, far_away()).at(state) for config in (CONFIG, wanted))
     np.testing.assert_allclose(plain.external.h - wider.external.h, [0.1, 0.1, 0.3, 0.0], atol=1e-12)
     np.testing.assert_array_equal(plain.own.h, wider.own.h)
     arm.sphere_deficit[3] = np.nan

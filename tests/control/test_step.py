@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control import rows
+from splatctrl_cli.control import barriers
 from splatctrl_cli.control.checks import static_violations
 from splatctrl_cli.control.ladder import Rung, is_usable
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
-from splatctrl_cli.control.step import MULTIPLIER, QpIkController, RowKind
+from splatctrl_cli.control.step import MULTIPLIER, QpIkController
+from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.records import DistanceField, Float64
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away
@@ -307,7 +308,7 @@ def test_an_arm_that_cannot_stop_at_once_keeps_its_margin_by_looking_ahead(
         return min(clearance)
 
     assert CONFIG.margin - 1e-4 < least() < CONFIG.margin + 1e-3
-    monkeypatch.setattr(rows, "braking_speed", lambda room, gain, *_: gain * room)
+    monkeypatch.setattr(barriers, "braking_speed", lambda room, gain, *_: gain * room)
     assert least() < CONFIG.margin - 5e-3
 
 

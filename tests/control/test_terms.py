@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.barriers import (
     barrier_bound,
@@ -10,14 +11,15 @@ from splatctrl_cli.control.barriers import (
     external_gradient,
     fastest_approach,
     is_immovable,
-    pair_distance,
     pair_gradient,
 )
 from splatctrl_cli.control.goals import pose_error, reference_velocity, rotation_vector
 from splatctrl_cli.control.limits import box_rows, velocity_box
-from splatctrl_cli.control.tasks import posture_task, velocity_task
+from splatctrl_cli.control.step import ControlStep, QpIkController
+from splatctrl_cli.control.terms import Barrier, BarrierTerm, Cost, CostTerm, State, reach_cost, stray_cost
 from splatctrl_cli.geometry import rotation_from_quat, transform_from
-from tests.control.fakes import Balls, PlanarArm, Plane
+from splatctrl_cli.kernels.chain import pair_gaps
+from tests.control.fakes import Balls, PlanarArm, Plane, far_away
 
 STEP = 1e-6
 
@@ -35,16 +37,16 @@ def test_external_gradient_is_the_derivative_of_the_sphere_clearance(field: Ball
 def test_pair_gradient_is_the_derivative_of_the_pair_distance() -> None:
     arm, q = PlanarArm(), np.array([0.4, 2.1])
     radii = arm.sphere_set.radii
-    direction = pair_distance(arm.sphere_centers(q), radii, arm.pairs)[1]
+    direction = pair_gaps(arm.sphere_centers(q), radii, arm.pairs)[1]
     gradient = pair_gradient(direction, arm.sphere_jacobians(q), arm.pairs)
     for joint in range(2):
         step = STEP * np.eye(2)[joint]
-        ahead, behind = (pair_distance(arm.sphere_centers(q + s * step), radii, arm.pairs)[0] for s in (1, -1))
+        ahead, behind = (pair_gaps(arm.sphere_centers(q + s * step), radii, arm.pairs)[0] for s in (1, -1))
         np.testing.assert_allclose(gradient[:, joint], (ahead - behind) / (2 * STEP), atol=1e-8)
 
 
 def test_pair_distance_counts_both_radii() -> None:
-    distance, direction = pair_distance(np.array([[0.0, 0, 0], [0, 3, 4]]), np.array([1.0, 0.5]), np.array([[0, 1]]))
+    distance, direction = pair_gaps(np.array([[0.0, 0, 0], [0, 3, 4]]), np.array([1.0, 0.5]), np.array([[0, 1]]))
     assert distance[0] == pytest.approx(3.5)
     np.testing.assert_allclose(direction[0], [0, -0.6, -0.8])
 
@@ -93,9 +95,9 @@ def test_box_rows_say_the_same_as_the_box() -> None:
 def test_task_costs_are_the_printed_squares_up_to_a_constant() -> None:
     rng = np.random.default_rng(0)
     J, u, w, v = rng.normal(size=(6, 7)), rng.normal(size=6), rng.uniform(0.5, 2, 6), rng.normal(size=7)
-    H, c = velocity_task(J, u, w)
+    H, c = reach_cost(J, u, w)
     assert 0.5 * v @ H @ v + c @ v + u @ (w * u) == pytest.approx((u - J @ v) @ (w * (u - J @ v)))
-    H, c = posture_task(u, 0.3)
+    H, c = stray_cost(u, 0.3)
     assert 0.5 * u @ H @ u + c @ u + 0.3 * u @ u == pytest.approx(0.0)
 
 
@@ -129,3 +131,38 @@ def test_the_reference_is_capped_in_norm_and_keeps_its_direction() -> None:
 
 def test_spheres_are_named_by_link_and_place() -> None:
     assert sphere_names(PlanarArm().sphere_set) == ("base[0]", "upper[0]", "upper[1]", "fore[0]", "fore[1]")
+
+
+class HoldElbow:
+    """A cost of one's own: the elbow stays still."""
+
+    def rows(self, state: State) -> Cost:
+        return np.diag([0.0, 1e4]), np.zeros(2)
+
+
+class SlowShoulder(BarrierTerm):
+    """Rows of one's own: the shoulder turns at most 0.05 rad/s either way."""
+
+    names = ("shoulder forwards", "shoulder backwards")
+
+    def rows(self, state: State) -> Barrier:
+        G, h = np.array([[1.0, 0.0], [-1.0, 0.0]]), np.full(2, 0.05)
+        far = np.full(2, np.inf)
+        return Barrier(index=np.arange(2), G=G, h=h, distance=far, slack_cost=1e6, slack_weight=1.0)
+
+
+@pytest.mark.parametrize("preset", ["reduced", "paper"])
+def test_terms_of_ones_own_add_up_with_those_of_the_paper(preset: str) -> None:
+    arm, q = PlanarArm(), np.array([0.3, 0.9])
+    config, goal = ControlConfig(preset=preset), arm.frame_pose(np.array([0.9, 1.4]), "tip")
+
+    def stepped(*terms: CostTerm | BarrierTerm) -> ControlStep:
+        return QpIkController(arm, config, far_away(), frame="tip", terms=terms).step(q, goal)
+
+    plain, held, slow = stepped(), stepped(HoldElbow()), stepped(SlowShoulder())
+    assert np.all(np.abs(plain.velocity) > 0.1) and not plain.interventions
+    assert abs(held.velocity[1]) < 0.01 and abs(held.velocity[0]) > 0.1
+    assert slow.velocity[0] == pytest.approx(-0.05, abs=1e-6) and slow.scale == 1.0
+    assert [row.name for row in slow.interventions] == ["shoulder backwards"]
+    both = stepped(HoldElbow(), SlowShoulder())
+    assert abs(both.velocity[0]) <= 0.05 + 1e-6 and abs(both.velocity[1]) < 0.01

@@ -15,7 +15,7 @@ from itertools import islice
 import numpy as np
 
 from splatctrl_cli.config.motion import VerdictConfig
-from splatctrl_cli.control.audit import DistanceFunction, Stamps
+from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.reconstruction import SAME_MOMENT_NS, training_cameras
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.store import StoredAudit
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame
+from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps
 from splatctrl_cli.scene_files.scene_folder import open_scene

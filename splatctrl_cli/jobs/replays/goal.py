@@ -11,7 +11,6 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.audit import Stamps
 from splatctrl_cli.control.checks import checked_posture
 from splatctrl_cli.control.goals import TwistTrack
 from splatctrl_cli.control.replay import Waypoint
@@ -20,7 +19,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.records import Float64, FloatRows
+from splatctrl_cli.records import Float64, FloatRows, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.states.twists import read_twists
 

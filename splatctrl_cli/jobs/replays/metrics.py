@@ -13,7 +13,7 @@ from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.motion_limits import WINDOW
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
-from splatctrl_cli.control.step import RowKind
+from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.evaluate.clearance import ClearanceAgreement
 from splatctrl_cli.evaluate.metrics import (
     LARGEST,

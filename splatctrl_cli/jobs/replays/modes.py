@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.audit import Stamps
+from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.checks import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
-from splatctrl_cli.control.rows import scene_margin
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replays.compare import compared, planned_ways_out
@@ -24,7 +23,7 @@ from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRe
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
 

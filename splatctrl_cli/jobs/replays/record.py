@@ -7,7 +7,7 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.audit import AuditTrace, Clearance, Stamps, audited, moving_clearance
+from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance
 from splatctrl_cli.control.checks import static_clearance
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
@@ -17,7 +17,7 @@ from splatctrl_cli.control.signals import audit_signals, interval_signals, limit
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replays.store import BLOCK, Figures, StoredAudit, StoredObjects
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.control.audit import AuditTrace, Clearance
 from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
-from splatctrl_cli.control.step import ControlStep, RowKind, VelocityMargin
+from splatctrl_cli.control.step import ControlStep, VelocityMargin
+from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.files.rows import IN_MEMORY, RowFile, Rows, scratch_folder
 from splatctrl_cli.records import Float64, FloatRows
 

@@ -1,0 +1,219 @@
+"""The terms of the QP of III-E: each adds a cost or rows over the joint velocities, and the solver only adds them up.
+
+A term of one's own is one class: a cost has ``rows(state) -> (H, c)``, a constraint is a `BarrierTerm`, with rows
+``G v - s <= h``. `QpIkController` takes them beside those of the paper.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.goals import Guide
+from splatctrl_cli.records import Float64
+
+Cost = tuple[Float64, Float64]
+"""H (J, J) and c (J,) of a cost ``1/2 v' H v + c' v`` over joint velocities v (J,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What a term sees of a step: the configuration q (J,) [rad], the box of velocities (J,), (J,) [rad/s] that the
+    limits allow, the velocity (6,) [m/s, rad/s] that `frame` should reach, how its goal moves (None: it stands
+    still), the last velocity (J,) [rad/s] (None: not known), and dd/dt [m/s] of the moving spheres' distances, (M,)
+    or one number.
+    """
+
+    model: ArmModel
+    frame: str
+    q: Float64
+    box: tuple[Float64, Float64]
+    reference: Float64 = field(default_factory=lambda: np.zeros(6))
+    guide: Guide | None = None
+    last_velocity: Float64 | None = None
+    distance_rate: float | Float64 = 0.0
+
+    @cached_property
+    def jacobian(self) -> Float64:
+        """(6, J) of the frame."""
+        return self.model.frame_jacobian(self.q, self.frame)
+
+    @cached_property
+    def spheres(self) -> tuple[Float64, Float64]:
+        """Centres (S, 3) [m] of all spheres and their Jacobians (S, 3, J)."""
+        return self.model.spheres_at(self.q)
+
+
+class CostTerm(Protocol):
+    """A term that draws the velocity somewhere."""
+
+    def rows(self, state: State) -> Cost:
+        """H and c."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReachGoal:
+    """The first two terms of III-E, ``(u - J v)' W (u - J v)``, u the reference; weight (6,) is the diagonal of W."""
+
+    weight: Float64
+
+    @classmethod
+    def of(cls, config: ControlConfig) -> "ReachGoal":
+        """With what is left of the configured Q and R."""
+        Q, R = configured_weights(config)
+        return cls(weight=eliminated_weight(Q, R))
+
+    def rows(self, state: State) -> Cost:
+        """See `CostTerm`."""
+        return reach_cost(state.jacobian, state.reference, self.weight)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeanHome:
+    """The home bias of III-E, which also makes the QP of a redundant arm strictly convex: towards home (J,) [rad], or
+    the posture of the goal's guide on top of that posture's own motion.
+    """
+
+    home: Float64
+    gain: float
+    weight: float
+
+    def rows(self, state: State) -> Cost:
+        """See `CostTerm`."""
+        if state.guide is None:
+            return stray_cost(self.gain * (self.home - state.q), self.weight)
+        return stray_cost(self.gain * (state.guide.posture - state.q) + state.guide.velocity, self.weight)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChangeLittle:
+    """The smoothness: strays little from the last velocity, where that is known."""
+
+    weight: float
+
+    def rows(self, state: State) -> Cost:
+        """See `CostTerm`."""
+        if state.last_velocity is None:
+            return stray_cost(np.zeros(len(state.q)), 0.0)
+        return stray_cost(state.last_velocity, self.weight)
+
+
+def standard_costs(config: ControlConfig, home: Float64) -> tuple[CostTerm, ...]:
+    """The optional costs of III-E, beside the goal's."""
+    lean = LeanHome(home=home, gain=config.posture_gain, weight=config.posture_weight)
+    return (lean, ChangeLittle(weight=config.smoothness_weight)) if config.smoothness_weight > 0 else (lean,)
+
+
+def configured_weights(config: ControlConfig) -> tuple[Float64, Float64]:
+    """The diagonals (6,) of Q and R."""
+    Q = np.repeat([config.weight_linear, config.weight_angular], 3)
+    return Q, config.weight_kinematics * Q
+
+
+def eliminated_weight(weight_task: Float64, weight_kinematics: Float64) -> Float64:
+    """The weight (6,) that is left when the end-effector velocity and its slack are eliminated from III-E.
+
+    ``min over d of (e - d)' Q (e - d) + d' R d`` is ``e' W e`` with ``W = (Q^-1 + R^-1)^-1``; Q, R diagonal (6,).
+    """
+    return np.asarray(1.0 / (1.0 / weight_task + 1.0 / weight_kinematics))
+
+
+def reach_cost(jacobian: Float64, velocity: Float64, weight: Float64) -> Cost:
+    """The cost ``(u - J v)' W (u - J v)`` of missing the end-effector velocity u.
+
+    jacobian (6, J); velocity u (6,) [m/s, rad/s], world; weight (6,), the diagonal of W.
+    """
+    weighted = jacobian.T * weight
+    return 2.0 * weighted @ jacobian, -2.0 * weighted @ velocity
+
+
+def stray_cost(velocity: Float64, weight: float) -> Cost:
+    """The cost ``weight |v - velocity|^2`` of straying from a joint velocity (J,) [rad/s]."""
+    return 2.0 * weight * np.eye(len(velocity)), -2.0 * weight * velocity
+
+
+def summed(costs: Sequence[Cost]) -> Cost:
+    """All costs as one."""
+    H, c = np.zeros_like(costs[0][0]), np.zeros_like(costs[0][1])
+    for cost_H, cost_c in costs:
+        H += cost_H
+        c += cost_c
+    return H, c
+
+
+class RowKind(StrEnum):
+    """What a row of the program guards."""
+
+    LIMIT = "limit"
+    SCENE = "scene"
+    SELF = "self"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Barrier:
+    """M barrier rows ``G v - s <= h`` with ``G = -dd/dq`` (M, J) and ``h = alpha (d - epsilon) + dd/dt`` (M,).
+
+    distance d (M,) [m]; index (M,) is each row's place in its catalogue of names (sphere, or sphere pair).
+    The cost of slack is ``slack_cost * s + slack_weight * s^2`` per row [s in m/s].
+    """
+
+    index: NDArray[np.integer]
+    G: Float64
+    h: Float64
+    distance: Float64
+    slack_cost: float
+    slack_weight: float
+
+    def __len__(self) -> int:
+        return len(self.h)
+
+    def select(self, rows: NDArray[np.bool_]) -> "Barrier":
+        """The rows where `rows` (M,) is true, in order."""
+        return replace(self, index=self.index[rows], G=self.G[rows], h=self.h[rows], distance=self.distance[rows])
+
+    def joined(self, other: "Barrier") -> "Barrier":
+        """These rows and then those of `other`, at the same cost of slack."""
+        return replace(
+            self,
+            index=np.concatenate([self.index, other.index]),
+            G=np.concatenate([self.G, other.G]),
+            h=np.concatenate([self.h, other.h]),
+            distance=np.concatenate([self.distance, other.distance]),
+        )
+
+
+class BarrierTerm(ABC):
+    """A term that bounds the velocity by M rows; `names` say what each guards.
+
+    One that is not against a distance has `rows` alone: its distance is then infinite, so that no step is measured by
+    it again.
+    """
+
+    kind = RowKind.LIMIT
+    names: tuple[str, ...]
+
+    @property
+    def margin(self) -> Float64:
+        """(M,) [m] that the rows keep."""
+        return np.zeros(len(self.names))
+
+    @abstractmethod
+    def rows(self, state: State) -> Barrier:
+        """Every row, in the order of the names."""
+
+    def room(self, state: State, velocity: Float64) -> Float64:
+        """``h - G v`` (M,) [m/s] of a velocity (J,)."""
+        rows = self.rows(state)
+        return np.asarray(rows.h - rows.G @ velocity)
+
+    def distances(self, centers: Float64) -> Float64:
+        """Every row's distance (M,) [m] with spheres at centers (S, 3), NaN where it is not known."""
+        return np.full(len(self.names), np.inf)
