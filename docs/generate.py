@@ -1,5 +1,5 @@
 """Writes docs/cli.md from the parser, docs/config.md from what the configuration declares, and the tables that the
-registries of formats and layouts make in other pages, for `make docs`.
+registries of formats, layouts and checks make in other pages, for `make docs`.
 
 The pages are made from the parser itself and not from its printed help, whose wrapping depends on the terminal and on
 the version of Python.
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from splatctrl_cli import config
+from splatctrl_cli.checks.finding import CHECKS, Check
 from splatctrl_cli.cli.main import EXIT_CODES, build_parser
 from splatctrl_cli.config.declared import OneOf, Section
 from splatctrl_cli.config.load import type_name
@@ -34,11 +35,14 @@ SHARED_BY = 3  # commands with the same option, in the same words, from which on
 INPUT = "input"  # the group of options that say how a recording is read
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:\|.*\n)*)")
-REGISTRIES: dict[str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout | Criterion[Judged]]]] = {
+REGISTRIES: dict[
+    str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout | Check | Criterion[Judged]]]
+] = {
     "splat_files": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
     "grid_files": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
     "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
     "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
+    "checks": (("code", "what it means", "severity"), CHECKS.values()),
 }
 
 
@@ -50,7 +54,10 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """The text of each generated page, by file name."""
-    tabled = {name: (DOCS / name).read_text(encoding="utf-8") for name in ("artefacts.md", "input.md", "verdict.md")}
+    tabled = {
+        name: (DOCS / name).read_text(encoding="utf-8")
+        for name in ("artefacts.md", "check.md", "input.md", "verdict.md")
+    }
     filled = {name: TABLE.sub(_filled, text) for name, text in tabled.items()}
     return {"cli.md": cli_page(), "config.md": config_page(), **filled}
 

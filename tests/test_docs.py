@@ -41,7 +41,7 @@ def generated() -> dict[str, str]:
     return pages
 
 
-@pytest.mark.parametrize("name", ["cli.md", "config.md", "artefacts.md", "input.md", "verdict.md"])
+@pytest.mark.parametrize("name", ["cli.md", "config.md", "artefacts.md", "check.md", "input.md", "verdict.md"])
 def test_generated_pages_are_what_make_docs_writes_now(name: str) -> None:
     assert (ROOT / "docs" / name).read_text(encoding="utf-8") == generated()[name], "run: make docs"
 

@@ -1,4 +1,4 @@
-"""Whether intrinsics fit the images, distortion is known, and tf places every frame."""
+"""Whether colour and depth pair, intrinsics fit the images, distortion is known, and tf places every frame."""
 
 import math
 from collections.abc import Sequence
@@ -8,8 +8,10 @@ import numpy as np
 
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.logs.decoder import CAMERA_INFO
+from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS
+from splatctrl_cli.logs.rig import Camera, intrinsics_of, nearest_gap_ns
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.logs.tf_tree import MAX_GAP_NS
 from splatctrl_cli.records import Float64, Intrinsics
@@ -21,6 +23,11 @@ FIELD_OF_VIEW = (20.0, 140.0)  # [deg], horizontal
 MAX_POSES = 20_000  # of a camera that are looked up
 JUMP = 0.2  # [m] in a frame, as `reconstruct` refuses them
 JUMP_RATIO = 10.0  # times the median step
+MIN_PAIRED = 0.95  # of the images of the rarer topic
+LATE_PAIR = 0.010  # [s] between colour and depth at which an arm at 1 m/s is 1 cm apart
+MAX_PAIRED = 20_000  # stamps of a topic that are paired
+FEWEST = 5  # images that a rate is judged by
+SLOWER = 1.5  # of the images of one topic that the other has at least, for a note
 NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
 
@@ -179,3 +186,60 @@ def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 
             remedy = "two publishers of one frame, or a localisation that was corrected; reconstruct refuses it"
             findings.append(error("pose-jump", where, text, remedy, value=longest, unit="m", stamp_ns=at))
     return findings
+
+
+def camera_findings(
+    found: Survey, topics: CameraTopics, camera: Camera | None, options: SourceOptions
+) -> list[Finding]:
+    """Pairs, lens and poses of one camera."""
+    findings = [*_pairing(found, topics, options), *_lens(found, topics, options)]
+    if camera is None or camera.fixed_pose is not None:
+        return findings
+    stamps = sorted(found.topics[topics.color].stamps_ns)[:MAX_POSES]
+    tolerance_ns = round(options.pose_tolerance_s * 1e9)
+    poses = [camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in stamps]
+    return [*findings, *pose_findings(f"camera {topics.name}", stamps, poses)]
+
+
+def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> list[Finding]:
+    where = f"camera {camera.name}"
+    color, depth = (found.topics[t].stamps_ns[:MAX_PAIRED] for t in (camera.color, camera.depth))
+    pairs = pair_by_stamp(color, depth, round(options.pairing_tolerance_s * 1e9))
+    rarer, other = sorted((len(color), len(depth)))
+    if not pairs or not rarer:
+        gap = nearest_gap_ns(color, depth) * 1e-9
+        text = f"no colour image has a depth image of its time; the closest are {1e3 * gap:.4g} ms apart"
+        remedy = f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right"
+        return [error("pairing", where, text, remedy, value=1e3 * gap, unit="ms")]
+    findings = []
+    if len(pairs) < MIN_PAIRED * rarer:
+        text = f"{len(pairs)} of {rarer} images find a partner within {1e3 * options.pairing_tolerance_s:g} ms"
+        remedy = "let the driver synchronise colour and depth, or give --pairing-tolerance"
+        findings.append(warning("pairing", where, text, remedy, value=len(pairs) / rarer))
+    if other > SLOWER * rarer and rarer >= FEWEST and max(len(color), len(depth)) < MAX_PAIRED:
+        names = ("depth", "colour") if len(depth) < len(color) else ("colour", "depth")
+        text = f"{rarer} {names[0]} images to {other} of {names[1]}: {other - len(pairs)} {names[1]} images go unused"
+        remedy = "record both at one rate; more frames show more, and what moves is seen sooner"
+        findings.append(note("rates-differ", where, text, remedy, value=rarer / other))
+    offset = float(np.median([depth[j] - color[i] for i, j in pairs])) * 1e-9
+    if abs(offset) > LATE_PAIR:
+        text = f"depth is stamped {1e3 * offset:+.1f} ms against its colour image (median)"
+        remedy = "let the driver synchronise colour and depth: what moves is in two places"
+        findings.append(note("pair-offset", where, text, remedy, value=1e3 * offset, unit="ms"))
+    return findings
+
+
+def _lens(found: Survey, topics: CameraTopics, options: SourceOptions) -> list[Finding]:
+    """Of the lens that is used: the one given, else the CameraInfo's; and of depth's own."""
+    where, image = f"camera {topics.name}", found.topics[topics.color].first_image
+    given = options.intrinsics.get(topics.name)
+    if given is not None and image is not None:
+        fx, fy, cx, cy = given
+        lens = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=image.width, height=image.height)
+        return lens_findings(where, lens, "--intrinsics")
+    found_by: list[Finding] = []
+    for name in dict.fromkeys(name for name in (topics.info, topics.depth_info) if name):
+        calibration = found.topics[name].calibration
+        if calibration is not None and calibration.width:
+            found_by += lens_findings(where, intrinsics_of(calibration), name)
+    return found_by

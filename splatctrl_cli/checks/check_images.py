@@ -1,4 +1,7 @@
-"""What images hold: whether they decode, their encodings and sizes, how much depth and how far."""
+"""What images hold: encodings, sizes, how much depth and how far, and whether the edges of colour and depth meet.
+
+Where they do not, depth is of another camera, or not registered.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -7,10 +10,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.checks.finding import Finding, Thinned, error, note, warning
+from splatctrl_cli.checks.check_times import Thinned
+from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.shot import PLAUSIBLE_DEPTH
-from splatctrl_cli.records import Float32, Intrinsics, UInt8
+from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8
 
 ROWS = 240  # that a kept depth image has at most
 NUM_KEPT = 12  # depth images of a camera
@@ -20,6 +24,13 @@ NUM_DECODED = 300
 LITTLE_DEPTH, SOME_DEPTH = 0.10, 0.5  # of the pixels
 SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
 TABLE_DEPTH = (0.15, 8.0)  # [m] between which a median is no surprise
+NUM_FRAMES = 4  # of a camera
+EDGE_STEP = 0.05  # of the depth, across an edge
+BORDER = 3  # [px] that are left out
+CLEAR, AHEAD = 0.2, 1.35  # correlation of a peak, and how far above the next one, for it to be believed
+SHIFT = 0.015  # of the width
+AROUND = 3  # [px] of a peak, and around no shift
+SEARCHED = 8  # a shift of up to an eighth of the image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +124,7 @@ class ImageWatch:
 
     def rescale(self, scale: float) -> None:
         """Take [m per count] for what the depths were read with; for a log that says its unit."""
-        read_with = self.scale if self.scale is not None else 1.0 if self.is_float else MILLIMETRE
-        factor = np.float32(scale / read_with)
+        factor = np.float32(scale / (self.unit or 1.0))
         self.scale = scale
         if factor != 1.0:
             self.medians.change(lambda median: float(median * factor))
@@ -125,7 +135,12 @@ class ImageWatch:
     @property
     def is_float(self) -> bool:
         """Whether most images are 32FC1."""
-        return self.encodings.most_common(1)[:1] != [] and self.encodings.most_common(1)[0][0] == "32FC1"
+        return [name for name, _ in self.encodings.most_common(1)] == ["32FC1"]
+
+    @property
+    def unit(self) -> float | None:
+        """Metres per count of depth; None for metres."""
+        return self.scale if self.scale is not None else None if self.is_float else MILLIMETRE
 
     def add_undecoded(self, encoding: str, width: int, height: int) -> None:
         """An image of an encoding that is not read, or of which only the head is."""
@@ -167,8 +182,8 @@ def image_findings(images: ImageWatch) -> list[Finding]:
         text = f"{images.num_bad} of {images.count} images do not decode; the first: {images.first_bad}"
         severity = error if images.num_bad == images.count else warning
         remedy = "they are left out; copy the file again, or look at the recorder"
-        figure = {"value": images.num_bad, "stamp_ns": images.first_bad_ns}
-        found.append(severity("undecodable", where, text, remedy, **figure))
+        at = images.first_bad_ns
+        found.append(severity("undecodable", where, text, remedy, value=images.num_bad, stamp_ns=at))
     if len(images.sizes) > 1:
         sizes = ", ".join(f"{w}x{h} ({n})" for (w, h), n in images.sizes.most_common(4))
         remedy = "record one size; frames of another than the camera's are left out"
@@ -221,7 +236,7 @@ def _scale(images: ImageWatch) -> list[Finding]:
     if not medians:
         return []
     median = float(np.median(medians))
-    used = images.scale if images.scale is not None else 1.0 if images.is_float else MILLIMETRE
+    used = images.unit or 1.0
     low, high = PLAUSIBLE_DEPTH
     if low <= median <= high:
         near, far = TABLE_DEPTH
@@ -238,3 +253,100 @@ def _scale(images: ImageWatch) -> list[Finding]:
     text += f"; {guess}?" if guess else ""
     remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
     return [error("depth-scale", images.where, text, remedy, value=median, unit="m")]
+
+
+def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
+    """Of every camera whose frames have colour."""
+    edges = {
+        camera: [_spectra(f) for f in its[:: max(1, len(its) // NUM_FRAMES)][:NUM_FRAMES]]
+        for camera in sorted({frame.camera for frame in frames})
+        if (its := [frame for frame in frames if frame.camera == camera and frame.color.any()])
+    }
+    found: list[Finding] = []
+    for camera, spectra in edges.items():
+        surface = np.mean([_correlation(color, depth) for color, depth in spectra], axis=0)
+        where = f"camera {camera}"
+        dv, du, peak, runner_up = _peak(surface)
+        width = surface.shape[1]
+        if max(peak, 0.0) >= CLEAR and peak >= AHEAD * runner_up:
+            if max(abs(du), abs(dv)) > SHIFT * width:
+                found.append(_shifted(where, du, dv, width, peak))
+            continue
+        other = _other(camera, edges, _at_zero(surface))
+        if other is not None:
+            found.append(_exchanged(where, *other))
+    return found
+
+
+def _shifted(where: str, du: int, dv: int, width: int, peak: float) -> Finding:
+    share = 100 * max(abs(du), abs(dv)) / width
+    text = f"depth edges lie {-du:+d} px across and {-dv:+d} px down from colour edges in images {width} px wide"
+    text = f"{text} ({share:.1f} % of the width, correlation {peak:.2f} there): depth is not registered to colour"
+    remedy = "record depth aligned to colour, or with its own frame and CameraInfo, that ingest may register it"
+    return error("alignment", where, text, remedy, value=max(abs(du), abs(dv)), unit="px")
+
+
+def _exchanged(where: str, other: str, own: float, peak: float) -> Finding:
+    text = (
+        f"its colour edges meet the depth edges of camera {other} (correlation {peak:.2f}), not its own ({own:.2f})"
+    )
+    return error("alignment", where, text, "exchange the depth topics, with --camera NAME=COLOR,DEPTH", value=own)
+
+
+def _other(
+    camera: str, edges: dict[str, list[tuple[Float64, Float64]]], own: float
+) -> tuple[str, float, float] | None:
+    """The camera whose depth fits this one's colour clearly, its own score, and the other's."""
+    scores = {}
+    for name, its in edges.items():
+        pairs = list(zip(edges[camera], its, strict=False))
+        if name != camera and all(a[0].shape == b[1].shape for a, b in pairs):
+            scores[name] = _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in pairs], axis=0))
+    best = max(scores, key=lambda name: scores[name], default=None)
+    if best is None or scores[best] < max(CLEAR, 2 * own):
+        return None
+    return best, own, scores[best]
+
+
+def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:
+    """Transforms of where colour and where depth change, each of mean 0 and length 1."""
+    gray = cv2.GaussianBlur(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
+    slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+    slope = np.minimum(slope, np.percentile(slope, 95))
+    around = np.ones((5, 5), np.uint8)
+    far = cv2.dilate(frame.depth, around)
+    near = cv2.erode(np.where(frame.depth > 0, frame.depth, np.float32(1e9)), around)
+    is_edge = (far - near > EDGE_STEP * near) & (near < 1e8)
+    is_edge[:BORDER] = is_edge[-BORDER:] = False
+    is_edge[:, :BORDER] = is_edge[:, -BORDER:] = False
+    return _transformed(slope), _transformed(is_edge.astype(np.float32))
+
+
+def _transformed(image: Float32) -> Float64:
+    window = np.outer(np.hanning(image.shape[0]) ** 0.25, np.hanning(image.shape[1]) ** 0.25)
+    centred = (image - image.mean()) * window
+    length = float(np.linalg.norm(centred))
+    return np.asarray(np.fft.rfft2(centred / length if length > 0 else centred))
+
+
+def _correlation(color: Float64, depth: Float64) -> Float64:
+    """(h, w) by shift of the colour edges against the depth edges, no shift in the middle."""
+    return np.fft.fftshift(np.fft.irfft2(color * np.conj(depth)))
+
+
+def _peak(surface: Float64) -> tuple[int, int, float, float]:
+    """Rows and columns of the best shift, its correlation, and the best one apart from it."""
+    height, width = surface.shape
+    rows, columns = height // SEARCHED, width // SEARCHED
+    near = surface[
+        height // 2 - rows : height // 2 + rows + 1, width // 2 - columns : width // 2 + columns + 1
+    ].copy()
+    v, u = np.unravel_index(int(np.argmax(near)), near.shape)
+    peak = float(near[v, u])
+    near[max(0, v - 2 * AROUND) : v + 2 * AROUND + 1, max(0, u - 2 * AROUND) : u + 2 * AROUND + 1] = -1.0
+    return int(v) - rows, int(u) - columns, peak, float(near.max())
+
+
+def _at_zero(surface: Float64) -> float:
+    v, u = surface.shape[0] // 2, surface.shape[1] // 2
+    return float(surface[v - AROUND : v + AROUND + 1, u - AROUND : u + AROUND + 1].max())

@@ -3,14 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from splatctrl_cli.checks.check_alignment import alignment_findings
-from splatctrl_cli.checks.check_cameras import calibration_findings, tf_findings
-from splatctrl_cli.checks.check_images import depth_findings, image_findings, sample_findings, thumbnail_lens
-from splatctrl_cli.checks.check_report import CheckReport, damage_findings, needs, usable_frames
-from splatctrl_cli.checks.check_rig import CheckedCamera, camera_findings, checked_camera, nearest, ready
-from splatctrl_cli.checks.check_robot import motion_findings
+from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
+from splatctrl_cli.checks.check_images import depth_findings, image_findings, sample_findings
+from splatctrl_cli.checks.check_recording import Evidence, judged
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_times import (
     TimesWatch,
@@ -22,19 +17,16 @@ from splatctrl_cli.checks.check_times import (
     peer_findings,
     time_findings,
 )
-from splatctrl_cli.checks.check_views import check_views
-from splatctrl_cli.checks.check_watch import LogWatch
-from splatctrl_cli.checks.finding import Finding, Severity, error, note, warning
-from splatctrl_cli.checks.state_motion import ImageMotion
+from splatctrl_cli.checks.check_watch import LogWatch, checked_camera, image_motion, ready
+from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, warning
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
 from splatctrl_cli.logs.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
-from splatctrl_cli.logs.rig import Camera, camera_topics, check_mask_topics, missing
+from splatctrl_cli.logs.rig import camera_topics, check_mask_topics, missing
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.survey import Survey, survey
-from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
@@ -70,32 +62,24 @@ def check_log(
     findings += [error("missing", log.path.name, *_parted(lack)) for lack in lacks]
     checked = [checked_camera(t, c, watch.images, found.tf, options) for t, c in rig if c is not None]
     states, states_lack, of_states = log_states(found, options, model)
-    findings += of_states
-    frames = [frame for camera in checked for frame in camera.frames]
-    findings += alignment_findings(frames)
-    frames = usable_frames(frames, findings)
-    views = check_views(frames, {c.camera.name: _unit(watch, c) for c in checked if c.frames})
-    findings += views.findings
-    if states is not None and not any(finding.code == "joints-degrees" for finding in findings):
-        findings += motion_findings(views.corrected, _motion(watch, checked), states, model)
-    if not watch.is_whole:
-        findings.append(note("quick", log.path.name, f"only the first {num_images} images of a topic were read"))
     first, last = _span(found)
-    return CheckReport(
-        path=str(log.path),
+    evidence = Evidence(
+        path=log.path,
         kind=log.container,
         duration_s=(last - first) * 1e-9,
         num_messages=found.num_messages,
         start_ns=watch.first_ns,
-        findings=findings,
+        num_cameras=len(cameras),
+        num_frames=max((images.count for images in watch.images.values()), default=0),
         rates=[t.rate(is_read=_is_read(found, name)) for name, t in sorted(watch.times.items())],
-        needs=needs(
-            num_cameras=len(cameras),
-            num_frames=max((images.count for images in watch.images.values()), default=0),
-            states_lack=states_lack,
-        ),
-        frames=views.scaled,
+        frames=[frame for camera in checked for frame in camera.frames],
+        depth_units={c.camera.name: watch.images[c.topics.depth].unit for c in checked if c.frames},
+        motion=image_motion(watch, checked),
+        states=states,
+        states_lack=states_lack,
+        cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
     )
+    return judged(evidence, [*findings, *of_states], model)
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
@@ -123,12 +107,6 @@ def _parted(lack: str) -> tuple[str, str]:
     """What is lacking, and what to do."""
     what, _, remedy = lack.rpartition("; ")
     return (what, remedy) if what else (remedy, "")
-
-
-def _unit(watch: LogWatch, checked: CheckedCamera) -> float | None:
-    """Metres per count of its depth; None for metres."""
-    images = watch.images[checked.topics.depth]
-    return images.scale if images.scale is not None else None if images.is_float else 1e-3
 
 
 def _is_read(found: Survey, name: str) -> bool:
@@ -190,40 +168,3 @@ def _image_findings(watch: LogWatch, cameras: Sequence[CameraTopics]) -> list[Fi
             its += depth_findings(images)
         findings += its
     return [*findings, *sample_findings(list(watch.images.values()))]
-
-
-def _motion(watch: LogWatch, cameras: Sequence[CheckedCamera]) -> ImageMotion:
-    """How the first images of each camera change."""
-    motion = ImageMotion()
-    for checked in cameras:
-        if checked.frames and checked.topics.color in watch.images:
-            for frame in _thumbnails(watch, checked.camera, checked):
-                motion.add(frame)
-    return motion
-
-
-def _thumbnails(watch: LogWatch, camera: Camera, checked: CheckedCamera) -> list[RgbdFrame]:
-    """Colour beside depth only where both are of one view."""
-    is_registered = camera.depth_to_color is None
-    colors = watch.images[checked.topics.color].thumbnails if is_registered else []
-    gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
-    at, frames = sorted(gray), []
-    poses = {frame.stamp_ns: frame.T_world_camera for frame in checked.frames}
-    stamps = sorted(poses)
-    for thumbnail in watch.images[checked.topics.depth].thumbnails:
-        near, depth = nearest(at, thumbnail.stamp_ns), thumbnail.depth
-        assert depth is not None
-        color = gray.get(near) if near is not None else None
-        if color is None or color.shape[:2] != depth.shape:
-            color = np.zeros((*depth.shape, 3), np.uint8)
-        frames.append(
-            RgbdFrame(
-                stamp_ns=thumbnail.stamp_ns,
-                camera=camera.name,
-                color=color,
-                depth=depth,
-                intrinsics=thumbnail_lens(camera.intrinsics),
-                T_world_camera=poses[nearest(stamps, thumbnail.stamp_ns) or stamps[0]],
-            )
-        )
-    return frames

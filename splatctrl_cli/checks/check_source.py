@@ -1,25 +1,21 @@
 """Everything that is wrong with a capture or an image folder, from one pass over its frames."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from splatctrl_cli.captures.capture import is_capture
-from splatctrl_cli.checks.check_alignment import alignment_findings
 from splatctrl_cli.checks.check_cameras import lens_findings, pose_findings
 from splatctrl_cli.checks.check_images import ImageWatch, depth_findings, sample_findings, strided_lens
-from splatctrl_cli.checks.check_report import CheckReport, damage_findings, needs, usable_frames
-from splatctrl_cli.checks.check_robot import motion_findings
-from splatctrl_cli.checks.check_states import robot_findings
+from splatctrl_cli.checks.check_recording import Evidence, judged
+from splatctrl_cli.checks.check_states import robot_states
 from splatctrl_cli.checks.check_times import TimesWatch, time_findings
-from splatctrl_cli.checks.check_views import check_views
-from splatctrl_cli.checks.finding import Finding, error, note, warning
-from splatctrl_cli.checks.state_motion import ImageMotion
+from splatctrl_cli.checks.clock_offset import ImageMotion
+from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, error, needs, note, warning
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.shot import Shot, ShotSource
-from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
+from splatctrl_cli.logs.state_columns import StateCollector
 from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_source
@@ -36,7 +32,7 @@ class _CameraWatch:
     """What is kept of one camera's frames."""
 
     def __init__(self, lens: Intrinsics, where: str, unit: float | None) -> None:
-        self.lens, self.unit = lens, unit
+        self.lens = lens
         self.images, self.colors = ImageWatch(where, unit), ImageWatch(where)
         self.times = TimesWatch(where, has_stamps=False)
         self.stamps: list[int] = []
@@ -58,7 +54,6 @@ class _CameraWatch:
     def frames(self, camera: str) -> list[RgbdFrame]:
         """The kept images with their poses; by number, for views of a folder may have no clock."""
         poses = dict(zip(self.stamps, self.poses, strict=True))
-        pairs = [(d, c) for d, c in zip(self.images.kept, self.colors.kept, strict=True)]
         return [
             RgbdFrame(
                 stamp_ns=depth.stamp_ns,
@@ -68,7 +63,7 @@ class _CameraWatch:
                 intrinsics=strided_lens(self.lens, depth.stride),
                 T_world_camera=poses[depth.stamp_ns],
             )
-            for depth, color in pairs
+            for depth, color in zip(self.images.kept, self.colors.kept, strict=True)
             if depth.depth is not None
         ]
 
@@ -83,47 +78,53 @@ def check_source(
     except InputError as wrong:
         return _refused(path, kind if path.is_file() or is_capture(path) else "folder", wrong)
     cameras: dict[str, _CameraWatch] = {}
-    states = StateCollector(len(source.joint_names))
+    collected = StateCollector(len(source.joint_names))
     motion = ImageMotion()
     findings: list[Finding] = []
     is_whole = True
     try:
         for item in source.shots():
             if isinstance(item, JointState):
-                states.add(item)
+                collected.add(item)
                 continue
-            is_whole = _take(item, cameras, motion, num_images)
-            if not is_whole:
+            if item.camera not in cameras:
+                cameras[item.camera] = _CameraWatch(item.intrinsics, f"camera {item.camera}", item.depth_unit)
+            cameras[item.camera].add(item, motion)
+            if len(cameras[item.camera].stamps) == num_images:
+                is_whole = False
                 break
     except InputError as wrong:
         findings.append(error("refused", path.name, wrong.message, wrong.remedy))
     findings += _losses(source, path.name)
-    for name, camera in sorted(cameras.items()):
-        findings += _camera_findings(f"camera {name}", camera, has_clock=source.has_clock)
-    findings += sample_findings([camera.images for _, camera in sorted(cameras.items())])
-    frames = [frame for name, camera in sorted(cameras.items()) for frame in camera.frames(name)]
-    findings += alignment_findings(frames)
-    frames = usable_frames(frames, findings)
-    views = check_views(frames, {name: camera.unit for name, camera in sorted(cameras.items())})
-    findings += views.findings
-    columns = states.columns()
-    states_lack = "" if len(columns) else "no joint states; give them apart (docs/replay.md, Logs)"
-    if len(columns) and source.has_clock:
-        states_lack, of_robot = _robot(source, views.corrected, columns, motion, model)
-        findings += of_robot
     if not cameras and not any(finding.code == "refused" for finding in findings):
         findings.append(error("missing", path.name, "no frame could be read", "copy or record it again"))
-    if not is_whole:
-        findings.append(note("quick", path.name, f"only the first {num_images} frames of a camera were read"))
-    return _report(path, kind, source, cameras, len(columns), views.scaled, findings, states_lack)
-
-
-def _take(shot: Shot, cameras: dict[str, _CameraWatch], motion: ImageMotion, num_images: int | None) -> bool:
-    """Watch a frame; False where it was the last that is wanted."""
-    where = f"camera {shot.camera}"
-    camera = cameras.setdefault(shot.camera, _CameraWatch(shot.intrinsics, where, shot.depth_unit))
-    camera.add(shot, motion)
-    return len(camera.stamps) != num_images
+    cameras = dict(sorted(cameras.items()))
+    for camera in cameras.values():
+        findings += _camera_findings(camera, has_clock=source.has_clock)
+    findings += sample_findings([camera.images for camera in cameras.values()])
+    logged, states = collected.columns(), None
+    states_lack = "" if len(logged) else "no joint states; give them apart (docs/replay.md, Logs)"
+    if len(logged) and source.has_clock:
+        states, states_lack, of_states = robot_states(model, source.joint_names, logged)
+        findings += of_states
+    stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
+    evidence = Evidence(
+        path=path,
+        kind=kind,
+        duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
+        num_messages=len(stamps) + len(logged),
+        start_ns=min(stamps, default=None) if source.has_clock else None,
+        num_cameras=len(cameras),
+        num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
+        rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
+        frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
+        depth_units={name: camera.images.scale for name, camera in cameras.items()},
+        motion=motion,
+        states=states,
+        states_lack=states_lack,
+        cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
+    )
+    return judged(evidence, findings, model)
 
 
 def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
@@ -154,57 +155,10 @@ def _losses(source: ShotSource, where: str) -> list[Finding]:
     return findings
 
 
-def _camera_findings(where: str, camera: _CameraWatch, *, has_clock: bool) -> list[Finding]:
+def _camera_findings(camera: _CameraWatch, *, has_clock: bool) -> list[Finding]:
+    where = camera.images.where
     findings = [*lens_findings(where, camera.lens), *depth_findings(camera.images)]
     if has_clock:
         findings += time_findings(camera.times, "frames")
         findings += pose_findings(where, camera.stamps, camera.poses)
     return findings
-
-
-def _robot(
-    source: ShotSource,
-    frames: Sequence[RgbdFrame],
-    states: StateColumns,
-    motion: ImageMotion,
-    model: RobotModel | None,
-) -> tuple[str, list[Finding]]:
-    """What `replay` lacks, and what is wrong with the joint states."""
-    if model is None:
-        return "", motion_findings(frames, motion, states, None)
-    absent = [name for name in model.joint_names if name not in source.joint_names]
-    if absent:
-        text = f"the robot's joints {', '.join(absent)} are in no joint state"
-        remedy = "give this robot's URDF, or hold them still with --lock"
-        return f"{text}; {remedy}", [error("joints", "joint states", text, remedy)]
-    states = states.of_joints(np.asarray(model.joint_order(source.joint_names), dtype=np.int64))
-    found = robot_findings(model, states, "joint states")
-    return "", [*found, *motion_findings(frames, motion, states, model)]
-
-
-def _report(
-    path: Path,
-    kind: str,
-    source: ShotSource,
-    cameras: dict[str, _CameraWatch],
-    num_states: int,
-    frames: Sequence[RgbdFrame],
-    findings: list[Finding],
-    states_lack: str,
-) -> CheckReport:
-    stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
-    return CheckReport(
-        path=str(path),
-        kind=kind,
-        duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps and source.has_clock else 0.0,
-        num_messages=len(stamps) + num_states,
-        start_ns=min(stamps, default=None) if source.has_clock else None,
-        findings=findings,
-        rates=[camera.times.rate(is_read=True) for _, camera in sorted(cameras.items())] if source.has_clock else [],
-        needs=needs(
-            num_cameras=len(cameras),
-            num_frames=max((len(camera.stamps) for camera in cameras.values()), default=0),
-            states_lack=states_lack,
-        ),
-        frames=frames,
-    )

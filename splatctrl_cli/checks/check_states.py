@@ -1,13 +1,17 @@
-"""Whether joint states are there, finite, in radians, with velocities, and within the robot's limits."""
+"""Whether joint states are there, finite, in radians, with velocities, and fit a robot: angles against its limits,
+end-effector poses against its kinematics."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatctrl_cli.checks.finding import Finding, error, note, warning
-from splatctrl_cli.checks.state_check import PoseVerdict, check_angles, pose_agreement
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.rows import blocks_of
+from splatctrl_cli.files.rows import blocks_of, ranges
+from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.logs.joint_log import JointStream
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
@@ -17,10 +21,248 @@ from splatctrl_cli.logs.survey import Survey
 from splatctrl_cli.records import Float64, JointState, LossReport
 from splatctrl_cli.robot.model import RobotModel
 
+FAR = 0.5  # [rad] beyond the limits, and beyond a whole turn: not the limits of another joint
+MANY = 0.5  # of the states that must be there
+LONGEST_PAUSE = 86_400.0  # [s] between states; beyond it another clock goes on
+SLACK = 0.1  # [rad] by which degrees may exceed the limits
+MAX_POSES = 200  # that are compared, spread over the log
+SAME_POSITION, SAME_ROTATION = 0.005, 0.02  # [m], [rad] within which poses agree
+MIN_TRAVEL = 0.05  # [m] or, of rotation, [rad] that a link must move to tell a tool from a wrong robot
+_LEVER = 0.1  # [m] by which a rotation counts beside a position
 TURN = 2 * np.pi
 DEGREES = 3.0 * TURN  # that no joint of an arm turns to, in radians
 MOVING = 1e-3  # [rad or m] of all motion under which nothing moves
 LIMIT_SLACK = 0.01  # [rad or m]
+
+
+class PoseVerdict(StrEnum):
+    """What logged end-effector poses say about the robot model."""
+
+    AGREE = "agree"
+    TOOL = "tool"
+    BASE = "base"
+    DISAGREE = "disagree"
+    STILL = "still"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Median and largest difference of poses, in position [m] and rotation [rad]."""
+
+    median_position: float
+    max_position: float
+    median_rotation: float
+    max_rotation: float
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the poses are the same."""
+        return self.max_position < SAME_POSITION and self.max_rotation < SAME_ROTATION
+
+    @property
+    def words(self) -> str:
+        """For a sentence."""
+        return (
+            f"median {1e3 * self.median_position:.2f} mm and {np.degrees(self.median_rotation):.2f} deg, "
+            f"largest {1e3 * self.max_position:.2f} mm and {np.degrees(self.max_rotation):.2f} deg"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseAgreement:
+    """Logged end-effector poses beside forward kinematics.
+
+    difference: of the poses and those of `link`, the nearest; offset (4, 4): the one transform that explains most of
+    it, T_link_ee of a tool or T_logged_base of a wrong base; rest: the difference that remains with it.
+    """
+
+    verdict: PoseVerdict
+    link: str
+    num_poses: int
+    difference: Spread
+    offset: Float64
+    rest: Spread
+
+    @property
+    def sentence(self) -> str:
+        """One line for a report."""
+        start = f"{self.num_poses} logged end-effector poses"
+        x, y, z = self.offset[:3, 3]
+        by = f"({x:.4f}, {y:.4f}, {z:.4f}) m and {np.degrees(_angle(self.offset[:3, :3])):.1f} deg"
+        if self.verdict is PoseVerdict.AGREE:
+            return f"{start} agree with {self.link}: {self.difference.words}"
+        if self.verdict is PoseVerdict.TOOL:
+            return f"{start} stand at {by} in {self.link}: a flange or tool transform; beside it {self.rest.words}"
+        if self.verdict is PoseVerdict.BASE:
+            return f"{start} are moved by {by} in the world: is --base right? beside it {self.rest.words}"
+        if self.verdict is PoseVerdict.STILL:
+            return f"{start} cannot be judged: the robot hardly moves"
+        return (
+            f"{start} do not fit this robot, with any tool: {self.rest.words} from {self.link}; "
+            "wrong URDF, joint order, or units?"
+        )
+
+
+def check_states(states: StateColumns, joints: Sequence[str]) -> None:
+    """Raise InputError where there are no states (model order), a stamp goes back, or leaps as no pause does, or a
+    position is not finite.
+    """
+    stamps = states.stamp_ns
+    if not len(stamps):
+        raise InputError("joint states: expected at least one, got none", remedy="check the log's /joint_states")
+    back = np.flatnonzero(np.diff(stamps) < 0)
+    if len(back):
+        index = int(back[0]) + 1
+        raise InputError(
+            f"joint state {index}: expected a stamp not before {stamps[index - 1]} ns, got {stamps[index]} ns",
+            remedy="sort the states by stamp",
+        )
+    pauses = np.diff(stamps)
+    if len(pauses) and pauses.max() > LONGEST_PAUSE * 1e9:
+        index = int(np.argmax(pauses)) + 1
+        raise InputError(
+            f"joint states: mixed clocks: stamps jump by {pauses[index - 1] * 1e-9:.0f} s at state {index} of "
+            f"{len(stamps)}",
+            remedy="cut the log there, or give all states the times of one clock",
+        )
+    for first, last in ranges(len(stamps)):
+        q = states.position[first:last]
+        if not np.isfinite(q).all():
+            index, joint = (int(i[0]) for i in np.nonzero(~np.isfinite(q)))
+            raise InputError(
+                f"joint state {first + index}: joint {joints[joint]} is {q[index, joint]}, expected a finite angle"
+            )
+
+
+def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> None:
+    """Raise InputError where the positions (model order) are far beyond the limits and would fit as degrees."""
+    limited = np.isfinite(model.lower) & np.isfinite(model.upper)
+    if not len(states) or not limited.any():
+        return
+    lower, upper = model.lower[limited], model.upper[limited]
+    num_far = num_fit = 0
+    worst, at_worst = np.full(len(lower), -np.inf), np.zeros(len(lower))  # of each joint
+    for q in _positions(states):
+        beyond = np.abs(q[:, limited]) - np.maximum(np.maximum(np.abs(lower), np.abs(upper)), 2 * np.pi)
+        as_degrees = np.radians(q[:, limited])
+        num_far += int((beyond.max(axis=1) > FAR).sum())
+        num_fit += int(((as_degrees > lower - SLACK) & (as_degrees < upper + SLACK)).all(axis=1).sum())
+        for joint, row in enumerate(beyond.argmax(axis=0)):
+            if beyond[row, joint] > worst[joint]:
+                worst[joint], at_worst[joint] = beyond[row, joint], q[row, limited][joint]
+    if num_far / len(states) < MANY or num_fit / len(states) < 1 - (1 - MANY) / 5:
+        return
+    joint = int(np.argmax(worst))
+    names = [n for n, is_limited in zip(model.joint_names, limited, strict=True) if is_limited]
+    raise InputError(
+        f"{name}: joint {names[joint]}: expected radians within [{lower[joint]:.3f}, {upper[joint]:.3f}], "
+        f"got {at_worst[joint]:.4g}, which would fit as degrees",
+        remedy='convert them, or give the states as CSV or NPZ with unit = "deg" (docs/replay.md, Logs)',
+    )
+
+
+def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgreement | None:
+    """How the poses logged in `states` (model order) agree with the robot's links; None where none is logged.
+
+    Every link is tried. Poses that differ by a transform that does not change in a link's frame are a tool on it, by
+    one that does not change in the world a wrong base; anything else grows with the motion, and is another robot.
+    """
+    posed = _posed(states)
+    if not len(posed):
+        return None
+    chosen = [states[int(posed[i])] for i in np.unique(np.linspace(0, len(posed) - 1, MAX_POSES).astype(int))]
+    logged = np.array([_world(model, state) for state in chosen])
+    links = {
+        link: np.array([model.frame_pose(state.position, link) for state in chosen]) for link in model.frame_names
+    }
+    near = min(links, key=lambda link: _cost(_spread(links[link], logged)))
+    difference = _spread(links[near], logged)
+    if difference.is_small:
+        return _agreement(PoseVerdict.AGREE, near, len(chosen), difference, np.eye(4), difference)
+    tools = {link: _explained(poses, logged) for link, poses in links.items()}
+    bases = {link: _explained(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
+    tool = min(tools, key=lambda link: (round(_cost(tools[link][1]), 6), _cost(_spread(links[link], logged))))
+    base = min(bases, key=lambda link: _cost(bases[link][1]))
+    if _travel(logged) < MIN_TRAVEL:
+        return _agreement(PoseVerdict.STILL, near, len(chosen), difference, np.eye(4), difference)
+    if tools[tool][1].is_small:
+        return _agreement(PoseVerdict.TOOL, tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+    if bases[base][1].is_small:
+        offset, rest = bases[base]
+        moved = invert_transform(offset)
+        return _agreement(PoseVerdict.BASE, base, len(chosen), _spread(links[base], logged), moved, rest)
+    return _agreement(PoseVerdict.DISAGREE, tool, len(chosen), _spread(links[tool], logged), *tools[tool])
+
+
+def _positions(states: Sequence[JointState]) -> Iterator[Float64]:
+    """(T, J), a block at a time."""
+    if isinstance(states, StateColumns):
+        yield from blocks_of(states.position)
+    else:
+        yield np.array([state.position for state in states])
+
+
+def _posed(states: Sequence[JointState]) -> NDArray[np.int64]:
+    """The states that have an end-effector pose."""
+    if isinstance(states, StateColumns) and states.T_base_ee is None and states.T_world_ee is None:
+        return np.zeros(0, dtype=np.int64)
+    has_pose = (s.T_base_ee is not None or s.T_world_ee is not None for s in states)
+    return np.flatnonzero(np.fromiter(has_pose, dtype=np.bool_, count=len(states)))
+
+
+def _agreement(
+    verdict: PoseVerdict, link: str, num: int, difference: Spread, offset: Float64, rest: Spread
+) -> PoseAgreement:
+    return PoseAgreement(verdict=verdict, link=link, num_poses=num, difference=difference, offset=offset, rest=rest)
+
+
+def _world(model: RobotModel, state: JointState) -> Float64:
+    if state.T_world_ee is not None:
+        return state.T_world_ee
+    assert state.T_base_ee is not None
+    return np.asarray(model.T_world_base @ state.T_base_ee)
+
+
+def _explained(poses: Float64, logged: Float64) -> tuple[Float64, Spread]:
+    """The constant X (4, 4) of logged = poses X, by the mean rotation and median position, and what remains."""
+    relative = _inverse(poses) @ logged
+    U, _, Vt = np.linalg.svd(relative[:, :3, :3].sum(axis=0))
+    X = np.eye(4)
+    X[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    X[:3, 3] = np.median(relative[:, :3, 3], axis=0)
+    return X, _spread(poses @ X, logged)
+
+
+def _inverse(poses: Float64) -> Float64:
+    return np.array([invert_transform(T) for T in poses])
+
+
+def _spread(poses: Float64, logged: Float64) -> Spread:
+    position = np.linalg.norm(poses[:, :3, 3] - logged[:, :3, 3], axis=1)
+    relative = np.swapaxes(poses[:, :3, :3], 1, 2) @ logged[:, :3, :3]
+    rotation = np.array([_angle(R) for R in relative])
+    return Spread(
+        median_position=float(np.median(position)),
+        max_position=float(position.max()),
+        median_rotation=float(np.median(rotation)),
+        max_rotation=float(rotation.max()),
+    )
+
+
+def _angle(R: Float64) -> float:
+    """Angle [rad] of a rotation, exact near zero too."""
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1.0))
+
+
+def _cost(spread: Spread) -> float:
+    return spread.median_position + _LEVER * spread.median_rotation
+
+
+def _travel(poses: Float64) -> float:
+    first = np.broadcast_to(poses[0], poses.shape)
+    spread = _spread(first, poses)
+    return max(spread.max_position, spread.max_rotation)
 
 
 def log_states(
@@ -42,17 +284,24 @@ def log_states(
     if not len(states):
         lack = "no joint states; record /joint_states, or give the states apart (docs/replay.md, Logs)"
         return None, lack, findings
+    of_model, lack, of_robot = robot_states(model, names, states)
+    is_said = any(f.code == "joints-degrees" for f in findings)
+    return of_model, lack, [*findings, *(f for f in of_robot if not (is_said and f.code == "joints-degrees"))]
+
+
+def robot_states(
+    model: RobotModel | None, names: Sequence[str], states: StateColumns
+) -> tuple[StateColumns | None, str, list[Finding]]:
+    """States of joints `names` as `log_states` gives them."""
     if model is None:
-        return states, "", findings
+        return states, "", []
     absent = [name for name in model.joint_names if name not in names]
     if absent:
         text = f"the robot's joints {', '.join(absent)} are in no joint state"
         remedy = "give this robot's URDF, or hold them still with --lock"
-        return None, f"{text}; {remedy}", [*findings, error("joints", "joint states", text, remedy)]
+        return None, f"{text}; {remedy}", [error("joints", "joint states", text, remedy)]
     states = states.of_joints(np.asarray(model.joint_order(names), dtype=np.int64))
-    is_said = any(f.code == "joints-degrees" for f in findings)
-    of_robot = robot_findings(model, states, "joint states")
-    return states, "", [*findings, *(f for f in of_robot if not (is_said and f.code == "joints-degrees"))]
+    return states, "", robot_findings(model, states, "joint states")
 
 
 def stream_findings(where: str, stream: JointStream) -> list[Finding]:

@@ -1,13 +1,14 @@
 """When the messages of a topic came: rate, gaps, stamps that repeat or go back, header stamps against log times."""
 
 import heapq
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import pairwise
+from typing import Generic, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.checks.finding import Finding, Thinned, error, note, warning
+from splatctrl_cli.checks.finding import Finding, Rate, error, note, warning
 from splatctrl_cli.records import Float64
 
 MAX_KEPT = 4096  # intervals and delays of a topic, however long the log
@@ -27,18 +28,38 @@ FILES_APART = 60.0  # [s]
 _NS = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rate:
-    """A row of the table of rates; is_read: by later commands; hz: median; longest_s: interval between two stamps;
-    delay_s: median of log time minus stamp.
-    """
+T = TypeVar("T")
 
-    topic: str
-    is_read: bool
-    messages: int
-    hz: float | None
-    longest_s: float | None
-    delay_s: float | None
+
+class Thinned(Generic[T]):
+    """Every k-th of a long row of values, at most `limit` of them; k doubles where they would be more."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit, self._step, self._num = limit, 1, 0
+        self._kept: list[T] = []
+
+    def is_next(self) -> bool:
+        """Whether the value that comes now is kept; to be asked once for each value, before `add`."""
+        is_kept = self._num % self._step == 0
+        self._num += 1
+        return is_kept
+
+    def add(self, value: T) -> None:
+        """Keep it."""
+        self._kept.append(value)
+        if len(self._kept) > self._limit:
+            self._kept = self._kept[::2]
+            self._step *= 2
+
+    def change(self, by: Callable[[T], T]) -> None:
+        """Put something else in the place of each value."""
+        self._kept = [by(value) for value in self._kept]
+
+    def __iter__(self) -> Iterator[T]:
+        return iter(self._kept)
+
+    def __len__(self) -> int:
+        return len(self._kept)
 
 
 class TimesWatch:
@@ -156,8 +177,7 @@ def time_findings(times: TimesWatch, what: str = "messages") -> list[Finding]:
         text = f"stamps go back {times.num_back} times, by up to {times.furthest_back:.3g} s"
         remedy = "two publishers on one topic, a clock that was set, or a loop of a played log: record again"
         first = times.first_back_ns
-        figure = {"value": times.furthest_back, "unit": "s", "stamp_ns": first}
-        found.append(warning("stamp-back", where, text, remedy, **figure))
+        found.append(warning("stamp-back", where, text, remedy, value=times.furthest_back, unit="s", stamp_ns=first))
     return found
 
 
@@ -248,8 +268,8 @@ def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
             text = f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
             text = f"{text} cameras' images, as logged"
             remedy = "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves"
-            figure = {"value": round(1e3 * apart, 1), "unit": "ms", "stamp_ns": times.first_ns}
-            found.append(warning("clock-offset", times.topic, text, remedy, **figure))
+            value, at = round(1e3 * apart, 1), times.first_ns
+            found.append(warning("clock-offset", times.topic, text, remedy, value=value, unit="ms", stamp_ns=at))
     return found
 
 
@@ -271,7 +291,6 @@ def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
 def _offset(times: TimesWatch, common: float) -> Finding | None:
     delay = times.delay
     assert delay is not None
-    figure = {"value": delay, "unit": "s", "stamp_ns": times.first_ns}
     if -delay > AHEAD:
         text = f"header stamps are {-delay:.3g} s later than the log's times: the sender's clock is ahead"
     elif delay > DELAYED:
@@ -281,7 +300,7 @@ def _offset(times: TimesWatch, common: float) -> Finding | None:
     else:
         return None
     remedy = "synchronise the clocks (chrony, PTP) and record again; images and poses do not belong together"
-    return warning("clock-offset", times.topic, text, remedy, **figure)
+    return warning("clock-offset", times.topic, text, remedy, value=delay, unit="s", stamp_ns=times.first_ns)
 
 
 def _drift(times: TimesWatch) -> Finding | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.checks.check_images import TABLE_DEPTH
+from splatctrl_cli.checks.check_images import TABLE_DEPTH, strided_lens
 from splatctrl_cli.checks.finding import Finding, error, warning
 from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
 from splatctrl_cli.logs.shot import PLAUSIBLE_DEPTH
@@ -223,9 +223,7 @@ def _with(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str)
 def _view(frame: RgbdFrame) -> _View:
     stride = max(1, frame.depth.shape[0] // ROWS)
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth), 3)[::stride, ::stride]
-    k = frame.intrinsics
-    lens = replace(k, fx=k.fx / stride, fy=k.fy / stride, cx=k.cx / stride, cy=k.cy / stride)
-    lens = replace(lens, width=depth.shape[1], height=depth.shape[0])
+    lens = strided_lens(frame.intrinsics, stride)
     surface = back_project(lens, depth)
     normals = _normals(surface)
     points = surface[np.any(normals != 0, axis=-1)]

@@ -1,11 +1,18 @@
-"""One pass over a log for all that `check` asks: the survey's own, with every message watched on its way."""
+"""One pass over a log for all that `check` asks: messages watched on their way, and a few frames of each camera."""
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
-from splatctrl_cli.checks.check_images import ImageWatch
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.checks.check_images import ImageWatch, Kept, strided_lens, thumbnail_lens
 from splatctrl_cli.checks.check_times import TimesWatch
+from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -18,7 +25,12 @@ from splatctrl_cli.logs.decoder import (
     stamp_ns,
 )
 from splatctrl_cli.logs.messages import color_of, depth_of, num_invalid, read_image
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.registration import DepthToColor
+from splatctrl_cli.logs.rig import Camera, build_cameras
+from splatctrl_cli.logs.survey import Survey
+from splatctrl_cli.logs.tf_tree import TfTree
+from splatctrl_cli.records import Float64, RgbdFrame
 
 _HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu")
 _FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
@@ -128,3 +140,126 @@ class LogWatch:
                 self.transforms[child] = TimesWatch(edge, has_stamps=True)
             stamp = message.log_time_ns if self._by_log_time else stamp_ns(item.header)
             self.transforms[child].add(stamp, message.log_time_ns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedCamera:
+    """A camera that is ready to be read, and reduced frames of it, spread over the log; color is black where none was
+    kept at the time of the depth.
+    """
+
+    topics: CameraTopics
+    camera: Camera
+    frames: tuple[RgbdFrame, ...]
+
+
+def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
+    """The camera as `ingest` makes it ready; None where it lacks something (rig.missing says what)."""
+    try:
+        return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
+    except InputError:
+        return None
+
+
+def checked_camera(
+    topics: CameraTopics, camera: Camera, images: Mapping[str, ImageWatch], tf: TfTree, options: SourceOptions
+) -> CheckedCamera:
+    """With the frames whose depth was kept and whose pose is known."""
+    depths, colors = images.get(topics.depth), images.get(topics.color)
+    kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
+    frames = []
+    for kept in depths.kept if depths is not None else ():
+        near = nearest(sorted(kept_colors), kept.stamp_ns)
+        is_near = near is not None and abs(near - kept.stamp_ns) <= options.pairing_tolerance_s * 1e9
+        color = kept_colors[near] if near is not None and is_near else None
+        stamp_ns = kept.stamp_ns if color is None else color.stamp_ns
+        T = camera.pose_at(tf, stamp_ns, round(options.pose_tolerance_s * 1e9))
+        if T is not None:
+            frames.append(_frame(camera, kept, color, stamp_ns, T))
+    return CheckedCamera(topics=topics, camera=camera, frames=tuple(frames))
+
+
+def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
+    """Depth in the colour camera's view, without lens distortion, as `ingest` gives it but reduced."""
+    assert kept.depth is not None
+    depth: NDArray[Any] = kept.depth
+    stride = kept.stride
+    if camera.depth_to_color is not None:
+        stride = max(1, round(camera.intrinsics.height / kept.depth.shape[0]))
+        warp = camera.depth_to_color
+        depth = DepthToColor(
+            depth_intrinsics=strided_lens(warp.depth_intrinsics, kept.stride),
+            color_intrinsics=strided_lens(camera.intrinsics, stride),
+            T_color_depth=warp.T_color_depth,
+        ).warp(depth)
+    elif camera.undistortion is not None:
+        depth = _reduced(camera.undistortion.depth(_enlarged(depth, kept)), stride)
+    pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
+    if color is not None and color.color is not None:
+        pixels = color.color
+        if camera.undistortion is not None:
+            pixels = _reduced(camera.undistortion.color(_enlarged(pixels, color)), color.stride)
+    if pixels.shape[:2] != depth.shape:
+        pixels = np.zeros((*depth.shape, 3), np.uint8)
+    return RgbdFrame(
+        stamp_ns=stamp_ns,
+        camera=camera.name,
+        color=pixels,
+        depth=np.asarray(depth, np.float32),
+        intrinsics=strided_lens(camera.intrinsics, stride),
+        T_world_camera=T,
+    )
+
+
+def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
+    rows = np.repeat(image, kept.stride, axis=0)[: kept.height]
+    return np.repeat(rows, kept.stride, axis=1)[:, : kept.width]
+
+
+def _reduced(image: NDArray[Any], stride: int) -> NDArray[Any]:
+    return image[::stride, ::stride]
+
+
+def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
+    """Of stamps in order."""
+    if not stamps:
+        return None
+    after = int(np.searchsorted(np.array(stamps), stamp_ns))
+    return min(stamps[max(0, after - 1) : after + 1], key=lambda stamp: abs(stamp - stamp_ns))
+
+
+def image_motion(watch: LogWatch, cameras: Sequence[CheckedCamera]) -> ImageMotion:
+    """How the first images of each camera change."""
+    motion = ImageMotion()
+    for checked in cameras:
+        if checked.frames and checked.topics.color in watch.images:
+            for frame in _thumbnails(watch, checked.camera, checked):
+                motion.add(frame)
+    return motion
+
+
+def _thumbnails(watch: LogWatch, camera: Camera, checked: CheckedCamera) -> list[RgbdFrame]:
+    """Colour beside depth only where both are of one view."""
+    is_registered = camera.depth_to_color is None
+    colors = watch.images[checked.topics.color].thumbnails if is_registered else []
+    gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
+    at, frames = sorted(gray), []
+    poses = {frame.stamp_ns: frame.T_world_camera for frame in checked.frames}
+    stamps = sorted(poses)
+    for thumbnail in watch.images[checked.topics.depth].thumbnails:
+        near, depth = nearest(at, thumbnail.stamp_ns), thumbnail.depth
+        assert depth is not None
+        color = gray.get(near) if near is not None else None
+        if color is None or color.shape[:2] != depth.shape:
+            color = np.zeros((*depth.shape, 3), np.uint8)
+        frames.append(
+            RgbdFrame(
+                stamp_ns=thumbnail.stamp_ns,
+                camera=camera.name,
+                color=color,
+                depth=depth,
+                intrinsics=thumbnail_lens(camera.intrinsics),
+                T_world_camera=poses[nearest(stamps, thumbnail.stamp_ns) or stamps[0]],
+            )
+        )
+    return frames

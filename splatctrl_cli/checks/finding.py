@@ -1,11 +1,13 @@
-"""What `check` says about a recording, one finding at a time, and what it keeps of a long one."""
+"""What `check` says about a recording: the table of its checks, its findings, and what each later command lacks."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Generic, TypeVar
+from functools import partial
 
-T = TypeVar("T")
+from splatctrl_cli.records import RgbdFrame
 
 
 class Severity(StrEnum):
@@ -17,11 +19,114 @@ class Severity(StrEnum):
 
 
 ORDER = tuple(Severity)  # worst first
+LATER = ("reconstruct", "score", "replay")
+ALL = ("ingest", *LATER)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One kind of finding: what it says, how bad it can be, and the commands that refuse a recording with an error of
+    it, or whose result would be wrong.
+    """
+
+    code: str
+    severities: tuple[Severity, ...]
+    meaning: str
+    blocked: tuple[str, ...] = ()
+
+    @property
+    def docs(self) -> str:
+        """Its row in docs/check.md, cells between bars: code, meaning, severity."""
+        return f"`{self.code}` | {self.meaning} | {', '.join(self.severities)}"
+
+
+_TABLE = """
+# code | severities | commands that an error blocks | meaning
+damaged | warning |  | a part of the file cannot be read; the rest is judged
+loss | note |  | topics and frames that the source leaves out
+missing | error | all | what `ingest` needs is not there, or cannot be joined (depth, CameraInfo, tf)
+refused | error | all | the capture or folder cannot be read as described
+gap | warning |  | an image or state topic pauses for over 0.1 s and three of its median intervals; the time is where
+    the longest begins; topics and transforms that pause together are one finding
+part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log on
+files-apart | warning |  | over 60 s between two files of one recording
+stamp-repeats | warning |  | header stamps that repeat the one before
+stamp-back | warning |  | header stamps that go back
+stamp-zero | warning, error | all | header stamps of 0; an error where all of an image topic are (`--stamps log`)
+clock | note |  | stamps are of another clock than the log's, by the same for all topics (a played log)
+clock-offset | warning |  | stamps over 20 ms after their log time, over 1 s before it, or over 0.2 s from what most
+    topics have; or over 60 ms from those of the other cameras (three or more)
+clock-drift | warning |  | the time from stamp to log changes by over 20 ms (and six times its spread) over the log
+robot-clock | note, warning |  | the offset of cameras and robot: with `--urdf` from where depth shows the arm (a
+    warning beyond 40 ms, for a single camera where only it is off), else from when both see motion (beyond 30 ms plus
+    twice its uncertainty)
+sampled | note |  | not every image was decoded
+undecodable | note, warning, error | all | images that do not decode; an error where none does, a note where no camera
+    uses the topic
+encoding | note, warning |  | an encoding that is not read, or that changes; a note where no camera uses the topic
+image-size | note, warning |  | images of one topic of several sizes; a note where no camera uses the topic
+pairing | warning, error | all | less than 95 % of the images of colour or depth find a partner; an error where none
+    does
+rates-differ | note |  | one of colour and depth has 1.5 times as many images as the other
+pair-offset | note |  | depth over 10 ms from its colour image
+depth-scale | note, error | all | median depth outside 0.05 to 20 m (metres stored as integers, millimetres as floats,
+    another unit); a note outside 0.15 to 8 m
+depth-share | note, warning |  | less than half of the pixels have depth; a warning below a tenth
+depth-empty | warning, error | later | depth images without any depth; an error where none has
+depth-invalid | note |  | pixels that are NaN, infinite or negative
+principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error where both fit
+    another image size, which it names
+focal-ratio | warning |  | fx and fy differ by over 5 %
+field-of-view | warning |  | horizontal field of view outside 20 to 140 degrees
+uncalibrated | note, warning |  | a CameraInfo whose K is zero; a note where no camera needs it
+camera-info-size | error | all | a CameraInfo of another size than its images
+camera-info-changes | warning |  | a CameraInfo that changes within the log
+camera-info-two | warning |  | a second CameraInfo for the same frame and size, with another K
+distortion | note, warning, error | all | distorted images (note); a wrong number of coefficients (warning); a model
+    that is not known (error)
+tf-gap | warning |  | a moving transform pauses
+tf-ends | warning |  | a moving transform ends over 1 s before the last image
+tf-roots | note, error | all | separate trees; an error where the cameras are in several
+tf-parents | warning |  | a frame with two parents
+pose-missing | warning, error | all | images without a known pose; an error where none has one
+pose-jump | error | later | a camera is over 0.2 m, and ten times its median step, further in the next frame
+alignment | error | later | the edges of depth are over 1.5 % of the width from those of colour, or match another
+    camera's colour
+views-scale | warning, error | later | the factor on the depths (of all cameras or one) with which views fit together;
+    a warning where they hardly overlap at an unusual depth
+views-pose | warning |  | by how much a camera must be moved and turned for its views to fit the others', from 12 mm
+    or 0.8 deg on and where depths then differ by 4 % or less
+agreement | note, error | later | how far apart views place a surface that both see [mm]; an error beyond 30 mm (from
+    1 m on 3 % of the depth), which `reconstruct` refuses
+joints | note, error | replay | which topics and velocities are used; an error where the robot's joints are missing
+joints-nan | warning |  | positions that are not finite
+joints-degrees | error | replay | positions that no joint reaches in radians
+joints-velocity | note, warning |  | velocities that are missing (note) or zero throughout
+joints-still | note |  | no joint moves
+joints-limits | warning |  | states beyond the URDF's limits
+end-effector | note, error | replay | logged end-effector poses against the robot's kinematics
+arm | note, warning |  | depth minus the depth of the robot's rendered surface over the pixels it covers, per camera
+    [mm]; a warning beyond 30 mm, where it is 25 mm off in the mean, where a quarter of the pixels show what is
+    behind, or where depth is 4 % off throughout
+quick | note |  | only the first images were read
+"""
+_BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}
+
+
+def _checks() -> Iterator[Check]:
+    """The entries of `_TABLE`, whose rows go on in lines that are indented."""
+    for row in re.findall(r"^[a-z].*(?:\n +.*)*", _TABLE, flags=re.MULTILINE):
+        code, severities, blocked, meaning = (cell.strip() for cell in " ".join(row.split()).split("|"))
+        words = tuple(Severity(word) for word in severities.split(", "))
+        yield Check(code=code, severities=words, meaning=meaning, blocked=_BLOCKED[blocked])
+
+
+CHECKS: Mapping[str, Check] = {check.code: check for check in _checks()}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One thing about a recording: `code` names its kind (docs/check.md), `where` the topic, camera or joint.
+    """One thing about a recording: `code` names its entry of `CHECKS`, `where` the topic, camera or joint.
 
     value: the figure that was judged, in `unit`; stamp_ns: the first time it was met; both None where there is none.
     """
@@ -36,30 +141,16 @@ class Finding:
     stamp_ns: int | None = None
 
 
-def error(code: str, where: str, what: str, remedy: str = "", **figure: object) -> Finding:
-    """A finding of that severity; figure: value, unit, stamp_ns."""
-    return _finding(Severity.ERROR, code, where, what, remedy, **figure)
-
-
-def warning(code: str, where: str, what: str, remedy: str = "", **figure: object) -> Finding:
-    """A finding of that severity; figure: value, unit, stamp_ns."""
-    return _finding(Severity.WARNING, code, where, what, remedy, **figure)
-
-
-def note(code: str, where: str, what: str, remedy: str = "", **figure: object) -> Finding:
-    """A finding of that severity; figure: value, unit, stamp_ns."""
-    return _finding(Severity.NOTE, code, where, what, remedy, **figure)
-
-
 def _finding(
     severity: Severity,
     code: str,
     where: str,
     what: str,
-    remedy: str,
-    value: object = None,
-    unit: object = "",
-    stamp_ns: object = None,
+    remedy: str = "",
+    *,
+    value: float | None = None,
+    unit: str = "",
+    stamp_ns: int | None = None,
 ) -> Finding:
     return Finding(
         severity=severity,
@@ -67,43 +158,124 @@ def _finding(
         where=where,
         what=what,
         remedy=remedy,
-        value=None if value is None else round(float(str(value)), 6),
-        unit=str(unit),
-        stamp_ns=None if stamp_ns is None else int(str(stamp_ns)),
+        value=None if value is None else round(float(value), 6),
+        unit=unit,
+        stamp_ns=None if stamp_ns is None else int(stamp_ns),
     )
 
 
-def worst_first(findings: list[Finding]) -> list[Finding]:
-    """By severity, then as they were found."""
-    return sorted(findings, key=lambda finding: ORDER.index(finding.severity))
+error, warning, note = (partial(_finding, severity) for severity in ORDER)
 
 
-class Thinned(Generic[T]):
-    """Every k-th of a long row of values, at most `limit` of them; k doubles where they would be more."""
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """A row of the table of rates; is_read: by later commands; hz: median; longest_s: interval between two stamps;
+    delay_s: median of log time minus stamp.
+    """
 
-    def __init__(self, limit: int) -> None:
-        self._limit, self._step, self._num = limit, 1, 0
-        self._kept: list[T] = []
+    topic: str
+    is_read: bool
+    messages: int
+    hz: float | None
+    longest_s: float | None
+    delay_s: float | None
 
-    def is_next(self) -> bool:
-        """Whether the value that comes now is kept; to be asked once for each value, before `add`."""
-        is_kept = self._num % self._step == 0
-        self._num += 1
-        return is_kept
 
-    def add(self, value: T) -> None:
-        """Keep it."""
-        self._kept.append(value)
-        if len(self._kept) > self._limit:
-            self._kept = self._kept[::2]
-            self._step *= 2
+@dataclass(frozen=True, kw_only=True)
+class Need:
+    """A later command, and what keeps this recording from it; empty where it can start."""
 
-    def change(self, by: Callable[[T], T]) -> None:
-        """Put something else in the place of each value."""
-        self._kept = [by(value) for value in self._kept]
+    command: str
+    lacks: tuple[str, ...]
 
-    def __iter__(self) -> Iterator[T]:
-        return iter(self._kept)
 
-    def __len__(self) -> int:
-        return len(self._kept)
+@dataclass(frozen=True, kw_only=True)
+class CheckReport:
+    """A checked recording: findings, rates by topic, needs by command; frames: reduced views, without colour, of
+    every camera that has poses.
+    """
+
+    path: str
+    kind: str
+    duration_s: float
+    num_messages: int
+    start_ns: int | None
+    findings: Sequence[Finding]
+    rates: Sequence[Rate] = ()
+    needs: Sequence[Need] = ()
+    frames: Sequence[RgbdFrame] = field(default=(), repr=False)
+
+    @property
+    def unit(self) -> str:
+        """What `num_messages` counts."""
+        return "frames and states" if self.kind in {"capture", "image folder"} else "messages"
+
+    @property
+    def sorted_findings(self) -> list[Finding]:
+        """Worst first, then as they were found."""
+        return sorted(self.findings, key=lambda finding: ORDER.index(finding.severity))
+
+    def lacks(self, need: Need) -> tuple[str, ...]:
+        """What keeps a command from this recording, the errors among the findings included."""
+        return (*need.lacks, *(f"{f.where}: {f.what} [{f.code}]" for f in self.refusing(need)))
+
+    def refusing(self, need: Need) -> list[Finding]:
+        """The errors among the findings that keep a command from this recording."""
+        errors = [f for f in self.sorted_findings if f.severity is Severity.ERROR]
+        return [f for f in errors if need.command in CHECKS[f.code].blocked]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Findings by severity."""
+        return {str(s): sum(f.severity is s for f in self.findings) for s in ORDER}
+
+    def seconds(self, finding: Finding) -> float | None:
+        """When a finding was first met, from the start of the recording."""
+        if finding.stamp_ns is None or self.start_ns is None:
+            return None
+        return round((finding.stamp_ns - self.start_ns) * 1e-9, 3)
+
+    def as_dict(self) -> Mapping[str, object]:
+        """Plain values for JSON."""
+        return {
+            "path": self.path,
+            "kind": self.kind,
+            "duration_s": self.duration_s,
+            "messages": self.num_messages,
+            "counts": self.counts,
+            "findings": [
+                {
+                    "severity": str(f.severity),
+                    "code": f.code,
+                    "where": f.where,
+                    "what": f.what,
+                    "value": f.value,
+                    "unit": f.unit,
+                    "at_s": self.seconds(f),
+                    "stamp_ns": f.stamp_ns,
+                    "remedy": f.remedy,
+                }
+                for f in self.sorted_findings
+            ],
+            "rates": [vars(rate) for rate in self.rates],
+            "commands": {need.command: list(self.lacks(need)) for need in self.needs},
+        }
+
+
+def needs(*, num_cameras: int, num_frames: int, states_lack: str) -> list[Need]:
+    """One for each later command, errors among the findings apart. states_lack: why there are no joint states."""
+    too_few = "one camera and less than three frames: nothing can be held out; record more views"
+    lacks = {
+        "score": too_few if num_cameras == 1 and 0 < num_frames < 3 else "",
+        "replay": states_lack,
+    }
+    return [Need(command=name, lacks=tuple(filter(None, [lacks.get(name)]))) for name in ALL]
+
+
+def damage_findings(where: str, notes: Sequence[str]) -> list[Finding]:
+    """One for each kind of damage, with how often it is met."""
+    remedy = "copy the file again; if it stays, look at what wrote these messages"
+    return [
+        warning("damaged", where, text if num == 1 else f"{text} ({num} times)", remedy, value=num)
+        for text, num in Counter(notes).items()
+    ]

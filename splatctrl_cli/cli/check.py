@@ -8,10 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.check_report import CheckReport
 from splatctrl_cli.checks.check_source import check_source
-from splatctrl_cli.checks.check_times import Rate
-from splatctrl_cli.checks.finding import Finding, Severity, error, note
+from splatctrl_cli.checks.finding import CheckReport, Finding, Rate, Severity, error, note
 from splatctrl_cli.cli.common import Console, Subparsers, add_command, table
 from splatctrl_cli.cli.numbers import several
 from splatctrl_cli.cli.robot_options import add_lock, locked_joints

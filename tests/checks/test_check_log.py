@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.check_report import CheckReport
-from splatctrl_cli.checks.finding import Finding, Severity
+from splatctrl_cli.checks.finding import CheckReport, Finding, Severity
 from splatctrl_cli.containers.bag_log import open_raw_log
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel

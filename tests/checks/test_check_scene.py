@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.checks.check_alignment import alignment_findings
+from splatctrl_cli.checks.check_arm import motion_findings
+from splatctrl_cli.checks.check_images import alignment_findings
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.check_report import usable_frames
-from splatctrl_cli.checks.check_robot import motion_findings
+from splatctrl_cli.checks.check_recording import usable_frames
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_views import ViewsCheck, check_views
+from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
-from splatctrl_cli.checks.state_motion import ImageMotion
 from splatctrl_cli.containers.bag_log import open_raw_log
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.checks.state_check import PoseVerdict, check_angles, pose_agreement
+from splatctrl_cli.checks.check_states import PoseVerdict, check_angles, pose_agreement
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.records import Float64, JointState

@@ -7,8 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.checks.state_motion import CameraMotion, ImageMotion, silhouettes
-from splatctrl_cli.checks.state_offset import ClockOffset, RobotPoints, estimate_clock_offset, states_asked
+from splatctrl_cli.checks.clock_offset import (
+    CameraMotion,
+    ClockOffset,
+    ImageMotion,
+    RobotPoints,
+    estimate_clock_offset,
+    silhouettes,
+    states_asked,
+)
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel

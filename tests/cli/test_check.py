@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from splatctrl_cli.checks.check_report import BLOCKED
+from splatctrl_cli.checks.finding import CHECKS
 from tests.cli.test_ingest import run
 from tests.files.break_log import Message, broken_log
 from tests.logs.make_log import LogRecipe, make_log
@@ -54,7 +54,7 @@ def test_an_error_fails_unless_never(
         "/cam0/depth/image_raw",
     )
     assert finding["value"] == pytest.approx(0.001)
-    assert all("depth-scale" in result["commands"][name][-1] for name in BLOCKED["depth-scale"])
+    assert all("depth-scale" in result["commands"][name][-1] for name in CHECKS["depth-scale"].blocked)
 
 
 def test_cameras_whose_poses_disagree_are_an_error_with_millimetres(

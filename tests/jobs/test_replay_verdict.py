@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.checks.state_offset import ClockOffset
+from splatctrl_cli.checks.clock_offset import ClockOffset
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.grid_files.grid import read_npz, write_npz

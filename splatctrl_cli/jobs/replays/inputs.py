@@ -7,9 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.checks.state_check import PoseAgreement, check_angles, check_states, pose_agreement
-from splatctrl_cli.checks.state_motion import ImageMotion
-from splatctrl_cli.checks.state_offset import ClockOffset, RobotPoints, estimate_clock_offset, states_asked
+from splatctrl_cli.checks.check_states import PoseAgreement, check_angles, check_states, pose_agreement
+from splatctrl_cli.checks.clock_offset import (
+    ClockOffset,
+    ImageMotion,
+    RobotPoints,
+    estimate_clock_offset,
+    states_asked,
+)
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.geometry import transform_from
