@@ -10,7 +10,7 @@ from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.logs.decoder import CAMERA_INFO
 from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
-from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS
+from splatctrl_cli.logs.registration import DISTORTION_MODELS, NUM_COEFFICIENTS, SAME_MODELS
 from splatctrl_cli.logs.rig import Camera, intrinsics_of, nearest_gap_ns
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.logs.tf_tree import MAX_GAP_NS
@@ -98,7 +98,8 @@ def _distortion(name: str, calibration: Calibration) -> list[Finding]:
     if len(d) not in NUM_DISTORTION[model]:
         expected = " or ".join(map(str, NUM_DISTORTION[model]))
         text = f"{model} with {len(d)} coefficients, expected {expected}"
-        return [warning("distortion", name, text, "calibrate again", value=len(d))]
+        make = warning if len(d) in NUM_COEFFICIENTS else error
+        return [make("distortion", name, text, "calibrate again", value=len(d))]
     figures = ", ".join(f"{v:.4g}" for v in d[:5])
     return [note("distortion", name, f"{model} ({figures}): ingest undistorts, images do not pass through unchanged")]
 

@@ -82,8 +82,8 @@ uncalibrated | note, warning |  | a CameraInfo whose K is zero; a note where no 
 camera-info-size | error | all | a CameraInfo of another size than its images
 camera-info-changes | warning |  | a CameraInfo that changes within the log
 camera-info-two | warning |  | a second CameraInfo for the same frame and size, with another K
-distortion | note, warning, error | all | distorted images (note); a wrong number of coefficients (warning); a model
-    that is not known (error)
+distortion | note, warning, error | all | distorted images (note); a wrong number of coefficients (warning); a number
+    that cannot be read, or a model that is not known (error)
 tf-gap | warning |  | a moving transform pauses
 tf-ends | warning |  | a moving transform ends over 1 s before the last image
 tf-roots | note, error | all | separate trees; an error where the cameras are in several

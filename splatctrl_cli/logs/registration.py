@@ -10,6 +10,7 @@ from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV takes
 LEAST_SEEN = 0.25  # of an undistorted image
 FARTHEST = 20.0  # from the optical axis, at a depth of one: 87 degrees
 SAME_MODELS = {  # what others call them
@@ -67,6 +68,12 @@ class Undistortion:
     """
 
     def __init__(self, intrinsics: Intrinsics, model: str, coefficients: Float64) -> None:
+        if len(coefficients) not in NUM_COEFFICIENTS:
+            expected = ", ".join(map(str, NUM_COEFFICIENTS))
+            raise InputError(
+                f"distortion model {model}: expected {expected} coefficients, got {len(coefficients)}",
+                remedy="calibrate again, or fill up with zeros",
+            )
         self.intrinsics = intrinsics
         self._map_u, self._map_v = _maps(intrinsics, model, coefficients)
         is_seen = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
