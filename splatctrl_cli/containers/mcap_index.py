@@ -1,7 +1,7 @@
 """What an MCAP holds without reading it: from the heads of its records, where no summary says so."""
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_records import (
@@ -55,7 +55,7 @@ def index_by_heads(file: McapFile) -> LogIndex:
                 channel, size = struct.unpack_from("<HI", content)
                 counts[channel] = counts.get(channel, 0) + size // 16
                 offsets = {**chunks[-1].message_index_offsets, channel: offset}
-                chunks[-1] = replace(chunks[-1], message_index_offsets=offsets)
+                chunks[-1] = chunks[-1]._replace(message_index_offsets=offsets)
             elif opcode == MESSAGE:
                 channel, _, stamp, _ = struct.unpack_from("<HIQQ", content)
                 counts[channel] = counts.get(channel, 0) + 1

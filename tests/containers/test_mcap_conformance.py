@@ -4,7 +4,6 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.mcap_records import ATTACHMENT, Attachment, Chunk, Message, MessageIndex, parse_record
+from splatctrl_cli.containers.mcap_records import ATTACHMENT, Attachment, Chunk, MessageIndex, parse_record
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.files.unpacking import unpacked
 
@@ -46,7 +45,7 @@ def records_in(chunk: Chunk) -> Iterator[Any]:
 
 def as_json(record: Any) -> dict[str, Any]:
     """A record in the suite's form: numbers as text, bytes as lists of numbers, fields by name."""
-    fields = record._asdict() if isinstance(record, Message) else asdict(record)
+    fields = record._asdict()
     if isinstance(record, Attachment):
         fields.pop("crc")  # the walk has checked it
     return {"type": type(record).__name__, "fields": [[name, _value(fields[name])] for name in sorted(fields)]}
