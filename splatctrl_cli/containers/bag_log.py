@@ -1,48 +1,73 @@
-"""Opens a recorded log by its content: one file, or the folder of a ROS 2 bag."""
+"""Opens a recorded log by its content: one file, the folder of a ROS 2 bag, or several logs of one session."""
 
+import heapq
 import re
-from collections.abc import Collection, Iterator
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from splatctrl_cli.containers.bag1_log import Bag1Log
-from splatctrl_cli.containers.compressed_log import (
-    UnpackedFile,
-    UnpackedFileLog,
-    UnpackedMessagesLog,
-    check_compression,
-)
+from splatctrl_cli.containers.compressed_log import UnpackedMessagesLog, check_compression, unpack
 from splatctrl_cli.containers.db3_log import Db3Log
 from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.containers.raw_log import Damage, JoinedLog, RawLog, RawMessage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import names_in
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
-class SplitLog:
-    """Files of one recording, read one after the other."""
+@dataclass(frozen=True, kw_only=True)
+class Container:
+    """A kind of file with messages: its usual suffix, its first bytes, and how a file of it is opened."""
 
-    def __init__(self, path: Path, parts: tuple[RawLog, ...], container: str, note: str = "") -> None:
-        """note: what is wrong with the folder itself, counted as damage; empty where nothing."""
-        self.path = path
-        self.files = tuple(file for part in parts for file in part.files)
-        self.container = container
-        self._parts, self._note = parts, note
+    suffix: str
+    magic: bytes
+    open: Callable[[Path], RawLog]
 
-    def topics(self) -> tuple[Topic, ...]:
-        """The topics of all parts, each once."""
-        return tuple(dict.fromkeys(topic for part in self._parts for topic in part.topics()))
+
+CONTAINERS = (
+    Container(suffix=".mcap", magic=b"\x89MCAP0\r\n", open=McapLog),
+    Container(suffix=".bag", magic=b"#ROSBAG V", open=Bag1Log),
+    Container(suffix=".db3", magic=b"SQLite format 3", open=Db3Log),
+)
+SUFFIXES = tuple(kind.suffix for kind in CONTAINERS)
+
+
+class SessionLog(JoinedLog):
+    """Logs that were recorded at the same time, as cameras in one and joints in another: by the time of logging."""
+
+    def __init__(self, parts: tuple[RawLog, ...]) -> None:
+        path = parts[0].path.with_name("+".join(part.path.name for part in parts))
+        super().__init__(path, parts, " + ".join(dict.fromkeys(part.container for part in parts)))
 
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of each part in turn."""
-        if self._note:
-            damage.add(self._note)
+        """Yield the messages of all parts by time of logging.
+
+        Where two parts share a topic, leaving others out would change the order in which its messages meet; it must
+        be the same in every pass, so all are read then.
+        """
+        pushed = None if names is None or self._share(names) else names
+        parts = (part.messages(damage, pushed) for part in self._parts)
+        for message in heapq.merge(*parts, key=lambda message: message.log_time_ns):
+            if names is None or message.topic.name in names:
+                yield message
+
+    def _share(self, names: Collection[str]) -> bool:
+        seen: set[str] = set()
         for part in self._parts:
-            yield from part.messages(damage, names)
+            here = {topic.name for topic in part.topics()}
+            if not here or seen & here & set(names):  # a log without index may hold anything
+                return True
+            seen |= here
+        return False
 
 
 def open_raw_log(path: Path) -> RawLog:
@@ -56,15 +81,12 @@ def open_raw_log(path: Path) -> RawLog:
         raise InputError(f"{path}: the file is empty (0 bytes)", remedy="record or copy it again")
     with path.open("rb") as stream:
         magic = stream.read(16)
-    if magic.startswith(b"\x89MCAP0\r\n"):
-        return McapLog(path)
-    if magic.startswith(b"#ROSBAG V"):
-        return Bag1Log(path)
-    if magic.startswith(b"SQLite format 3"):
-        return Db3Log(path)
+    kind = next((kind for kind in CONTAINERS if magic.startswith(kind.magic)), None)
+    if kind is not None:
+        return kind.open(path)
     if magic.startswith(_ZSTD):
         return _open_compressed(path)
-    if path.suffix in {".mcap", ".bag", ".db3"}:
+    if path.suffix in SUFFIXES:
         raise InputError(
             f"{path}: does not begin like a {path.suffix} file (first bytes {magic[:8]!r})",
             remedy="the file is damaged or has the wrong name",
@@ -93,7 +115,7 @@ def _open_folder(path: Path) -> RawLog:
     parts = tuple(open_raw_log(file) for file in files)
     kind = "mcap" if ".mcap" in files[0].suffixes else "sqlite3"
     container = f"ROS 2 bag ({kind}, {len(parts)} file{'s' if len(parts) > 1 else ''})"
-    log = SplitLog(path, parts, container, note)
+    log = JoinedLog(path, parts, container, note=note)
     is_by_message = mode == "message" or (not told and _begins_compressed(parts))
     return UnpackedMessagesLog(log) if is_by_message else log
 
@@ -116,17 +138,26 @@ def _begins_compressed(parts: tuple[RawLog, ...]) -> bool:
 
 
 def _open_compressed(path: Path) -> RawLog:
-    file = UnpackedFile(path)
-    if file.unpacked.stat().st_size == 0:
-        raise InputError(f"{path}: {file.note or 'holds nothing'}", remedy="copy it again")
-    with file.unpacked.open("rb") as stream:
-        if stream.read(4) == _ZSTD:
+    """The log in a .zstd file, unpacked into a temporary folder that goes when the log does."""
+    folder = Path(tempfile.mkdtemp(prefix="splatctrl-"))
+    file = folder / path.stem
+    with ExitStack() as stack:
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        note = unpack(path, file)
+        with file.open("rb") as stream:
+            start = stream.read(4)
+        if not start:
+            raise InputError(f"{path}: {note or 'holds nothing'}", remedy="copy it again")
+        if start == _ZSTD:
             raise InputError(f"{path}: compressed twice", remedy="unpack it with zstd -d")
-    try:
-        return UnpackedFileLog(file, open_raw_log(file.unpacked))
-    except InputError as error:
-        message = error.message.removeprefix(f"{file.unpacked}: ")
-        raise InputError(f"{path}: {message}", remedy=error.remedy) from None
+        try:
+            part = open_raw_log(file)
+        except InputError as error:
+            message = error.message.removeprefix(f"{file}: ")
+            raise InputError(f"{path}: {message}", remedy=error.remedy) from None
+        log = JoinedLog(path, (part,), part.container, files=(path,), note=f"{path.name}: {note}" if note else "")
+        weakref.finalize(log, stack.pop_all().close)
+    return log
 
 
 def _ordered_files(path: Path, told: dict[str, Any]) -> list[Path]:

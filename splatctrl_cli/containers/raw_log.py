@@ -1,6 +1,6 @@
 """Recorded messages as bytes, in the order of the file, whatever the container; damage is counted, not raised."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -80,3 +80,26 @@ class RawLog(Protocol):
     def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Yield the messages of topics `names` (all, if None) in file order; what is damaged goes to `damage`."""
         ...
+
+
+class JoinedLog:
+    """Logs as one, read one after the other; a note says what is wrong with them together, and counts as damage."""
+
+    def __init__(
+        self, path: Path, parts: Sequence[RawLog], container: str, *, files: tuple[Path, ...] = (), note: str = ""
+    ) -> None:
+        """files: those that the log consists of, by default those of its parts."""
+        self.path, self.container = path, container
+        self.files = files or tuple(file for part in parts for file in part.files)
+        self._parts, self._note = parts, note
+
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics of all parts, each once."""
+        return tuple(dict.fromkeys(topic for part in self._parts for topic in part.topics()))
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Yield the messages of each part in turn."""
+        if self._note:
+            damage.add(self._note)
+        for part in self._parts:
+            yield from part.messages(damage, names)

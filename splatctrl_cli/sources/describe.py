@@ -8,7 +8,7 @@ from typing import Any
 from splatctrl_cli.captures.capture import is_capture, read_capture_header
 from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.containers.bag_log import CONTAINERS, SUFFIXES, is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
 from splatctrl_cli.datasets.layouts import layout_of, open_layout, readable_in
@@ -24,9 +24,6 @@ from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
 from splatctrl_cli.sources.describe_file import describe_file
 
-_LOG_MAGICS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3")
-_LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
-
 
 def describe(path: Path, options: SourceOptions | None = None) -> Summary:
     """Describe `path`. Raises InputError where there is nothing, or nothing known."""
@@ -37,7 +34,7 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
         return _describe_folder(path, options)
     with path.open("rb") as stream:
         start = stream.read(16)
-    if start.startswith(_LOG_MAGICS) or path.suffix in _LOG_SUFFIXES:
+    if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in SUFFIXES:
         return describe_log(open_raw_log(path), options)
     if path.suffix == ".toml":
         return _describe_images(path, open_image_folder(path, options), "image folder")

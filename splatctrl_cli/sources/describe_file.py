@@ -13,6 +13,7 @@ import yaml
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
+from splatctrl_cli.containers.bag_log import SUFFIXES
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.files.summary import Grid, Summary
@@ -36,7 +37,7 @@ def describe_file(path: Path) -> Summary:
         if (summary := describe(path, head)) is not None:
             return summary
     grids = [Path(f"x{kind.suffix}").suffix for kind in GRID_FORMATS.values()]
-    known = [*(".mcap", ".bag", ".db3", ".toml"), *SPLAT_FORMATS, *(".npz", ".npy"), *grids]
+    known = [*SUFFIXES, ".toml", *SPLAT_FORMATS, *(".npz", ".npy"), *grids]
     known += [".urdf", ".json", ".jsonl", ".csv", ".yaml", ".png", ".jpg"]
     raise InputError(f"{path}: unknown kind of file", remedy=f"known: {' '.join(dict.fromkeys(known))}")
 

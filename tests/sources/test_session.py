@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatctrl_cli.containers.bag_log import SessionLog
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
-from splatctrl_cli.containers.session_log import SessionLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.image_stamps import StampClock, dropped, first_of_each
 from splatctrl_cli.logs.options import SourceOptions
