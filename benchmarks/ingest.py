@@ -189,8 +189,8 @@ def _decode(images: list[bytes], num_pairs: int) -> None:
 
 def _access(capture: CaptureSource, numbers: list[int]) -> None:
     for number in numbers:
-        shot = capture.shot_at(number)
-        assert shot is not None and shot.frame.depth.shape == (480, 640)
+        stored = capture.stored_at(number)
+        assert stored is not None and stored.frame.depth.shape == (480, 640)
 
 
 def _peak(log: Path, out: Path) -> float:

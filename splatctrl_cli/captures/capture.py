@@ -26,7 +26,7 @@ from splatctrl_cli.logs.joint_topics import (
 )
 from splatctrl_cli.logs.messages import decode_file, metres
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.shot import Shot, human_mask, merged
+from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask, merged
 from splatctrl_cli.records import (
     Bool,
     Float32,
@@ -93,13 +93,12 @@ class CaptureSource:
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
-        for item in self.shots():
-            yield item.frame if isinstance(item, Shot) else item
+        return decoded(self.stored())
 
-    def shots(self) -> Iterator[Shot | JointState]:
-        """Joint states and shots by stamp."""
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """Joint states and stored frames by stamp."""
         self._damaged = []
-        return merged(self._joints, self._shots())
+        return merged(self._joints, self._stored_frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every row of frames.csv."""
@@ -110,12 +109,12 @@ class CaptureSource:
         return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS")}
 
     def __len__(self) -> int:
-        """Frames that `shot_at` knows."""
+        """Frames that `stored_at` knows."""
         return len(self._rows)
 
-    def shot_at(self, number: int) -> Shot | None:
+    def stored_at(self, number: int) -> StoredFrame | None:
         """A frame by its number among those of `cameras`, without reading others; None where it is damaged."""
-        return self._shot(self._rows[number])
+        return self._stored_frame(self._rows[number])
 
     def row(self, number: int) -> Mapping[str, str]:
         """What frames.csv says of a frame, by its number."""
@@ -125,13 +124,13 @@ class CaptureSource:
         """The joint states, by stamp."""
         return self._joints
 
-    def _shots(self) -> Iterator[Shot]:
+    def _stored_frames(self) -> Iterator[StoredFrame]:
         for row in self._rows:
-            shot = self._shot(row)
-            if shot is not None:
-                yield shot
+            stored = self._stored_frame(row)
+            if stored is not None:
+                yield stored
 
-    def _shot(self, row: Mapping[str, str]) -> Shot | None:
+    def _stored_frame(self, row: Mapping[str, str]) -> StoredFrame | None:
         """The frame of a row; None, and counted, where an image is not as it was written."""
         color_bytes, depth_bytes = self._read(row["color"]), self._read(row["depth"])
         human_bytes = self._read(row["human"]) if row.get("human") else None
@@ -148,7 +147,7 @@ class CaptureSource:
             self._damaged.append(f"{row['color']}, {row['depth']}: expected images of {size} as capture.json says")
             return None
         intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
-        return Shot.of(
+        return StoredFrame.of(
             RgbdFrame(
                 stamp_ns=int(row["stamp_ns"]),
                 camera=row["camera"],

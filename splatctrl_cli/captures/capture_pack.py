@@ -45,12 +45,14 @@ def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | Non
         states = iter(source.states())
         state = next(states, None)
         for number in range(len(source)):
-            row, shot = source.row(number), source.shot_at(number)
-            if shot is None:
+            row, stored = source.row(number), source.stored_at(number)
+            if stored is None:
                 raise InputError(f"{capture}: {source.loss.notes[-1]}", remedy="run `splatctrl ingest` again")
-            while state is not None and state.stamp_ns <= shot.frame.stamp_ns:
+            while state is not None and state.stamp_ns <= stored.frame.stamp_ns:
                 state = _add_state(log, state, source, states)
-            _add_frame(log, shot.frame, shot.depth_unit, {n: capture / row[n] for n in _IMAGES if row.get(n)}, source)
+            _add_frame(
+                log, stored.frame, stored.depth_unit, {n: capture / row[n] for n in _IMAGES if row.get(n)}, source
+            )
             if progress is not None:
                 progress(number + 1)
         while state is not None:

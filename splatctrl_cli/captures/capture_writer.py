@@ -22,8 +22,8 @@ from splatctrl_cli.files.rows import Table, blocks_of
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.logs.joint_topics import FOLDER, JointTopics, write_topics
 from splatctrl_cli.logs.messages import metres
-from splatctrl_cli.logs.shot import Shot, ShotSource
 from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import Float32, JointState, LossReport
 
 FORMAT, VERSION = "splatctrl-capture", 1
@@ -49,7 +49,7 @@ class CaptureSummary:
 
 def write_capture(
     folder: Path,
-    source: ShotSource,
+    source: FrameSource,
     *,
     topics: JointTopics | None = None,
     progress: Callable[[int], None] | None = None,
@@ -67,14 +67,14 @@ def write_capture(
     cameras: dict[str, dict[str, Any]] = {}
     num_states = num_resumed = 0
     with Journal(folder, identity or {}) as journal:
-        for item in source.shots():
+        for item in source.stored():
             if isinstance(item, JointState):
                 states.add(item)
                 num_states += 1
                 continue
             row, kept = _row(item, cameras), journal.kept()
             if kept is None:
-                journal.add(_write_shot(folder, item, row, cameras[item.camera]))
+                journal.add(_write_frame(folder, item, row, cameras[item.camera]))
             else:
                 check_same_frame(folder, kept.row, row)
                 num_resumed += 1
@@ -137,74 +137,76 @@ def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics:
     sums.write(folder / "SHA256SUMS")
 
 
-def _row(shot: Shot, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
+def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, str]:
     """The frame's row of frames.csv, but for the suffixes of its files; its camera is counted."""
-    if shot.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(shot.camera):
-        raise InputError(f"{shot.origin}: camera {shot.camera!r}: cannot name a folder", remedy="name it otherwise")
-    unit = FLOAT_DEPTH_UNIT if shot.depth_unit is None else shot.depth_unit
-    lens = vars(shot.intrinsics)
-    camera = cameras.setdefault(shot.camera, {**lens, "depth_scale": unit, "num_frames": 0})
-    if any(camera[name] != value for name, value in lens.items()):
+    if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
         raise InputError(
-            f"{shot.origin}: camera {shot.camera} changes its lens, and a capture holds one of each camera",
+            f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="name it otherwise"
+        )
+    unit = FLOAT_DEPTH_UNIT if stored.depth_unit is None else stored.depth_unit
+    intrinsics = vars(stored.intrinsics)
+    camera = cameras.setdefault(stored.camera, {**intrinsics, "depth_scale": unit, "num_frames": 0})
+    if any(camera[name] != value for name, value in intrinsics.items()):
+        raise InputError(
+            f"{stored.origin}: camera {stored.camera} changes its intrinsics; a capture holds one set of each camera",
             remedy="leave --holdout to `reconstruct` and `score`",
         )
     camera["num_frames"] += 1
-    T = shot.T_world_camera
+    T = stored.T_world_camera
     pose = [repr(float(value)) for value in (*T[:3, 3], *quat_from_rotation(T[:3, :3]))]
     return {
-        "camera": shot.camera,
-        "stamp_ns": str(shot.stamp_ns),
+        "camera": stored.camera,
+        "stamp_ns": str(stored.stamp_ns),
         **dict(zip(COLUMNS[4:11], pose, strict=True)),
-        "source": shot.origin,
+        "source": stored.origin,
     }
 
 
-def _write_shot(folder: Path, shot: Shot, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
+def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera: Mapping[str, Any]) -> Entry:
     """Write the images of a frame whose row is without their names."""
     sums: list[tuple[str, str]] = []
     stem, unit = f"{camera['num_frames'] - 1:06d}", float(camera["depth_scale"])
-    color = shot.color_file
+    color = stored.color_file
     if color is None:
-        color = encoded(cv2.cvtColor(shot.color, cv2.COLOR_RGB2BGR))
+        color = encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
     is_png = color.startswith(b"\x89PNG")
-    color_name = f"color/{shot.camera}/{stem}.{'png' if is_png else 'jpg'}"
-    kind, depth = _depth_file(shot, unit)
-    depth_name = f"depth/{shot.camera}/{stem}.{kind}"
+    color_name = f"color/{stored.camera}/{stem}.{'png' if is_png else 'jpg'}"
+    kind, depth = _depth_file(stored, unit)
+    depth_name = f"depth/{stored.camera}/{stem}.{kind}"
     files = {color_name: color, depth_name: depth}
     named = {"color": color_name, "depth": depth_name}
-    if shot.human is not None:
-        named["human"] = f"human/{shot.camera}/{stem}.png"
-        files[named["human"]] = encoded(shot.human * np.uint8(255))
-    if shot.valid is not None:
-        mask = encoded(shot.valid * np.uint8(255))
-        named["valid"] = f"valid/{shot.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
+    if stored.human is not None:
+        named["human"] = f"human/{stored.camera}/{stem}.png"
+        files[named["human"]] = encoded(stored.human * np.uint8(255))
+    if stored.valid is not None:
+        mask = encoded(stored.valid * np.uint8(255))
+        named["valid"] = f"valid/{stored.camera}/{hashlib.sha256(mask).hexdigest()[:16]}.png"
         files[named["valid"]] = mask
     for name, data in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
         sums.append((hashlib.sha256(data).hexdigest(), name))
-    return Entry(row=row | named, sums=sums, provenance=_provenance(shot, color_name, depth_name))
+    return Entry(row=row | named, sums=sums, provenance=_provenance(stored, color_name, depth_name))
 
 
-def _provenance(shot: Shot, color: str, depth: str) -> dict[str, str]:
+def _provenance(stored: StoredFrame, color: str, depth: str) -> dict[str, str]:
     """Where the images of a frame were recorded; a byte that is not known stays empty."""
-    if not shot.places:
+    if not stored.places:
         return {}
     found = {"color": color, "depth": depth}
-    for kind, place in zip(("color", "depth"), shot.places, strict=False):
+    for kind, place in zip(("color", "depth"), stored.places, strict=False):
         offset = "" if place.offset < 0 else str(place.offset)
         found |= {f"{kind}_file": place.file, f"{kind}_offset": offset, f"{kind}_log_time_ns": str(place.log_time_ns)}
     return found
 
 
-def _depth_file(shot: Shot, unit: float) -> tuple[str, bytes]:
+def _depth_file(stored: StoredFrame, unit: float) -> tuple[str, bytes]:
     """Suffix and bytes of the depth image: the recorded PNG where it counts in the camera's unit."""
-    if shot.depth_file is not None and shot.depth_unit == unit:
-        return "png", shot.depth_file
-    counts = _counts(shot.depth, unit, is_exact=shot.depth_unit is not None)
-    return ("npy", _npy(shot.depth)) if counts is None else ("png", encoded(counts))
+    if stored.depth_file is not None and stored.depth_unit == unit:
+        return "png", stored.depth_file
+    counts = _counts(stored.depth, unit, is_exact=stored.depth_unit is not None)
+    return ("npy", _npy(stored.depth)) if counts is None else ("png", encoded(counts))
 
 
 def _counts(depth: Float32, unit: float, *, is_exact: bool) -> np.ndarray[Any, np.dtype[np.uint16]] | None:

@@ -13,7 +13,7 @@ import numpy as np
 from splatctrl_cli.checks.check_times import Thinned
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.logs.messages import MILLIMETRE
-from splatctrl_cli.logs.shot import PLAUSIBLE_DEPTH
+from splatctrl_cli.logs.stored_frame import PLAUSIBLE_DEPTH
 from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8
 
 ROWS = 240  # that a kept depth image has at most

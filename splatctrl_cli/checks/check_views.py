@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.checks.check_images import TABLE_DEPTH, strided_lens
 from splatctrl_cli.checks.finding import Finding, error, warning
 from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
-from splatctrl_cli.logs.shot import PLAUSIBLE_DEPTH
+from splatctrl_cli.logs.stored_frame import PLAUSIBLE_DEPTH
 from splatctrl_cli.records import Bool, Float64, RgbdFrame
 
 ROWS = 80  # of an image that are looked at

@@ -20,7 +20,7 @@ from splatctrl_cli.files.output import sha256
 from splatctrl_cli.logs.messages import decode_file, metres, num_invalid
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion
-from splatctrl_cli.logs.shot import Shot, check_depth, human_mask, is_kept, is_png
+from splatctrl_cli.logs.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
@@ -84,20 +84,19 @@ class ImageFolderSource:
 
     def records(self) -> Iterator[Record]:
         """Frames by stamp."""
-        for item in self.shots():
-            yield item.frame if isinstance(item, Shot) else item
+        return decoded(self.stored())
 
-    def shots(self) -> Iterator[Shot | JointState]:
-        """Shots by stamp."""
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """Stored frames by stamp."""
         self._damaged, self._num_invalid = [], 0
         checked: set[str] = set()
         for view in self._views:
-            shot = self._shot(view)
-            if shot is None:
+            stored = self._stored_frame(view)
+            if stored is None:
                 continue
-            if view.camera not in checked and check_depth(shot.frame.depth, str(view.depth), view.depth_scale):
+            if view.camera not in checked and check_depth(stored.frame.depth, str(view.depth), view.depth_scale):
                 checked.add(view.camera)
-            yield shot
+            yield stored
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every view."""
@@ -122,7 +121,7 @@ class ImageFolderSource:
         first = {description.path.name: description.path} if description.path.is_file() else {}
         return {name: sha256(path) for name, path in {**first, **dict(sorted(named.items()))}.items()}
 
-    def _shot(self, view: View) -> Shot | None:
+    def _stored_frame(self, view: View) -> StoredFrame | None:
         color_bytes = view.color.read_bytes()
         color = decode_file(color_bytes, color=True)
         depth = self._depth(view)
@@ -145,7 +144,7 @@ class ImageFolderSource:
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
         is_counts = lens.registration is None and not _is_float(self._description.depth.encoding, view.depth)
         is_plain = lens.undistortion is None
-        return Shot.of(
+        return StoredFrame.of(
             RgbdFrame(
                 stamp_ns=view.stamp_ns,
                 camera=view.camera,
@@ -305,12 +304,11 @@ class RigFolderSource:
 
     def records(self) -> Iterator[Record]:
         """Frames by stamp."""
-        for item in self.shots():
-            yield item.frame if isinstance(item, Shot) else item
+        return decoded(self.stored())
 
-    def shots(self) -> Iterator[Shot | JointState]:
-        """Shots by stamp, of the same stamp by camera."""
-        return heapq.merge(*(part.shots() for part in self._parts), key=_stamp_ns)
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """Stored frames by stamp, of the same stamp by camera."""
+        return heapq.merge(*(part.stored() for part in self._parts), key=_stamp_ns)
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every view."""
@@ -325,5 +323,5 @@ class RigFolderSource:
         return {name: digest for part in self._parts for name, digest in part.digests().items()}
 
 
-def _stamp_ns(item: Shot | JointState) -> int:
+def _stamp_ns(item: StoredFrame | JointState) -> int:
     return item.stamp_ns

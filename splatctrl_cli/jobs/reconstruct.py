@@ -14,7 +14,7 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.reconstruction import Reconstruction, training_cameras
 from splatctrl_cli.jobs.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
-from splatctrl_cli.logs.shot import ShotSource
+from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Box, RecordSource
 from splatctrl_cli.robot.declared import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -176,7 +176,7 @@ def _robot(request: ReconstructRequest) -> RobotModel | None:
     return model
 
 
-def check_pose_jumps(source: ShotSource, limit: float) -> None:
+def check_pose_jumps(source: FrameSource, limit: float) -> None:
     """Raise InputError for a camera that is suddenly elsewhere; where nobody knows when, views may lie anywhere."""
     if not limit > 0:
         raise UsageError(f"--max-pose-jump: expected metres, got {limit}")

@@ -110,7 +110,7 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
         return False
     calibration = survey.topics[info].calibration if info else None
     depth_calibration = survey.topics[depth_info].calibration if depth_info else None
-    return calibration is None or depth_calibration is None or _same_lens(calibration, depth_calibration)
+    return calibration is None or depth_calibration is None or _same_intrinsics(calibration, depth_calibration)
 
 
 def common_prefix(name: str, other: str) -> tuple[str, ...]:
@@ -123,7 +123,7 @@ def common_prefix(name: str, other: str) -> tuple[str, ...]:
     return tuple(shared)
 
 
-def _same_lens(a: Calibration, b: Calibration) -> bool:
+def _same_intrinsics(a: Calibration, b: Calibration) -> bool:
     return bool(abs(a.K - b.K).max() <= 0.01 * a.K[0, 0])
 
 

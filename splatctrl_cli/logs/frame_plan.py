@@ -17,7 +17,7 @@ from splatctrl_cli.files.rows import BLOCK, RowFile, scratch_folder
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.messages import ImageMessage, read_image
 from splatctrl_cli.logs.rig import Camera
-from splatctrl_cli.logs.shot import Place
+from splatctrl_cli.logs.stored_frame import Place
 from splatctrl_cli.records import Float64
 
 Index = NDArray[np.int64]
@@ -228,12 +228,12 @@ def _read(
         read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
         for message, lazily in zip(messages, kept, strict=False)
     ]
-    registration = camera.depth_to_color
-    lenses = (camera.intrinsics, camera.intrinsics if registration is None else registration.depth_intrinsics)
-    for image, lens in zip(images, lenses, strict=False):
-        if (image.width, image.height) != (lens.width, lens.height):
+    depth = camera.depth_to_color
+    expected = (camera.intrinsics, camera.intrinsics if depth is None else depth.depth_intrinsics)
+    for image, k in zip(images, expected, strict=False):
+        if (image.width, image.height) != (k.width, k.height):
             raise UndecodableMessageError(
-                f"expected an image of {lens.width}x{lens.height}, got {image.width}x{image.height}"
+                f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}"
             )
     return images
 

@@ -101,10 +101,10 @@ class Undistortion:
         return np.asarray(cv2.remap(image, self._map_u, self._map_v, cv2.INTER_NEAREST), dtype=np.float32)
 
 
-def _maps(lens: Intrinsics, model: str, coefficients: Float64) -> tuple[Float32, Float32]:
+def _maps(camera: Intrinsics, model: str, coefficients: Float64) -> tuple[Float32, Float32]:
     """Column and row in the distorted image of each pixel of the result."""
-    K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]], dtype=np.float64)
-    size = (lens.width, lens.height)
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=np.float64)
+    size = (camera.width, camera.height)
     if model == "equidistant":
         maps = cv2.fisheye.initUndistortRectifyMap(K, coefficients[:4], np.eye(3), K, size, cv2.CV_32FC1)
     else:
@@ -112,10 +112,10 @@ def _maps(lens: Intrinsics, model: str, coefficients: Float64) -> tuple[Float32,
     return np.asarray(maps[0]), np.asarray(maps[1])
 
 
-def _radii(lens: Intrinsics) -> Float64:
+def _radii(camera: Intrinsics) -> Float64:
     """Distance of each pixel (H, W) from the optical axis, at a depth of one."""
-    u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
-    return np.asarray(np.hypot((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy))
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return np.asarray(np.hypot((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy))
 
 
 def _largest_radius(model: str, coefficients: Float64) -> float:

@@ -20,8 +20,17 @@ from splatctrl_cli.logs.joint_topics import topics_of, with_joints
 from splatctrl_cli.logs.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid
 from splatctrl_cli.logs.options import SourceOptions, still_note
 from splatctrl_cli.logs.rig import Camera, build_cameras, nearest_gap_ns
-from splatctrl_cli.logs.shot import Place, Shot, check_depth, human_mask, is_kept, is_png, merged
 from splatctrl_cli.logs.state_topics import joint_records
+from splatctrl_cli.logs.stored_frame import (
+    Place,
+    StoredFrame,
+    check_depth,
+    decoded,
+    human_mask,
+    is_kept,
+    is_png,
+    merged,
+)
 from splatctrl_cli.logs.survey import Survey, survey
 from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8
 
@@ -66,16 +75,15 @@ class RosLogSource:
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
-        for item in self._merged(lazily=False):
-            yield item.frame if isinstance(item, Shot) else item
+        return decoded(self._merged(lazily=False))
 
-    def shots(self) -> Iterator[Shot | JointState]:
-        """Joint states and shots by stamp; image files that need no change are only decoded on demand."""
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """Joint states and stored frames by stamp; image files that need no change are only decoded on demand."""
         return self._merged(lazily=True)
 
-    def _merged(self, *, lazily: bool) -> Iterator[Shot | JointState]:
+    def _merged(self, *, lazily: bool) -> Iterator[StoredFrame | JointState]:
         self._damage, self._num_invalid = Damage(), 0
-        return merged(self._joints, self._shots(lazily=lazily))
+        return merged(self._joints, self._stored_frames(lazily=lazily))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every planned frame."""
@@ -149,7 +157,7 @@ class RosLogSource:
             )
         self._loss.without_pose += len(color) - num
 
-    def _shots(self, *, lazily: bool) -> Iterator[Shot]:
+    def _stored_frames(self, *, lazily: bool) -> Iterator[StoredFrame]:
         images = PlannedImages(self._log, self._plan)
         checked: set[str] = set()
 
@@ -160,26 +168,26 @@ class RosLogSource:
             human = self._human(planned.camera, masks[0]) if masks else None
             if not depth.is_counts:
                 self._num_invalid += num_invalid(depth.pixels)
-            shot = _shot(planned, color, depth, human, places)
+            stored = _stored_frame(planned, color, depth, human, places)
             camera = planned.camera
             if camera.name not in checked:
                 scale = _scale(depth, camera.depth_scale)
-                if check_depth(shot.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
+                if check_depth(stored.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
                     checked.add(camera.name)
-            yield shot
+            yield stored
 
     def _human(self, camera: Camera, mask: ImageMessage) -> UInt8:
         human = human_mask(mask.pixels, camera.intrinsics, f"{self._log.path}: topic {camera.human_topic}")
         return human if camera.undistortion is None else camera.undistortion.labels(human)
 
 
-def _shot(
+def _stored_frame(
     planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, places: tuple[Place, ...]
-) -> Shot:
+) -> StoredFrame:
     camera = planned.camera
     is_counts = depth.is_counts and camera.depth_to_color is None
     keeps_color, keeps_depth, _ = keeps_files(camera)
-    return Shot(
+    return StoredFrame(
         stamp_ns=planned.stamp_ns,
         camera=camera.name,
         intrinsics=camera.intrinsics,

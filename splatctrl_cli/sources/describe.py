@@ -18,7 +18,7 @@ from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.rig import camera_topics, missing
-from splatctrl_cli.logs.shot import Shot
+from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.logs.survey import Survey, TopicSurvey, survey_to_describe
 from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
@@ -201,7 +201,7 @@ def _describe_capture(path: Path) -> Summary:
 
 
 def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, kind: str) -> Summary:
-    first = next((item for item in source.shots() if isinstance(item, Shot)), None)
+    first = next((item for item in source.stored() if isinstance(item, StoredFrame)), None)
     counts = source.count_views()
     facts: dict[str, object] = {"has_clock": source.has_clock}
     if first is not None:

@@ -11,12 +11,12 @@ from splatctrl_cli.datasets.layouts import open_layout
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.ros_log import RosLogSource
-from splatctrl_cli.logs.shot import ShotSource
+from splatctrl_cli.logs.stored_frame import FrameSource
 
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
 
 
-def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
+def open_source(path: Path, options: SourceOptions | None = None) -> FrameSource:
     """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder, or image folder's TOML
     description.
 
@@ -34,7 +34,7 @@ def open_source(path: Path, options: SourceOptions | None = None) -> ShotSource:
     return RosLogSource(open_raw_log(path), options)
 
 
-def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> ShotSource:
+def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
     """The records of one input, or of several logs that were recorded at the same time.
 
     Raises InputError as `open_source`, and where one of several is no log.

@@ -71,8 +71,8 @@ def test_compressed_color_is_kept_byte_for_byte(tmp_path: Path) -> None:
     folder = tmp_path / "x.capture"
     folder.mkdir()
     write_capture(folder, source)
-    shots = [shot for shot in source.shots() if not isinstance(shot, JointState)]
-    assert [(folder / f"color/cam0/{i:06d}.jpg").read_bytes() for i in range(5)] == [s.color_file for s in shots]
+    frames = [stored for stored in source.stored() if not isinstance(stored, JointState)]
+    assert [(folder / f"color/cam0/{i:06d}.jpg").read_bytes() for i in range(5)] == [s.color_file for s in frames]
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:

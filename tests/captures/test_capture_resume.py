@@ -11,7 +11,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.logs import ros_log
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.shot import Shot
+from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import LogRecipe, make_log
@@ -24,16 +24,16 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def interrupted(log: Path, out: Path, monkeypatch: pytest.MonkeyPatch, after: int) -> Path:
     """The partial folder of an ingest that was stopped after some frames."""
-    shots = ros_log.RosLogSource._shots
+    frames = ros_log.RosLogSource._stored_frames
 
-    def stopping(self: ros_log.RosLogSource, *, lazily: bool) -> Iterator[Shot]:
-        for number, shot in enumerate(shots(self, lazily=lazily)):
+    def stopping(self: ros_log.RosLogSource, *, lazily: bool) -> Iterator[StoredFrame]:
+        for number, stored in enumerate(frames(self, lazily=lazily)):
             if number == after:
                 raise KeyboardInterrupt
-            yield shot
+            yield stored
 
     with monkeypatch.context() as patch:
-        patch.setattr(ros_log.RosLogSource, "_shots", stopping)
+        patch.setattr(ros_log.RosLogSource, "_stored_frames", stopping)
         assert main(["ingest", str(log), "-o", str(out), "-q"]) == 130
     assert not out.exists()
     return out.with_name(out.name + ".partial")
@@ -95,15 +95,15 @@ def test_a_frame_is_read_by_its_number(tmp_path: Path) -> None:
     folder = tmp_path / "x.capture"
     write_capture(folder, open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))))
     source = CaptureSource(folder, SourceOptions(cameras=("cam1",)))
-    shots = [shot for shot in source.shots() if isinstance(shot, Shot)]
-    assert len(source) == len(shots) == 5
+    frames = [stored for stored in source.stored() if isinstance(stored, StoredFrame)]
+    assert len(source) == len(frames) == 5
     for number in (3, 0, 4):
-        alone = source.shot_at(number)
+        alone = source.stored_at(number)
         assert alone is not None
-        assert alone.color_file == shots[number].color_file
-        assert alone.origin == shots[number].origin
+        assert alone.color_file == frames[number].color_file
+        assert alone.origin == frames[number].origin
     (folder / "depth/cam1/000003.png").unlink()
-    assert source.shot_at(3) is None
+    assert source.stored_at(3) is None
 
 
 def test_what_an_interrupted_ingest_left_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

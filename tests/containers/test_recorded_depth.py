@@ -112,7 +112,7 @@ def test_a_file_that_cannot_be_kept_costs_its_frame(tmp_path: Path, wrong: str, 
     change = {2: odd if wrong == "of another size" else b"\x89PNG\r\n\x1a\n" + bytes(40)}
     with_png_depth(tmp_path / "raw.mcap", tmp_path / "png.mcap", change=change)
     source = open_source(tmp_path / "png.mcap")
-    frames = [item for item in (source.shots() if lazily else source.records()) if not isinstance(item, JointState)]
+    frames = [item for item in (source.stored() if lazily else source.records()) if not isinstance(item, JointState)]
     assert len(frames) == 4 and source.loss.damaged == 1
     words = "expected an image of 32x24, got 5x5" if wrong == "of another size" else "no image file"
     assert words in source.loss.notes[-1]
@@ -125,9 +125,9 @@ def test_a_frame_that_was_left_undecoded_is_refused_where_it_does_not_decode(tmp
     chunks = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in parts]
     with_png_depth(tmp_path / "raw.mcap", tmp_path / "png.mcap", change={2: b"\x89PNG\r\n\x1a\n" + b"".join(chunks)})
     source = open_source(tmp_path / "png.mcap")
-    shots = [item for item in source.shots() if not isinstance(item, JointState)]
+    frames = [item for item in source.stored() if not isinstance(item, JointState)]
     with pytest.raises(InputError, match=r"/cam0/depth/image_raw#2: compressed image .* no image file; copy"):
-        _ = shots[2].frame
+        _ = frames[2].frame
     assert sum(isinstance(item, RgbdFrame) for item in source.records()) == 4  # and counted where it is decoded
     assert source.loss.damaged == 1
 
@@ -158,9 +158,9 @@ def test_depth_in_another_unit_than_its_cameras_is_counted_again(tmp_path: Path)
         def __getattr__(self, name: str) -> Any:
             return getattr(self._source, name)
 
-        def shots(self) -> Iterator[Any]:
-            *shots, last = self._source.shots()
-            yield from shots
+        def stored(self) -> Iterator[Any]:
+            *frames, last = self._source.stored()
+            yield from frames
             yield replace(last, depth_unit=5e-4, read_depth=lambda: last.depth * np.float32(0.5))
 
     write_capture(tmp_path / "x.capture", Mixed())

@@ -9,7 +9,7 @@ import pytest
 from splatctrl_cli.containers.bag_log import is_bag_folder
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.shot import Shot
+from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.sources.source import open_source
 from tests.conftest import ROOT
 
@@ -58,9 +58,9 @@ REFUSED = {
 }
 
 
-def first_shot(path: Path, options: SourceOptions) -> tuple[tuple[str, ...], Shot]:
+def first_stored(path: Path, options: SourceOptions) -> tuple[tuple[str, ...], StoredFrame]:
     source = open_source(path, options)
-    return source.cameras, next(item for item in source.shots() if isinstance(item, Shot))
+    return source.cameras, next(item for item in source.stored() if isinstance(item, StoredFrame))
 
 
 def ids(recording: Recording) -> str:
@@ -72,8 +72,8 @@ def test_a_recording_is_read(real_data: Path, recording: Recording) -> None:
     path, options = real_data / recording.path, recording.options
     if recording.example:
         path, options = EXAMPLES / f"{recording.example}.toml", SourceOptions(root=path)
-    cameras, shot = first_shot(path, options)
-    frame = shot.frame
+    cameras, stored = first_stored(path, options)
+    frame = stored.frame
     low, high = recording.depth_share
     assert cameras == recording.cameras
     assert (frame.intrinsics.width, frame.intrinsics.height) == recording.size
@@ -98,9 +98,9 @@ def test_single_views_without_poses_are_read_as_a_camera_that_stands_still(real_
         description.write_text(f'root = "{folder}"\n[camera]\n{lens}{frames}')
         with pytest.raises(InputError, match=r"\[poses\] is missing; .*--camera-pose NAME=identity"):
             open_source(description)
-        _, shot = first_shot(description, SourceOptions(camera_poses={"camera": STILL}))
-        assert (shot.frame.depth > 0).mean() > 0.01  # the background was cut away
-        assert shot.frame.T_world_camera[2, 2] == 1.0
+        _, stored = first_stored(description, SourceOptions(camera_poses={"camera": STILL}))
+        assert (stored.frame.depth > 0).mean() > 0.01  # the background was cut away
+        assert stored.frame.T_world_camera[2, 2] == 1.0
     assert len(lenses) == 10
 
 

@@ -164,7 +164,7 @@ def test_a_capture_refuses_a_camera_that_changes_its_lens(tmp_path: Path) -> Non
     folder = make_nerfstudio(tmp_path, fl_x=20.0)
     (tmp_path / "out").mkdir()
     write_capture(tmp_path / "out", open_source(folder))
-    with pytest.raises(InputError, match="camera holdout changes its lens"):
+    with pytest.raises(InputError, match="camera holdout changes its intrinsics"):
         write_capture(tmp_path / "again", open_source(folder, SourceOptions(holdout=("0", "1"))))
 
 

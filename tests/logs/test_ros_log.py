@@ -152,7 +152,7 @@ def test_a_distorted_lens_is_undone_on_colour_and_depth(tmp_path: Path) -> None:
     assert (frame.depth[seen] > 0).mean() > 0.99  # all but what the first pixel without depth covers
     assert not frame.depth[~seen].any()
     assert frame.depth[12, 16] == np.float32(1.25)
-    assert next(s for s in open_source(log).shots() if not isinstance(s, JointState)).color_file is None
+    assert next(s for s in open_source(log).stored() if not isinstance(s, JointState)).color_file is None
 
 
 def test_rectified_images_take_the_projection_and_keep_their_pixels(tmp_path: Path) -> None:

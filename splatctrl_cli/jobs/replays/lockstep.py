@@ -27,7 +27,7 @@ from splatctrl_cli.jobs.replays.known_scene import (
 )
 from splatctrl_cli.jobs.replays.request import DEFAULT_POSE_JUMP, ReplayRequest
 from splatctrl_cli.logs.ros_log import RosLogSource
-from splatctrl_cli.logs.shot import ShotSource
+from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Float64, UInt8
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -221,7 +221,7 @@ class Lockstep:
         self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")
 
 
-def _open(request: ReplayRequest, model: RobotModel) -> ShotSource:
+def _open(request: ReplayRequest, model: RobotModel) -> FrameSource:
     """The log once more: its frames are read in step with the replay."""
     source = open_states(request.log, request.options, model.joint_names)
     if not source.cameras:

@@ -1,6 +1,6 @@
 """A frame together with how its source stored it, so that `ingest` can keep what is lossless without decoding it."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import UndecodableMessageError
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, RecordSource, RgbdFrame, UInt8
+from splatctrl_cli.records import (
+    Bool,
+    Float32,
+    Float64,
+    Intrinsics,
+    JointState,
+    Record,
+    RecordSource,
+    RgbdFrame,
+    UInt8,
+)
 
 PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
 
@@ -29,7 +39,7 @@ class Place:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shot:
+class StoredFrame:
     """A frame whose images are decoded when they are asked for, and how its source stored them.
 
     read_color, read_depth: give the frame's color and depth, or raise UndecodableMessageError;
@@ -54,8 +64,8 @@ class Shot:
     depth_file: bytes | None = None
 
     @classmethod
-    def of(cls, frame: RgbdFrame, **stored: Any) -> "Shot":
-        """A shot of a frame that is decoded already."""
+    def of(cls, frame: RgbdFrame, **stored: Any) -> "StoredFrame":
+        """A stored frame of one that is decoded already."""
         return cls(
             stamp_ns=frame.stamp_ns,
             camera=frame.camera,
@@ -102,7 +112,7 @@ class Shot:
             raise InputError(f"{self.origin}: {error}", remedy="copy the recording again") from None
 
 
-class ShotSource(RecordSource, Protocol):
+class FrameSource(RecordSource, Protocol):
     """A record source that also says how its frames were stored."""
 
     @property
@@ -110,8 +120,8 @@ class ShotSource(RecordSource, Protocol):
         """The frame of poses, as the source names it."""
         ...
 
-    def shots(self) -> Iterator[Shot | JointState]:
-        """As `records`, with the frames as shots."""
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """As `records`, with the frames as they are stored."""
         ...
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
@@ -129,15 +139,20 @@ def is_png(data: bytes | None) -> bool:
     return data is not None and data.startswith(b"\x89PNG\r\n")
 
 
-def merged(joints: Sequence[JointState], shots: Iterator[Shot]) -> Iterator[Shot | JointState]:
-    """Joint states (sorted) and shots (sorted) by stamp, joint states first."""
+def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
+    """The same records, their frames decoded."""
+    return (item.frame if isinstance(item, StoredFrame) else item for item in items)
+
+
+def merged(joints: Sequence[JointState], frames: Iterator[StoredFrame]) -> Iterator[StoredFrame | JointState]:
+    """Joint states (sorted) and frames (sorted) by stamp, joint states first."""
     states = iter(joints)  # a file's, a block at a time
     state = next(states, None)
-    for shot in shots:
-        while state is not None and state.stamp_ns <= shot.stamp_ns:
+    for stored in frames:
+        while state is not None and state.stamp_ns <= stored.stamp_ns:
             yield state
             state = next(states, None)
-        yield shot
+        yield stored
     if state is not None:
         yield state
     yield from states
