@@ -10,11 +10,12 @@ from tests.test_docs import commands_on
 from tools.golden.__main__ import lines, main, ordered, parse, read_cases
 from tools.golden.digest import of_json, stamps, written
 
-README = Path(__file__).parent.parent.parent / "README.md"
+ROOT = Path(__file__).parent.parent.parent
 
 
-def test_every_command_of_the_readme_is_run() -> None:
-    shown = [shlex.split(line, comments=True) for line in commands_on(README)]
+@pytest.mark.parametrize("page", ["README.md", "docs/start.md"])
+def test_every_command_of_the_first_pages_is_run(page: str) -> None:
+    shown = [shlex.split(line.removesuffix(" -v"), comments=True) for line in commands_on(ROOT / page)]
     run = [shlex.split(case.run) for case in read_cases().values()]
     assert len(shown) >= 9
     assert [command for command in shown if command not in run] == []
