@@ -25,8 +25,9 @@ from pathlib import Path
 
 from benchmarks.fuzz_mutate import mutated
 from benchmarks.fuzz_samples import Sample, make_samples
+from splatctrl_cli.cli.commands import COMMANDS
 from splatctrl_cli.cli.common import table
-from splatctrl_cli.cli.main import COMMANDS, main
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import SplatCtrlError
 
 ALLOWED = {0, 1, 2, 3, 4, 5, 6}

@@ -24,8 +24,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatctrl_cli.cli.commands import COMMANDS
 from splatctrl_cli.cli.common import table
-from splatctrl_cli.cli.main import COMMANDS, main
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.files.output import partial_path
 from splatctrl_cli.sources.describe import describe

@@ -5,7 +5,6 @@ The pages are made from the parser itself and not from its printed help, whose w
 the version of Python.
 """
 
-import argparse
 import inspect
 import re
 from collections import Counter
@@ -16,7 +15,8 @@ from typing import Any, get_type_hints
 
 from splatctrl_cli import config
 from splatctrl_cli.checks.finding import CHECKS, Check
-from splatctrl_cli.cli.main import EXIT_CODES, build_parser
+from splatctrl_cli.cli.commands import COMMANDS, EXIT_CODES, build_parser
+from splatctrl_cli.cli.parser import Parser, invocation
 from splatctrl_cli.config.declared import OneOf, Section
 from splatctrl_cli.config.load import type_name
 from splatctrl_cli.datasets.layout import Layout
@@ -33,6 +33,7 @@ DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
 SHARED_BY = 3  # commands with the same option, in the same words, from which on it is explained once
 INPUT = "input"  # the group of options that say how a recording is read
+HELP = ("help", "help_all")
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:\|.*\n)*)")
 REGISTRIES: dict[
@@ -44,6 +45,8 @@ REGISTRIES: dict[
     "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
     "checks": (("code", "what it means", "severity"), CHECKS.values()),
 }
+
+Row = tuple[str, str]  # an argument, and what it means
 
 
 def main() -> None:
@@ -71,18 +74,20 @@ def _filled(found: re.Match[str]) -> str:
 
 
 def cli_page() -> str:
-    """One section per subcommand, with every argument that its --help shows."""
+    """One section per subcommand, with every argument that its --help-all shows."""
     parser = build_parser()
-    commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    summaries = {action.dest: action.help for action in commands._choices_actions}
+    assert parser.actions is not None
+    commands = parser.actions.choices
+    summaries = [(f"[{name}](#{name})", COMMANDS[name].summary) for name in commands]
     lines = [
         NOTICE,
         "# The command line",
         "",
         f"`splatctrl COMMAND ...`: {parser.description}",
         "",
-        *_table(("command", "what it does"), [(f"[{n}](#{n})", summaries[n]) for n in commands.choices]),
+        *_table(("command", "what it does"), summaries),
         "",
+        "`--help` shows what people use of a command, `--help-all` everything, in the groups that are named here.",
         "Results go to stdout, as a table or with `--json` as one JSON object; progress and log lines go to stderr.",
         "An error is one line on stderr with its remedy. Options cannot be abbreviated. Relative paths start at the",
         "folder you are in; missing folders above an output are made. An output that is a link is written where the",
@@ -91,13 +96,13 @@ def cli_page() -> str:
         "",
         EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
     ]
-    leaves = list(_leaves(commands.choices.values()))
-    counts = Counter(row for leaf in leaves for row in _rows(leaf))
-    of_recording = {row for leaf in leaves for row in _rows(leaf, INPUT)}
+    leaves = [dict(_groups(leaf)) for leaf in _leaves(commands.values())]
+    counts = Counter(row for leaf in leaves for rows in leaf.values() for row in rows)
+    of_recording = {row for leaf in leaves for row in leaf.get(INPUT, ())}
     shared = {row: _kind(row, count == len(leaves), row in of_recording) for row, count in counts.items()}
     shared = {row: kind for row, kind in shared.items() if kind or counts[row] >= SHARED_BY}
-    for name, command in commands.choices.items():
-        lines += _command_section("##", name, command, shared)
+    for command in commands.values():
+        lines += _command_section("##", command, shared)
     lines += ["", "## Options of several commands", "", "The same in every command that has them."]
     for kind in sorted(set(shared.values())):
         rows = [row for row, other in shared.items() if other == kind]
@@ -105,39 +110,34 @@ def cli_page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _kind(row: tuple[str, str], is_in_all: bool, is_of_recording: bool) -> str:
+def _kind(row: Row, is_in_all: bool, is_of_recording: bool) -> str:
     """The heading under which an option is explained once for all commands that have it, "" for none of its own."""
     return "Of every command" if is_in_all else "Of a recording" if is_of_recording else ""
 
 
-def _leaves(parsers: Iterable[argparse.ArgumentParser]) -> Iterator[argparse.ArgumentParser]:
+def _leaves(parsers: Iterable[Parser]) -> Iterator[Parser]:
     """The parsers of commands, those of actions in the place of the command that has them."""
     for parser in parsers:
-        nested = _nested(parser)
-        yield from [parser] if nested is None else _leaves(nested.choices.values())
+        yield from [parser] if parser.actions is None else _leaves(parser.actions.choices.values())
 
 
-def _nested(parser: argparse.ArgumentParser) -> "argparse._SubParsersAction[Any] | None":
-    return next((a for a in parser._actions if isinstance(a, argparse._SubParsersAction)), None)
-
-
-def _command_section(
-    level: str, name: str, parser: argparse.ArgumentParser, shared: Mapping[tuple[str, str], str]
-) -> list[str]:
-    """Heading, usage, summary and arguments; of a command with actions, a section for each action below it."""
-    lines = ["", f"{level} {name}", "", _usage(name, parser), "", parser.description, ""]
-    nested = _nested(parser)
-    if nested is None:
-        rows = _rows(parser)
-        lines += _table(("argument", "meaning"), [row for row in rows if row not in shared])
-        names = [shared[row] or re.findall(r"--[a-z][a-z-]*", row[0])[-1] for row in rows if row in shared]
-        also = ", ".join(_link(name) for name in dict.fromkeys(names) if name != "Of every command")
-        return [*lines, "", f"Also: {also}."] if also else lines
-    actions = [(f"`{name} {action.dest}`", action.help) for action in nested._choices_actions]
-    lines += _table(("action", "what it does"), actions)
-    for action, below in nested.choices.items():
-        lines += _command_section(f"{level}#", f"{name} {action}", below, shared)
-    return lines
+def _command_section(level: str, parser: Parser, shared: Mapping[Row, str]) -> list[str]:
+    """Heading, usage, summary and arguments by group; of a command with actions, a section for each below it."""
+    name = parser.prog.partition(" ")[2]
+    usage = parser.format_usage().strip().removeprefix("usage: ")
+    lines = ["", f"{level} {name}", "", f"`{usage}`", "", parser.description or ""]
+    if parser.actions is not None:
+        below = parser.actions.choices
+        summaries = [(f"`{name} {action}`", one.summary) for action, one in (COMMANDS[name].actions or {}).items()]
+        lines += ["", *_table(("action", "what it does"), summaries)]
+        return [*lines, *(line for one in below.values() for line in _command_section(f"{level}#", one, shared))]
+    for title, rows in _groups(parser):
+        own = [row for row in rows if row not in shared]
+        lines += ["", *_table((title or "argument", "meaning"), own)] if own else []
+    common = [row for _, rows in _groups(parser) for row in rows if row in shared]
+    names = dict.fromkeys(shared[row] or re.findall(r"--[a-z][a-z-]*", row[0])[-1] for row in common)
+    also = ", ".join(_link(name) for name in names if name != "Of every command")
+    return [*lines, "", f"Also: {also}."] if also else lines
 
 
 def _link(name: str) -> str:
@@ -145,38 +145,13 @@ def _link(name: str) -> str:
     return f"`{name}`" if name.startswith("-") else f"those [{name.lower()}](#{name.lower().replace(' ', '-')})"
 
 
-def _usage(name: str, parser: argparse.ArgumentParser) -> str:
-    groups = parser._mutually_exclusive_groups
-    grouped = {id(action) for group in groups for action in group._group_actions}
-    required = [f"({' | '.join(_invocation(a) for a in group._group_actions)})" for group in groups if group.required]
-    required += [_invocation(a) for a in parser._actions if a.option_strings and a.required and id(a) not in grouped]
-    places = [_placed(a) for a in parser._actions if not a.option_strings]
-    return f"`{' '.join(['splatctrl', name, *places, *required, '[options]'])}`"
-
-
-def _placed(action: argparse.Action) -> str:
-    name = str(action.metavar or action.dest).upper()
-    return f"[{name}]" if action.nargs == "?" else name
-
-
-def _rows(parser: argparse.ArgumentParser, title: str | None = None) -> list[tuple[str, str]]:
-    """What --help shows of each argument, or of those in the group `title`."""
+def _groups(parser: Parser) -> list[tuple[str, list[Row]]]:
+    """Argument and meaning, by the title of their group."""
     formatter = parser._get_formatter()
-    groups = [group for group in parser._action_groups if title in {None, group.title}]
-    actions = [a for group in groups for a in group._group_actions if a.dest != "help"]
-    return [(f"`{_invocation(a)}`", formatter._expand_help(a) if a.help else "") for a in actions]
-
-
-def _invocation(action: argparse.Action) -> str:
-    """``-o, --out PATH``, the same in every version of Python."""
-    if not action.option_strings:
-        return _placed(action)
-    names = ", ".join(action.option_strings)
-    if action.nargs == 0:
-        return names
-    if action.choices:
-        return f"{names} {{{','.join(map(str, action.choices))}}}"
-    return f"{names} {action.metavar or action.dest.upper()}"
+    return [
+        (title, [(f"`{invocation(a)}`", formatter._expand_help(a)) for a in actions if a.dest not in HELP])
+        for title, actions in parser.groups
+    ]
 
 
 def config_page() -> str:

@@ -11,8 +11,8 @@ from string import Template
 
 import pytest
 
-from splatctrl_cli.cli.main import build_parser, main
-from splatctrl_cli.cli.parser import COMMANDS
+from splatctrl_cli.cli.commands import COMMANDS, build_parser
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import load_config
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.jobs.replays.metrics import metric_names
@@ -86,7 +86,10 @@ def test_every_option_that_help_shows_is_in_the_page() -> None:
     for command, parser in subparsers.choices.items():
         linked = [text for kind, text in of_kind.items() if f"[{kind.lower()}]" in sections[command]]
         explained = "".join([sections[command], of_kind["Of every command"], *linked])
-        for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", parser.format_help())) - {"--help"}:
+        for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", parser.format_full_help())) - {
+            "--help",
+            "--help-all",
+        }:
             assert option in explained, f"{command} {option}"
 
 

@@ -1,87 +1,15 @@
-"""What subcommands share: common options, tables and JSON on stdout, log lines on stderr, gates."""
+"""What subcommands print: tables and JSON on stdout, log lines on stderr."""
 
 import argparse
 import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.cli.numbers import MAX_SEED, whole
-from splatctrl_cli.cli.parser import COMMANDS
-from splatctrl_cli.config import Config, load_config
-from splatctrl_cli.evaluate.gates import gate
 from splatctrl_cli.evaluate.verdict import Verdict
 
 MAX_REASONS = 10  # printed; --json and summary.json have all
-Subparsers = Any  # argparse keeps its subparser type private
-
-
-def add_named(subparsers: Subparsers, name: str, summary: str = "") -> argparse.ArgumentParser:
-    """The parser of a subcommand, or of an action of one with a summary of its own."""
-    summary = summary or COMMANDS[name]
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        name, help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False
-    )
-    return parser
-
-
-def add_command(
-    subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int], *, summary: str = ""
-) -> argparse.ArgumentParser:
-    """The same, with what runs it and the options that every command has: --json, -v, -q."""
-    parser = add_named(subparsers, name, summary)
-    parser.set_defaults(run=run)
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; show tracebacks")
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress, no log lines")
-    return parser
-
-
-def add_output(parser: argparse.ArgumentParser, *, default: str, what: str) -> None:
-    """``-o/--out`` and ``--force``."""
-    parser.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"{what} (default: {default})")
-    parser.add_argument("--force", action="store_true", help="replace the output if it exists")
-
-
-def add_config(parser: argparse.ArgumentParser) -> None:
-    """``--config``, ``--set``, ``--seed``, ``--threads``."""
-    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="configuration, see docs/config.md")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="one setting (repeatable)"
-    )
-    parser.add_argument("--seed", type=whole(0, MAX_SEED), default=0, help="seed of everything random (default: 0)")
-    add_threads(parser)
-
-
-def add_threads(parser: argparse.ArgumentParser) -> None:
-    """``--threads``."""
-    parser.add_argument(
-        "--threads",
-        type=whole(0, 1024),
-        default=0,
-        help="threads, at most 16 or one per core (default: one per core)",
-    )
-
-
-def add_gates(parser: argparse.ArgumentParser) -> None:
-    """``--require 'metric>=value'``."""
-    parser.add_argument(
-        "--require",
-        action="append",
-        default=[],
-        type=gate,
-        metavar="METRIC>=VALUE",
-        help="fail (exit 1) unless it holds",
-    )
-
-
-def configured(args: argparse.Namespace) -> "Config":
-    """The configuration that --config and --set give."""
-    return load_config(args.config, args.set)
-
-
 _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
@@ -107,16 +35,17 @@ class Console:
 
     def concluded(
         self,
-        verdict: "Verdict",
+        verdict: Verdict,
         result: Mapping[str, Any],
         lines: Iterable[str],
-        code: int,
         *,
+        code: int | None = None,
         has_findings: bool = False,
-    ) -> None:
-        """A verdict, its reasons and notes, then `result` or `lines`; the sentence goes to stderr too where `code` is
-        not 0. has_findings: the lines say each reason themselves.
+    ) -> int:
+        """A verdict, its reasons and notes, then `result` or `lines`; the sentence goes to stderr too where the exit
+        code is not 0. Returns that: `code`, else the verdict's. has_findings: the lines say each reason themselves.
         """
+        code = verdict.exit_code if code is None else code
         if self.is_json:
             self.result({"exit_code": code, "verdict": verdict.as_dict(), **result}, ())
         else:
@@ -130,6 +59,7 @@ class Console:
         if code:
             gates = [str(reason) for reason in verdict.decisive[1:] if reason.criterion.startswith("--require")]
             print("\n".join(f"splatctrl: {line}" for line in (verdict.sentence, *gates)), file=sys.stderr, flush=True)
+        return code
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:

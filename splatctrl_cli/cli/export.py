@@ -2,15 +2,13 @@
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_output, table
+from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.records import Label
-from splatctrl_cli.splat_files.splat_formats import FORMATS
 
-SUFFIXES = ", ".join(FORMATS)
 SHOWN = {  # of Differences: what the table calls it, and the unit it is shown in
     "center": ("centre mm", 1e3),
     "sigma": ("sigma %", 1e2),
@@ -21,36 +19,14 @@ SHOWN = {  # of Differences: what the table calls it, and the unit it is shown i
 }
 
 
-def register(subparsers: Subparsers) -> None:
-    """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "export", run)
-    parser.add_argument("scene", type=Path, metavar="SCENE", help=f"a scene folder, or a splat file: {SUFFIXES}")
-    parser.add_argument(
-        "--labels",
-        metavar="NAME,...",
-        help="only splats of these labels: object, robot, human (default: all)",
-    )
-    parser.add_argument(
-        "--layout",
-        choices=["short", "full"],
-        help="of a PLY: short has label and density and no harmonics, full has the reference's 62 properties "
-        "(default: short for isotropic splats; for others full, and a label where one is not object)",
-    )
-    parser.add_argument(
-        "--isotropic",
-        action="store_true",
-        help="make anisotropic Gaussians round: same volume, opacity and mean colour",
-    )
-    add_output(
-        parser, default="SCENE.ply, beside SCENE", what=f"the file to write; its suffix is the format: {SUFFIXES}"
-    )
-
-
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    console, same = Console(args), ("scene", "out", "layout", "isotropic", "force")
-    request = ExportRequest(labels=_labels(args.labels), **{name: getattr(args, name) for name in same})
-    result = export(request, console)
+    console = Console(args)
+    return show_exported(console, export(request_of(ExportRequest, args, labels=_labels(args.labels)), console))
+
+
+def show_exported(console: Console, result: ExportResult) -> int:
+    """What was written, and what it keeps of its source."""
     console.result(result.as_dict(), _lines(result))
     return 0
 

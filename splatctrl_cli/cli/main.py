@@ -1,49 +1,24 @@
-"""``splatctrl``: builds the parser, runs one subcommand, turns errors into one line and an exit code.
-
-A subcommand's file is imported when it is named, so ``splatctrl --help`` answers at once.
-"""
+"""``splatctrl``: parses the words, runs one subcommand, turns errors into one line and an exit code."""
 
 import argparse
-import importlib
+import errno
 import io
 import os
+import stat
 import sys
 import traceback
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
-from splatctrl_cli import __version__
-from splatctrl_cli.cli.inputs import refuse_endless_files
-from splatctrl_cli.cli.parser import COMMANDS, Parser
+from splatctrl_cli.cli.commands import build_parser, function_of
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 
 MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 
-EXIT_CODES = """\
-exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
-damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug; 130 interrupted"""
-
-
-def build_parser(words: Sequence[str] | None = None) -> argparse.ArgumentParser:
-    """The parser with all subcommands and their options, or with those of the one that `words` begin with alone: a
-    run neither waits for the files of the other subcommands nor fails with them.
-    """
-    parser = Parser(
-        prog="splatctrl",
-        description="What did the robot's cameras know, and would this controller have kept it safe?",
-        epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument("--version", action="version", version=f"splatctrl {__version__}")
-    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command, summary in COMMANDS.items():
-        if words is None or [command] == list(words[:1]):
-            module = importlib.import_module(f"splatctrl_cli.cli.{command.replace('-', '_')}")
-            module.register(subparsers)
-        else:
-            subparsers.add_parser(command, help=summary, add_help=False)
-    return parser
+_BY_THE_SHELL = ("/dev/stdin", "/dev/fd/", "/proc/self/fd/")  # as in --config <(...)
+_WRITES = os.O_WRONLY | os.O_RDWR
+_NEVER_END = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "device": stat.S_ISCHR, "disk": stat.S_ISBLK}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,11 +39,11 @@ def _run(argv: Sequence[str] | None) -> int:
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of numpy; more wait for each other, and round otherwise
     try:
-        words = sys.argv[1:] if argv is None else argv
-        args = build_parser(words).parse_args(words)
+        words = sys.argv[1:] if argv is None else list(argv)
+        args = build_parser(words[0] if words else "").parse_args(words)
         verbose = args.verbose
         _check_output(args)
-        code: int = args.run(args)
+        code = function_of(args.run)(args)
         sys.stdout.flush()
         return code
     except SplatCtrlError as error:
@@ -153,3 +128,31 @@ def _fail(error: BaseException, line: str, code: int, verbose: int) -> int:
         traceback.print_exception(error)
     print(f"splatctrl: {' '.join(line.split())}", file=sys.stderr)
     return code
+
+
+@cache
+def refuse_endless_files() -> None:
+    """From now on, opening what is no file to read it raises OSError, wherever in the program that is.
+
+    A FIFO in a folder of images would wait for its writer, a link to /dev/zero would fill the memory. Folders hold
+    millions of files and are read in many places, so it is the interpreter that looks, once for each file it opens.
+    """
+    sys.addaudithook(_look)
+
+
+def _look(event: str, arguments: tuple[object, ...]) -> None:
+    if event != "open":
+        return
+    path, flags = arguments[0], arguments[2]
+    if not isinstance(path, str | bytes) or (isinstance(flags, int) and flags & _WRITES):
+        return
+    name = os.fsdecode(path)
+    if name.startswith(_BY_THE_SHELL) or name == os.devnull:
+        return
+    try:
+        mode = os.stat(name).st_mode  # noqa: PTH116  (also called while Path itself is imported)
+    except (OSError, ValueError):
+        return
+    kind = next((kind for kind, is_one in _NEVER_END.items() if is_one(mode)), None)
+    if kind is not None:
+        raise OSError(errno.EINVAL, f"is a {kind}, expected a file", name)

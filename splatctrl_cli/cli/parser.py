@@ -1,33 +1,41 @@
-"""An argument parser whose errors are one line with a remedy, as every other error of the tool is."""
+"""An argument parser whose errors are one line with a remedy, whose help fits a screen, and whose options are
+declared a line each.
+"""
 
 import argparse
 import difflib
 import re
+import shutil
 import sys
-from collections.abc import Iterable, Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NoReturn, TypeVar
 
+from splatctrl_cli.config.declared import OneOf, Section, Within, shown
 from splatctrl_cli.errors import UsageError
 
-COMMANDS = {
-    "simulate": "write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
-    "ingest": "turn a log or image folder into a capture folder",
-    "info": "describe a log, capture, scene, grid, robot or other file",
-    "check": "say what is wrong with a log, capture or image folder",
-    "reconstruct": "fit splats to a log, a capture or a DTU scan",
-    "export": "write splats as a file that viewers open, and check what reads back",
-    "sdf-bake": "bake a scene's splats into a distance grid with gradient",
-    "score": "compare renders of a scene with recorded views (by default of the cameras that did not train it): "
-    "PSNR, SSIM, depth error, by a named protocol; or fit scans first (--fit)",
-    "replay": "audit logged joint states, ask the controller at each, or drive the arm in closed loop",
-    "robot": "fit and measure a robot's collision spheres, list its self-collision pairs and limits",
-    "demo": "run the main job on a sample recording, with pictures",
-    "capture": "pack a capture into one MCAP that viewers open, and unpack it",
-}
+T = TypeVar("T", int, float)
+
+MAX_SECONDS = 1e8  # [s] of a recording: three years
+MAX_LENGTH = 1e6  # [m, px] of a place: as of poses in files
+MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
+MOST_WIDTH = 100  # columns of help
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises UsageError where argparse prints its usage and leaves; the parsers of subcommands are of this class."""
+    """Raises UsageError where argparse prints its usage and leaves; the parsers of subcommands are of this class.
+
+    ``--help`` shows what stands in no group of its own; ``--help-all`` shows everything.
+    """
+
+    def __init__(self, *, examples: Sequence[str] = (), **kwargs: Any) -> None:
+        kwargs |= {"allow_abbrev": False, "add_help": False, "formatter_class": _Formatter}
+        super().__init__(**kwargs)
+        self.run_group = argparse._ArgumentGroup(self, "run")  # the last of the groups, which every command has
+        self.examples = examples
+        add = Options(self)
+        add("-h/--help", "show this help and exit", action="help")
+        if self.prog != "splatctrl":
+            add("--help-all", "show every option", action=_HelpAll, nargs=0)
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override]
         """As in argparse, but what is left over is refused here, by the parser that knows the options."""
@@ -61,6 +69,178 @@ class Parser(argparse.ArgumentParser):
 
     def _known(self) -> list[str]:
         return [*self._option_string_actions, "--"]
+
+    @property
+    def actions(self) -> "argparse._SubParsersAction[Parser] | None":
+        """The parsers below this one, None where it takes options itself."""
+        return next((action for action in self._actions if isinstance(action, argparse._SubParsersAction)), None)
+
+    @property
+    def groups(self) -> list[tuple[str, list[argparse.Action]]]:
+        """Options by the title of their group, the first of which are what ``--help`` shows."""
+        shown = [action for group in self._action_groups[:2] for action in group._group_actions]
+        more = [*self._action_groups[2:], self.run_group]
+        return [("", shown), *((group.title or "", group._group_actions) for group in more if group._group_actions)]
+
+    def format_usage(self) -> str:
+        """One line: places, and options that are required."""
+        either = [group for group in self._mutually_exclusive_groups if group.required]
+        grouped = {id(action) for group in either for action in group._group_actions}
+        required = [f"({' | '.join(invocation(a) for a in group._group_actions)})" for group in either]
+        single = [a for a in self._actions if a.option_strings and a.required and id(a) not in grouped]
+        required += [invocation(action) for action in single]
+        places = [invocation(action) for action in self._actions if not action.option_strings]
+        return " ".join(["usage:", self.prog, *places, *required, "[options]"]) + "\n"
+
+    def format_help(self) -> str:
+        """What people use, and examples."""
+        num_hidden = sum(len(actions) for _, actions in self.groups[1:])
+        titles = ", ".join(title for title, _ in self.groups[1:])
+        examples = "".join(f"  splatctrl {example}\n" for example in self.examples)
+        return (
+            self._format(self._action_groups[:2])
+            + (f"\nexamples:\n{examples}" if examples else "")
+            + (f"\n--help-all shows {num_hidden} more options: {titles}\n" if num_hidden else "")
+            + (f"\n{self.epilog}\n" if self.epilog else "")
+        )
+
+    def format_full_help(self) -> str:
+        """Every option, by group."""
+        return self._format([*self._action_groups, self.run_group])
+
+    def _format(self, groups: Iterable[argparse._ArgumentGroup]) -> str:
+        formatter = self._get_formatter()
+        formatter.add_text(self.description)
+        for group in groups:
+            formatter.start_section(group.title)
+            formatter.add_arguments(group._group_actions)
+            formatter.end_section()
+        return f"{self.format_usage()}\n{formatter.format_help()}"
+
+
+class Options:
+    """Adds options, declared a line each, to a parser or to a group of one."""
+
+    def __init__(self, container: argparse._ActionsContainer) -> None:
+        self._container = container
+
+    def __call__(
+        self,
+        name: str,
+        meaning: str,
+        kind: Callable[[str], Any] | Sequence[str] | None = None,
+        default: Any = None,
+        **more: Any,
+    ) -> None:
+        """Add ``-o/--out PATH``, ``--flag``, ``--repeatable NAME ...`` or a ``PLACE``.
+
+        kind: what makes the value of the text, or the words to choose from. default: of an option that is not given;
+        the help says it where it is a number or a word. more: as in argparse.
+        """
+        flags, _, metavar = name.partition(" ")
+        is_place, repeats = not flags.startswith("-"), metavar.endswith(" ...")
+        if isinstance(kind, tuple):
+            more["choices"] = kind
+        elif kind is not None:
+            more["type"] = kind
+        if is_place or metavar:
+            more["metavar"] = flags if is_place else metavar.removesuffix(" ...")
+        elif not isinstance(kind, tuple):
+            more.setdefault("action", "store_true")
+        if repeats:
+            more |= {"action": "append", "default": []}
+            meaning += " (repeatable)"
+        elif default is not None:
+            more["default"] = default
+            meaning += f" (default: {default:g})" if isinstance(default, int | float) else f" (default: {default})"
+        names = [flags.lower()] if is_place else flags.split("/")
+        self._container.add_argument(*names, help=meaning.replace("%", "%%"), **more)
+
+    def group(self, title: str) -> "Options":
+        """Options that ``--help-all`` alone shows."""
+        return Options(self._container.add_argument_group(title))
+
+    def either(self, *, required: bool = False) -> "Options":
+        """Options of which one may be given, or has to be."""
+        return Options(self._container.add_mutually_exclusive_group(required=required))
+
+
+class _HelpAll(argparse.Action):
+    """Prints everything and leaves."""
+
+    def __call__(self, parser: Any, *_: object) -> None:
+        print(parser.format_full_help(), end="")
+        parser.exit()
+
+
+class _Formatter(argparse.HelpFormatter):
+    """Up to MOST_WIDTH columns, with room for the names of options."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28, width=min(shutil.get_terminal_size().columns - 2, MOST_WIDTH))
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        return invocation(action)
+
+
+def invocation(action: argparse.Action) -> str:
+    """``-o, --out PATH``, the same in every version of Python."""
+    if not action.option_strings:
+        name = str(action.metavar or action.dest)
+        return {"?": f"[{name}]", "+": f"{name} ..."}.get(str(action.nargs), name)
+    names = ", ".join(action.option_strings)
+    if action.nargs == 0:
+        return names
+    if action.choices:
+        return f"{names} {{{','.join(map(str, action.choices))}}}"
+    return f"{names} {action.metavar or action.dest.upper()}"
+
+
+def real(low: float, high: float, unit: str = "") -> Callable[[str], float]:
+    """A number from `low` to `high`, both allowed, in `unit`."""
+    return _bounded(float, Within(low, high, unit, ""))
+
+
+def whole(low: int, high: int, unit: str = "") -> Callable[[str], int]:
+    """A whole number from `low` to `high`, both allowed."""
+    return _bounded(int, Within(low, high, unit, ""))
+
+
+def setting(section: type[Section], key: str) -> Callable[[str], float]:
+    """A number that stands for a key of the configuration: its type and range."""
+    declared = section.declared[key]
+    assert isinstance(declared, Within)
+    return _bounded(int if type(getattr(section, key)) is int else float, declared)
+
+
+def words(section: type[Section], key: str) -> tuple[str, ...]:
+    """The words that a key of the configuration may be."""
+    declared = section.declared[key]
+    assert isinstance(declared, OneOf)
+    return declared.words
+
+
+def several(text: str) -> tuple[float, ...]:
+    """Numbers joined by commas; none where one of them is no number, or not within `MAX_LENGTH`."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
+    return values if all(abs(value) <= MAX_LENGTH for value in values) else ()
+
+
+def _bounded(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:
+    def parse(text: str) -> T:
+        what = f"expected {'a whole number, ' if kind is int else ''}{declared.expected}, got {shown(text)}"
+        try:
+            value = kind(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(what) from None
+        if not declared.holds(value):
+            raise argparse.ArgumentTypeError(what)
+        return value
+
+    return parse
 
 
 def _nearest(word: str, known: Iterable[object]) -> str:

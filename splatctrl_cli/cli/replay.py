@@ -1,89 +1,102 @@
 """``splatctrl replay``: the clearance of logged motion, what a controller says of it, or what it does instead."""
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
-from splatctrl_cli.cli.numbers import MAX_SECONDS, real
-from splatctrl_cli.cli.reconstruct import add_declare
-from splatctrl_cli.cli.replay_options import (
-    MODES,
-    POSE,
-    add_baseline,
-    add_evidence,
-    add_goal,
-    add_golden,
-    add_lockstep,
-    add_robot_geometry,
-    add_worst_frames,
-    pose,
-    replay_request,
+from splatctrl_cli.cli.common import Console, long_table, table
+from splatctrl_cli.cli.options import locked_joints, request_of, source_options
+from splatctrl_cli.config import load_config
+from splatctrl_cli.control.presets import with_preset
+from splatctrl_cli.jobs.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replays.compare import MOTION, PLAN, figures_of
+from splatctrl_cli.jobs.replays.files import chunks_of, when_and_why
+from splatctrl_cli.jobs.replays.people import FIGURES
+from splatctrl_cli.jobs.replays.request import ReplayRequest
+from splatctrl_cli.jobs.replays.result import Comparison, Replay
+
+HEADLINE = (
+    *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),
+    *("max_velocity_share", "unknown_share", "max_map_age_s", "map_error_bound", "goal_reached", "duration_s"),
 )
-from splatctrl_cli.cli.replay_report import lines_of
-from splatctrl_cli.cli.source_options import add_source
-from splatctrl_cli.jobs.replay import replay
-
-
-def register(subparsers: Subparsers) -> None:
-    """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "replay", run)
-    parser.add_argument("log", type=Path, metavar="LOG", help="a log or capture with joint states")
-    scene = parser.add_mutually_exclusive_group(required=True)
-    scene.add_argument("--field", type=Path, metavar="FIELD", help="a baked field (folder or field.npz)")
-    scene.add_argument(
-        "--scene", type=Path, metavar="SCENE", help="a reconstruction: its splats, as known at each time"
-    )
-    add_lockstep(parser, scene)
-    parser.add_argument("--urdf", type=Path, required=True, metavar="FILE", help="the robot's URDF")
-    parser.add_argument("--spheres", type=Path, metavar="FILE.yaml", help="its spheres (default: the URDF's own)")
-    parser.add_argument(
-        "--base", type=pose, metavar=POSE, help="pose of the URDF's root in world (default: identity)"
-    )
-    parser.add_argument(
-        "--lock",
-        action="append",
-        default=[],
-        metavar="JOINT=VALUE",
-        help="hold a joint that no log moves (repeatable)",
-    )
-    add_robot_geometry(parser)
-    parser.add_argument("--mode", choices=MODES, default="audit", help="what to replay (default: audit)")
-    add_goal(parser)
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="truth.json of a simulated log")
-    parser.add_argument(
-        "--max-unknown",
-        type=real(0, 1),
-        default=0.05,
-        metavar="SHARE",
-        help="never-seen share allowed (default: 0.05)",
-    )
-    parser.add_argument(
-        "--max-map-age",
-        type=real(1e-3, MAX_SECONDS, "s"),
-        default=1.0,
-        metavar="S",
-        help="a scene older than this is no evidence (default: 1)",
-    )
-    add_evidence(parser)
-    add_golden(parser)
-    add_baseline(parser)
-    add_worst_frames(parser)
-    add_declare(parser)
-    parser.add_argument(
-        "--report-only", action="store_true", help="exit 0 whatever the verdict; a --require or --golden still counts"
-    )
-    parser.add_argument("--steps", action="store_true", help="print a row per step as well")
-    add_source(parser)
-    add_output(parser, default="replay", what="folder to write")
-    add_config(parser)
-    add_gates(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    console, request = Console(args), replay_request(args)
+    console = Console(args)
+    request = request_of(
+        ReplayRequest,
+        args,
+        out=args.out or Path("replay"),
+        config=with_preset(load_config(args.config, args.set)),
+        options=source_options(args),
+        locked=locked_joints(args),
+    )
     result = replay(request, console)
     code = result.exit_code(report_only=args.report_only)
-    lines = lines_of(result, is_long=args.verbose > 0, with_steps=args.steps)
-    console.concluded(result.verdict, {"out": str(result.out), **result.metrics}, lines, code)
-    return code
+    return show_replayed(console, result, code=code, is_long=args.verbose > 0, with_steps=args.steps)
+
+
+def show_replayed(
+    console: Console, result: ReplayResult, *, code: int, is_long: bool = False, with_steps: bool = False
+) -> int:
+    """The verdict, when and why, and the figures."""
+    lines = _lines(result, is_long=is_long, with_steps=with_steps)
+    return console.concluded(result.verdict, {"out": str(result.out), **result.metrics}, lines, code=code)
+
+
+def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator[str]:
+    """What goes to stdout after the verdict: when and why, the headline figures (all with `is_long`), what stands
+    beside, notes, and a row per step on request.
+    """
+    replay, metrics = result.replay, result.metrics
+    shown = metrics if is_long else {name: metrics[name] for name in HEADLINE if metrics.get(name) is not None}
+    lines = when_and_why(replay)
+    lines += ["", *table(("replay", "value"), [(name, _shown(value)) for name, value in shown.items()])]
+    if replay.separations:
+        rows = [
+            (figure, *(_shown(metrics[f"{motion}_{figure}"]) for motion in replay.separations)) for figure in FIGURES
+        ]
+        lines += ["", "Beside people, from the same moment:", *table(("", *replay.separations), rows)]
+    lines += _comparison_lines(replay.comparison)
+    if replay.static_violations:
+        rows = [(violation.sphere, f"{violation.clearance:.4f}") for violation in replay.static_violations]
+        lines += ["", "Spheres that no joint moves, within the margin:", *table(("sphere", "clearance"), rows)]
+    yield from lines
+    yield from result.notes
+    if not is_long:
+        yield f"wrote {result.out}; -v prints every figure"
+    if with_steps:
+        yield ""
+        yield from _step_lines(replay)
+
+
+def _step_lines(replay: Replay) -> Iterator[str]:
+    def is_shown(name: str) -> bool:
+        return name != "stamp_ns" and not name.startswith(("q_", "v_", "dv_"))
+
+    def rows() -> Iterator[list[str]]:
+        for chunk in chunks_of(replay):
+            shown = [values for name, values in chunk.items() if is_shown(name)]
+            yield from ([_shown(value) for value in row] for row in zip(*shown, strict=True))
+
+    return long_table([name for name in next(chunks_of(replay)) if is_shown(name)], rows)
+
+
+def _shown(value: object) -> str:
+    if value is None or value == "":
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _comparison_lines(comparison: Comparison) -> list[str]:
+    """The table of all methods side by side, and a line for each plan that was not found or has a smaller margin."""
+    if not comparison.methods:
+        return []
+    figures, methods = figures_of(comparison), comparison.methods
+    names = [name for name in (*MOTION, *PLAN) if any(f"{method}_{name}" in figures for method in methods)]
+    rows = [(name, *(_shown(figures.get(f"{method}_{name}")) for method in methods)) for name in names]
+    lines = ["", "Side by side, from the same state to the same goal:", *table(("", *methods), rows)]
+    return lines + [
+        f"{method}: no path: {plan.outcome}" for method, plan in comparison.plans.items() if not plan.path
+    ]

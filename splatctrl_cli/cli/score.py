@@ -1,182 +1,80 @@
 """``splatctrl score``: renders views that did not train a scene and compares them with what was recorded."""
 
 import argparse
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from splatctrl_cli.cli.common import Console, Subparsers, add_command, add_config, add_gates, add_output
-from splatctrl_cli.cli.numbers import real, setting, whole
-from splatctrl_cli.cli.score_report import lines_of
-from splatctrl_cli.cli.source_options import add_scan, add_source, recording_of
-from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.map import MOST_ITERATIONS
+from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.options import request_of
+from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.score_report import PREFIX, counted
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.score_cloud import CloudSettings
-from splatctrl_cli.jobs.score_fit import NUM_SPLATS, PROTOCOL, FitRequest, score_fits
+from splatctrl_cli.jobs.score_fit import EACH, METHODS, FitRequest, score_fits
 
 MILLIMETRE = 0.001  # [m], the unit of DTU's clouds
-OF_FITS: tuple[tuple[str, object], ...] = (
-    ("config", None),
-    ("set", []),
-    ("seed", 0),
-    ("fit_iterations", None),
-    ("fit_splats", None),
-)
-PASSED_ON = ("out", "force", "images", "lpips", "allow_training", "allow_other_recording", "threads")
-
-
-def register(subparsers: Subparsers) -> None:
-    """Add the subcommand to the parser."""
-    parser = add_command(subparsers, "score", run)
-    add = parser.add_argument
-    add(
-        "scene",
-        type=Path,
-        nargs="?",
-        metavar="SCENE",
-        help="a folder that reconstruct wrote, or one of such folders, named like the scans of --dtu",
-    )
-    either = parser.add_mutually_exclusive_group(required=True).add_argument
-    either("--reference", type=Path, metavar="PATH", help="a log, a capture, or an image folder's TOML")
-    either("--dtu", type=Path, metavar="ROOT", help="a DTU data set in MVSNet's layout, or in IDR's and NeuS's")
-    add_scan(parser)
-    add("--masks", type=Path, metavar="DIR", help="object masks 000.png and so on, for MVSNet's layout")
-    add(
-        "--snapshots",
-        choices=("newest", "final"),
-        default="newest",
-        help="render each view from the newest snapshot not later than it, or all from the final splats",
-    )
-    add("--allow-training", action="store_true", help="also score cameras that trained the scene")
-    add(
-        "--allow-other-recording",
-        action="store_true",
-        help="continue although this is not the recording that made the scene",
-    )
-    add(
-        "--images",
-        choices=("all", "best-worst", "none"),
-        default="best-worst",
-        help="with -o: pictures of every view, of each camera's best and worst, or of none (default: best-worst)",
-    )
-    add("--lpips", type=Path, metavar="FILE.npz", help="weights of LPIPS (docs/score.md); none are included")
-    _add_cloud(parser.add_argument_group("surface"))
-    add(
-        "--baseline",
-        type=Path,
-        metavar="FILE",
-        help="score.json of an earlier score -o: prints the change of each figure, gated as change_NAME",
-    )
-    _add_fit(parser.add_argument_group("fit"))
-    add_source(parser)
-    add_output(parser, default="none, the scores are only printed", what="folder for scores and pictures")
-    add_config(parser)
-    add_gates(parser)
-
-
-def _add_cloud(group: argparse._ActionsContainer) -> None:
-    """``--cloud`` and what goes with it."""
-    add = group.add_argument
-    add(
-        "--cloud",
-        type=Path,
-        metavar="FILE",
-        help="reference points (.ply) or mesh: accuracy, completeness, Chamfer; or a folder of stl024_total.ply or"
-        " scan24.ply",
-    )
-    add(
-        "--cloud-masks",
-        type=Path,
-        metavar="DIR",
-        help="DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where its own evaluation does",
-    )
-    add(
-        "--cloud-unit",
-        type=real(1e-9, 1e3, "m"),
-        metavar="M",
-        help="metres per unit (default: 0.001 with --dtu, else 1)",
-    )
-    add(
-        "--cloud-max",
-        type=real(1e-6, 1e3, "m"),
-        default=0.02,
-        metavar="M",
-        help="farther points count in a share, not in a mean",
-    )
-    add(
-        "--cloud-spacing",
-        type=real(1e-6, 1e3, "m"),
-        default=0.0002,
-        metavar="M",
-        help="both sides are thinned to points this far apart (default: 0.0002)",
-    )
-
-
-def _add_fit(group: argparse._ActionsContainer) -> None:
-    """``--fit`` and its options."""
-    add = group.add_argument
-    add(
-        "--fit",
-        action="store_true",
-        help="fit the scans of --dtu (--scan A,B; default: all), or the image folder of --reference, with both"
-        f" methods, then score them (default protocol of scans: {PROTOCOL})",
-    )
-    add(
-        "--fit-iterations",
-        type=whole(1, MOST_ITERATIONS),
-        metavar="N",
-        help="of each method (default: those of the configuration, 2300)",
-    )
-    add(
-        "--fit-splats",
-        type=setting(SceneConfig, "max_splats"),
-        metavar="N",
-        help="the budget, and Gaussians to begin with (default: 10000)",
-    )
+OF_FITS: dict[str, object] = {
+    "config": None,
+    "set": [],
+    "seed": 0,
+    "fit_iterations": None,
+    "fit_splats": None,
+}  # where they are not given
+COLUMNS = {
+    "psnr_seen": "dB seen",
+    "psnr_all": "dB all",
+    "psnr_masked": "dB mask",
+    "ssim_seen": "SSIM seen",
+    "ssim_all": "SSIM all",
+    "ssim_published": "SSIM publ.",
+    "lpips": "LPIPS",
+    "lpips_published": "LPIPS publ.",
+    "depth_median_seen": "depth mm seen",
+    "depth_median_all": "depth mm all",
+    "in_front_seen": "in front",
+    "seen_share": "seen",
+    "mask_share": "mask",
+    "valid_share": "valid",
+    "chamfer": "Chamfer mm",
+}
+SHARES = ("seen_share", "in_front_seen", "mask_share", "valid_share")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    result = _score_fits(args) if args.fit else _score(args)
-    Console(args).concluded(result.verdict, result.report, lines_of(result.report), result.verdict.exit_code)
-    return result.verdict.exit_code
+    console = Console(args)
+    return show_scored(console, score_fits(_fit(args), console) if args.fit else score(_request(args), console))
 
 
-def _score(args: argparse.Namespace) -> ScoreResult:
+def show_scored(console: Console, result: ScoreResult) -> int:
+    """The verdict, and a row per view, scan or method."""
+    return console.concluded(result.verdict, result.report, lines_of(result.report))
+
+
+def _request(args: argparse.Namespace) -> ScoreRequest:
     if args.scene is None:
         raise UsageError("score: expected a SCENE, got none", remedy="give what reconstruct wrote, or --fit")
-    for name, default in OF_FITS:
+    for name, default in OF_FITS.items():
         if getattr(args, name) != default:
             raise UsageError(f"--{name.replace('_', '-')}: only with --fit", remedy="leave it out")
-    return score(ScoreRequest(scene=args.scene, baseline=args.baseline, **_scoring(args)), Console(args))
+    return request_of(ScoreRequest, args, **_scoring(args))
 
 
-def _score_fits(args: argparse.Namespace) -> ScoreResult:
+def _fit(args: argparse.Namespace) -> FitRequest:
     if args.scene is not None:
         raise UsageError(f"--fit: makes the scenes itself, got {args.scene}", remedy="leave SCENE or --fit out")
     if args.baseline is not None:
         raise UsageError("--baseline: not with --fit", remedy="score the scenes that --fit -o leaves")
-    request = FitRequest(
-        config=args.config,
-        settings=tuple(args.set),
-        seed=args.seed,
-        iterations=args.fit_iterations,
-        num_splats=NUM_SPLATS if args.fit_splats is None else args.fit_splats,
-        **_scoring(args),
-    )
-    return score_fits(request, Console(args))
+    given = {"settings": tuple(args.set), "iterations": args.fit_iterations, **_scoring(args)}
+    given |= {} if args.fit_splats is None else {"num_splats": args.fit_splats}
+    return request_of(FitRequest, args, **given)
 
 
 def _scoring(args: argparse.Namespace) -> dict[str, Any]:
     """What both kinds of request have in common."""
-    return {
-        "recording": recording_of(args, args.reference, args.masks),
-        "newest": args.snapshots == "newest",
-        "cloud": _cloud(args),
-        "require": tuple(args.require),
-        **{name: getattr(args, name) for name in PASSED_ON},
-    }
+    recording = recording_of(args, args.reference, args.masks)
+    return {"recording": recording, "newest": args.snapshots == "newest", "cloud": _cloud(args)}
 
 
 def _cloud(args: argparse.Namespace) -> CloudSettings | None:
@@ -193,3 +91,154 @@ def _cloud(args: argparse.Namespace) -> CloudSettings | None:
     return CloudSettings(
         path=args.cloud, unit=unit, max_distance=args.cloud_max, spacing=args.cloud_spacing, masks=args.cloud_masks
     )
+
+
+def lines_of(report: Mapping[str, Any]) -> list[str]:
+    """The table of a report, and what belongs to its figures."""
+    if "fits" in report:
+        return _lines_of_fits(report)
+    return _lines_of_scans(report) if "results" in report else _lines_of_views(report)
+
+
+def _lines_of_views(report: Mapping[str, Any]) -> list[str]:
+    metrics, columns = report["metrics"], [name for name in COLUMNS if name in report["views"][0]]
+    stamps = [f"{view['stamp_ns'] / 1e9:.3f}" if report["has_clock"] else "-" for view in report["views"]]
+    rows = [
+        [view["view"], stamp, *_cells(columns, view)] for view, stamp in zip(report["views"], stamps, strict=True)
+    ]
+    lines = _with_mean(("view", "stamp [s]"), columns, rows, [f"mean of {len(rows)}", "-"], metrics)
+    lines += ["", *_protocol_lines(report["protocol"])]
+    lines.append(
+        f"{counted(metrics['num_views'], 'view')} scored, {metrics['num_skipped']:.0f} before the first snapshot; "
+        f"depth: median of the absolute error; seen: by {', '.join(report['training_cameras'])} within 2 cm"
+    )
+    if "chamfer" in metrics:
+        lines += _cloud_lines(metrics, report["protocol"]["definitions"]["cloud"])
+    lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
+    if metrics["free_mass"] is not None:
+        lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")
+    return lines
+
+
+def _lines_of_scans(report: Mapping[str, Any]) -> list[str]:
+    metrics, results = report["metrics"], report["results"]
+    columns = [name for name in COLUMNS if name in metrics]
+    rows = [[s, one["metrics"]["num_views"], *_cells(columns, one["metrics"])] for s, one in results.items()]
+    mean = [f"mean of {len(results)}", metrics["num_views"]]
+    lines = _with_mean(("scan", "views"), columns, rows, mean, metrics)
+    lines += ["", *_protocol_lines(report["protocol"])]
+    if "chamfer" in metrics:
+        lines += _cloud_lines(metrics, "; ".join(one["protocol"]["definitions"]["cloud"] for one in results.values()))
+    return lines
+
+
+def _with_mean(
+    header: Sequence[str],
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    mean: Sequence[Any],
+    metrics: Mapping[str, Any],
+) -> list[str]:
+    """The table of the rows, below a line their mean, and the changes where there was a baseline."""
+    last = [[*mean, *_cells(columns, metrics)]]
+    if f"{PREFIX}num_views" in metrics:
+        last.append(["change", "-", *(_change(name, metrics.get(PREFIX + name)) for name in columns)])
+    lines = table((*header, *(COLUMNS[name] for name in columns)), [*rows, *last])
+    lines.insert(2 + len(rows), lines[1])
+    return lines
+
+
+def _lines_of_fits(report: Mapping[str, Any]) -> list[str]:
+    metrics, settings, fits = report["metrics"], report["settings"], report["fits"]
+    rows, psnr = [], {name: [fit["psnr"] for fit in fits if fit["method"] == name] for name in METHODS}
+    for name, method in METHODS.items():
+        rest = [_number(metrics[f"{what}_{method.key}"]) for what in ("splats", "memory", "seconds")]
+        scans = [_cell("psnr", value) for value in (*psnr[name], metrics[f"psnr_{method.key}"])]
+        rows.append([method.name, f"{method.psnr:.2f}", method.splats, *scans, *rest])
+    pairs = zip(psnr["budget"], psnr["3dgs"], strict=True)
+    gains: list[float | None] = [METHODS["budget"].psnr - METHODS["3dgs"].psnr]
+    gains += [None if None in pair else pair[0] - pair[1] for pair in pairs]
+    first, *others = [_number(value, "+.2f") for value in (*gains, metrics["psnr_gain"])]
+    rows.append(["ours - 3D-GS", first, "-", *others, "-", "-", "-"])
+    header = ("method", "paper's dB", "paper's splats", *(f"{scan} dB" for scan in report["scans"]))
+    return [
+        *table((*header, "mean dB", "splats", "memory MiB", "fit s"), rows),
+        "paper's: its section IV-A, on scans, views, sizes and iterations that it does not name; the rest: here",
+        "",
+        *_each_fit(fits),
+        "",
+        *_protocol_lines(report["protocol"]),
+        f"PSNR {report['psnr']}; {settings['splats']:,} splats to begin with, {settings['iterations']} iterations,"
+        f" seed {settings['seed']}, the same losses; memory: the largest of the scans",
+    ]
+
+
+def _each_fit(fits: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What else was scored, a row for each fit."""
+    names = [name for name in EACH if name in fits[0]["metrics"]]
+    rows = [
+        [
+            *(fit["scan"], METHODS[fit["method"]].name, fit["splats"]),
+            *_cells(names, fit["metrics"]),
+            *(_number(fit["memory"]), _number(fit["seconds"])),
+        ]
+        for fit in fits
+    ]
+    return table(("scan", "method", "splats", *(COLUMNS[name] for name in names), "memory MiB", "fit s"), rows)
+
+
+def _protocol_lines(protocol: Mapping[str, Any]) -> list[str]:
+    """Protocol, split, mask rule, averaging, resolution and background."""
+    color = ", ".join(f"{value:.2f}" for value in protocol["background"])
+    published = protocol["published_resolution"]
+    resolution = ", ".join(protocol["resolution"])
+    differs = "" if published in (None, resolution) else f" (published figures: {published})"
+    scans = protocol["published_scans"]
+    return [
+        f"protocol: {protocol['name']}" + ("" if protocol["name"] == "none" else f" ({protocol['source']})"),
+        f"split: {protocol['split']}",
+        *([f"published figures: means over scans {', '.join(map(str, scans))}"] if scans else []),
+        f"mask rule: {protocol['mask_rule']}; averaging: {protocol['averaging']}; resolution: {resolution}{differs};"
+        f" background: ({color})",
+    ]
+
+
+def _cloud_lines(metrics: Mapping[str, Any], words: str) -> list[str]:
+    """Accuracy, completeness and Chamfer, and by what they came about."""
+
+    def length(name: str) -> str:
+        return "-" if metrics[name] is None else f"{1e3 * metrics[name]:.2f} mm"
+
+    def share(name: str) -> str:
+        return "-" if metrics[name] is None else f"{100 * metrics[name]:.1f}% farther"
+
+    parts = [f"accuracy {length('accuracy')} ({share('accuracy_beyond')})"]
+    for name, of in (("completeness", "all"), ("completeness_seen", "seen")):
+        parts.append(f"completeness of {of} {length(name)} ({share(name + '_beyond')})")
+    return [f"surface: {', '.join(parts)}, Chamfer {length('chamfer')}", f"cloud: {words}"]
+
+
+def _cells(columns: Sequence[str], metrics: Mapping[str, Any]) -> list[str]:
+    return [_cell(name, metrics.get(name)) for name in columns]
+
+
+def _change(name: str, value: float | None) -> str:
+    """A change as the table shows it, with its sign."""
+    return "-" if value is None else ("-" if value < 0 else "+") + _cell(name, abs(value))
+
+
+def _cell(name: str, value: float | None) -> str:
+    """A figure as the table shows it."""
+    if value is None:
+        return "-"
+    if name.startswith("depth"):
+        return f"{1000 * value:.1f}"
+    if name == "chamfer":
+        return f"{1000 * value:.2f}"
+    if name in SHARES:
+        return f"{100 * value:.1f}%"
+    return f"{value:.2f}" if name.startswith("psnr") else f"{value:.4f}"
+
+
+def _number(value: float | None, form: str = ".0f") -> str:
+    return "-" if value is None else format(value, form)

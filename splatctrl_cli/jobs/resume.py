@@ -14,6 +14,10 @@ from splatctrl_cli.files.output import sha256
 from splatctrl_cli.kernels import native
 from splatctrl_cli.scene_files.scene_writer import Checkpoint, read_checkpoint
 
+DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene beside its configuration, if not given
+    **{"cameras": None, "camera": [], "camera_pose": [], "world_frame": None, "depth_scale": None},
+    **{"pairing_tolerance": 0.02, "joint_topic": None, "holdout": None, "scan": None, "box": None},
+}
 DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit
 
 
@@ -47,16 +51,15 @@ def deciding_versions() -> dict[str, str]:
 
 
 @contextmanager
-def told_how_to_go_on(checkpoint: Path) -> Iterator[None]:
-    """Says after Ctrl-C what was kept: the folder above that of the checkpoint."""
+def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[None]:
+    """Says after Ctrl-C what was kept (by default the folder above that of the checkpoint)."""
     try:
         yield
     except KeyboardInterrupt:
         if not checkpoint.is_file():
             raise
-        raise KeyboardInterrupt(
-            f"interrupted: {checkpoint.parent.parent} is kept; go on with the same command and --resume"
-        ) from None
+        kept = kept or checkpoint.parent.parent
+        raise KeyboardInterrupt(f"interrupted: {kept} is kept; go on with the same command and --resume") from None
 
 
 def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> "Checkpoint":

@@ -3,23 +3,23 @@
 Each subcommand runs as a process of its own in some tests; what only asks for another line of it runs in this one.
 """
 
-import argparse
 import json
+import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from splatctrl_cli.captures.capture import write_capture
-from splatctrl_cli.cli import demo
-from splatctrl_cli.cli.main import build_parser, main
-from splatctrl_cli.cli.parser import COMMANDS
-from splatctrl_cli.evaluate.verdict import noted
+from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser, function_of
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.sources.source import open_source
 from tests.cli import here
 from tests.logs.make_log import LogRecipe, make_log
@@ -92,36 +92,55 @@ def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: st
         assert word in done.stderr
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_subcommand_has_help(command: str) -> None:
-    done = splatctrl(command, "--help")
-    assert done.returncode == 0
-    assert done.stdout.startswith(f"usage: splatctrl {command}")
-    assert "show this help" in done.stdout
-    assert done.stderr == ""
-
-
-def test_the_list_of_commands_names_each_and_the_exit_codes() -> None:
-    done = splatctrl("--help")
-    assert done.returncode == 0
-    for command in COMMANDS:
-        assert f"    {command}" in done.stdout
-    assert "130 interrupted" in done.stdout
-
-
-def test_help_imports_nothing_heavy() -> None:
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_imports_nothing_heavy_and_fits_a_screen(command: str) -> None:
+    """Of a command: its usage, the options that people use, two examples, and where to find the rest."""
     program = f"""
 import sys
 from splatctrl_cli.cli.main import main
 try:
-    main(["--help"])
+    main([*{command.split()!r}, "--help"])
 except SystemExit:
     pass
 print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert "usage: splatctrl" in done.stdout
+    environment = os.environ | {"COLUMNS": "100"}
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.startswith(f"usage: splatctrl {command}")
+    assert "show this help" in done.stdout
     assert done.stderr == "[]\n"
+    assert len(done.stdout.splitlines()) <= 40
+    if command:
+        assert len(re.findall(f"^  splatctrl {command}", done.stdout, flags=re.MULTILINE)) == 2
+    else:
+        assert all(f"    {name}" in done.stdout for name in COMMANDS)
+        assert "130 interrupted" in done.stdout
+
+
+def leaves(commands: dict[str, Command]) -> Iterator[tuple[list[str], Command]]:
+    for name, command in commands.items():
+        below = {} if command.actions is None else command.actions
+        yield from (([name, *words], one) for words, one in leaves(below)) if below else [([name], command)]
+
+
+@pytest.mark.parametrize(("words", "command"), [*leaves(COMMANDS)], ids=lambda value: str(value)[:20])
+def test_all_help_shows_every_option_and_the_command_has_a_function(
+    capsys: pytest.CaptureFixture[str], words: list[str], command: Command
+) -> None:
+    assert callable(function_of(command.run))
+    with pytest.raises(SystemExit) as ended:
+        build_parser(words[0]).parse_args([*words, "--help-all"])
+    shown = capsys.readouterr().out
+    assert ended.value.code in (0, None)
+    assert shown.startswith(f"usage: splatctrl {' '.join(words)}")
+    assert "\nrun:\n" in shown and "--quiet" in shown and (("\ninput:\n" in shown) == ("--cameras" in shown))
+
+
+@pytest.mark.parametrize("command", [name for name, command in COMMANDS.items() if not command.actions])
+def test_examples_are_taken(command: str) -> None:
+    for example in COMMANDS[command].examples:
+        assert build_parser(command).parse_args(shlex.split(example)).command == command
 
 
 def test_a_command_runs_without_the_files_of_the_others(
@@ -130,7 +149,7 @@ def test_a_command_runs_without_the_files_of_the_others(
     monkeypatch.setitem(sys.modules, "splatctrl_cli.cli.replay", None)  # importing it fails
     assert main(["info", str(sample_data / "tabletop" / "truth.json")]) == 0
     capsys.readouterr()
-    assert main(["replay"]) == 70
+    assert main(["replay", "a", "--field", "b", "--urdf", "c"]) == 70
     assert "splatctrl_cli.cli.replay" in capsys.readouterr().err
 
 
@@ -240,61 +259,6 @@ def test_force_keeps_what_no_command_wrote(work: Work, tmp_path: Path, command: 
         here.splatctrl(*work.arguments(command, precious.parent), "-q", "--force"), 2, said, "another --out"
     )
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [precious]
-
-
-def test_force_replaces_what_the_demo_wrote(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    done = noted("step", "expected 'done', got 'done'")
-    monkeypatch.setattr(demo, "_run", lambda command, console, folder, out: done)
-    monkeypatch.setattr(demo, "_pictures", lambda data, out, threads: {})
-    out = tmp_path / "out"
-    assert main(["demo", "-o", str(out), "-q"]) == 0
-    run = json.loads((out / "run.json").read_text())
-    assert run["command"] == "demo"
-    assert set(run["inputs"]) == {"log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml"}
-    assert run["verdict"]["label"] == "passed"
-    assert main(["demo", "-o", str(out), "-q", "--force"]) == 0
-    assert capsys.readouterr().err == ""
-
-
-def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    labels = dict(demo.EXPECTED)
-
-    def step(args: argparse.Namespace) -> int:
-        name = "replay --mode closed-loop" if getattr(args, "mode", "") == "closed-loop" else args.command
-        if name in labels:
-            args.out.mkdir()
-            (args.out / "run.json").write_text(json.dumps({"verdict": {"label": labels[name]}}))
-        return 1 if name.startswith("replay -") else 0
-
-    build = build_parser
-
-    def parser(words: Sequence[str] | None = None) -> argparse.ArgumentParser:
-        made = build(words)
-        parse = made.parse_args
-        made.parse_args = lambda *given: argparse.Namespace(**{**vars(parse(*given)), "run": step})  # type: ignore
-        return made
-
-    monkeypatch.setattr(demo, "_pictures", lambda data, out, threads: {})
-    out = tmp_path / "out"
-    with monkeypatch.context() as patch:
-        patch.setattr(demo, "build_parser", parser)
-        args = build(["demo"]).parse_args(["demo", "-o", str(out)])
-        assert demo.run(args) == 0
-        said = capsys.readouterr()
-        assert "demo: replay --mode closed-loop: expected 'margin broken', got 'margin broken'" in said.err
-        assert "\ndemo: PASSED (8 steps)\n" in f"\n{said.out}"
-        labels["replay --mode closed-loop"] = "safe"
-        args.force = True
-        assert demo.run(args) == 1
-    said = capsys.readouterr()
-    assert (
-        "demo: NOT AS EXPECTED (8 steps): replay --mode closed-loop: expected 'margin broken', got 'safe'" in said.out
-    )
-    assert json.loads((out / "run.json").read_text())["verdict"]["exit_code"] == 1
 
 
 @pytest.mark.parametrize("command", WRITERS)

@@ -7,21 +7,24 @@ import numpy as np
 import pytest
 import trimesh
 
+from splatctrl_cli.cli import scene_options
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.cli.numbers import words
+from splatctrl_cli.cli.parser import words
 from splatctrl_cli.cli.sdf_bake import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
 from splatctrl_cli.control import qp
 from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.evaluate.field_truth import FIELDS
-from splatctrl_cli.field import distance, probability, weights
+from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.grid import exact_channel
+from splatctrl_cli.grid_files import grid_formats
 from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.jobs.bake import SUMMARY_METRICS
 from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
+from splatctrl_cli.splat_files import splat_formats
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli import here
 from tests.field.scenes import cloud, splat_set
@@ -259,6 +262,10 @@ def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:
     assert tuple(weights.METHODS) == words(FieldConfig, "weights")
     assert tuple(probability.PROBABILITIES) == words(FieldConfig, "probability")
     assert tuple(qp.SOLVERS) == words(ControlConfig, "solver")
+    assert tuple(grid_formats.FORMATS) == scene_options.GRID_FORMATS
+    assert tuple(splat_formats.FORMATS) == scene_options.SPLAT_FORMATS
+    assert tuple(baker.CHANNELS) == scene_options.CHANNELS
+    assert scene_options.CHANNELS[:4] == baker.DEFAULT_CHANNELS
 
 
 def test_options_and_configuration_say_the_same(tmp_path: Path, splats: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.cli.score_report import lines_of
+from splatctrl_cli.cli.score import lines_of
 from splatctrl_cli.datasets.dtu import DtuView, read_dtu, write_dtu
 from splatctrl_cli.datasets.dtu_source import DtuSource
 from splatctrl_cli.datasets.idr import write_idr

@@ -1,0 +1,316 @@
+"""Every subcommand: what it is for, examples, its options, and the function that runs it, by name: what that function
+needs is imported when it runs, so that help answers at once.
+"""
+
+import argparse
+import importlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatctrl_cli import __version__
+from splatctrl_cli.cli.options import (
+    POSE,
+    SEVERAL_LOGS,
+    add_common,
+    add_gates,
+    add_lock,
+    add_output,
+    add_packages,
+    add_seed,
+    add_source,
+    add_threads,
+    pose,
+)
+from splatctrl_cli.cli.parser import Options, Parser, real, whole
+from splatctrl_cli.cli.replay_options import replay_options
+from splatctrl_cli.cli.scene_options import export_options, reconstruct_options, score_options, sdf_bake_options
+
+EXIT_CODES = """\
+exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
+damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug; 130 interrupted"""
+QUICK = 30  # images of a topic
+LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yaml"  # of examples
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A subcommand, or an action of one: `run` names MODULE:FUNCTION of this room, `options` adds its options; with
+    `actions` it has no more than these.
+    """
+
+    summary: str
+    examples: Sequence[str] = ()
+    run: str = ""
+    options: Callable[[Options, Parser], None] | None = None
+    actions: "dict[str, Command] | None" = None
+
+
+def build_parser(command: str | None = None) -> Parser:
+    """The parser with the options of `command` alone, or of every subcommand."""
+    parser = Parser(
+        prog="splatctrl",
+        description="What did the robot's cameras know, and would this controller have kept it safe?",
+        epilog=EXIT_CODES,
+    )
+    parser.add_argument("--version", action="version", version=f"splatctrl {__version__}")
+    _add_commands(parser, COMMANDS, dest="command", only=command)
+    return parser
+
+
+def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, only: str | None = None) -> None:
+    below = parser.add_subparsers(dest=dest, metavar=dest.upper(), required=True)
+    for name, command in commands.items():
+        description = command.summary[0].upper() + command.summary[1:] + "."
+        one = below.add_parser(name, help=command.summary, description=description, examples=command.examples)
+        if only not in (None, name):
+            continue
+        if command.actions is not None:
+            _add_commands(one, command.actions, dest="action")
+        if command.options is not None:
+            command.options(Options(one), one)
+            add_common(one)
+            one.set_defaults(run=command.run)
+
+
+def function_of(run: str) -> Callable[..., int]:
+    """What runs a command."""
+    module, _, name = run.partition(":")
+    function: Callable[..., int] = getattr(importlib.import_module(f"splatctrl_cli.cli.{module}"), name)
+    return function
+
+
+def _simulate(add: Options, parser: Parser) -> None:
+    files = "folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml"
+    add_output(add, files, default="simulated")
+    add_seed(add, "the noise and of --human-arm")
+    add("--duration S", "length in seconds (default: 7, with --human-arm 24)", real(0.5, 600, "s"))
+    add("--person", "a walking person with masks, instead of the standing cylinder")
+    shared = "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal"
+    add("--human-arm", shared, ("near-pickup", "near-goal"))
+    add(
+        "--dtu",
+        "write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in IDR's, with masks"
+        " of its things",
+    )
+    add("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0)
+    add("--width PX", "image width", whole(16, 4096, "px"), 320)
+    add("--height PX", "image height", whole(16, 4096, "px"), 240)
+    add("--noise", "depth noise", ("none", "realsense"), "realsense")
+
+
+def _ingest(add: Options, parser: Parser) -> None:
+    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, folder of a dataset, or .toml of an image folder"
+    add("SOURCE", f"{kinds}; {SEVERAL_LOGS}", Path, nargs="+")
+    add_output(add, "capture folder", default="NAME.capture in this folder, NAME that of SOURCE")
+    add("--resume", "continue an interrupted run, if there is one, to the same bytes")
+    add_source(add)
+
+
+def _info(add: Options, parser: Parser) -> None:
+    add("PATH", "file or folder", Path)
+    add_source(add)
+
+
+def _check(add: Options, parser: Parser) -> None:
+    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, capture, folder of a dataset, or .toml of an image folder"
+    add("SOURCE", f"{kinds}; {SEVERAL_LOGS}", Path, nargs="+")
+    fatal = "exit with 1 where a finding is as bad as this"
+    add("--fail-on", fatal, ("error", "warning", "never"), "error")
+    add(
+        "--quick N",
+        f"read the first N images of a topic only (default of N: {QUICK})",
+        _num_images,
+        nargs="?",
+        const=QUICK,
+    )
+    add("--urdf FILE", "compare joint states and depth with this robot", Path)
+    add("--spheres FILE", "its spheres (default: those of the URDF)", Path)
+    more = add.group("robot")
+    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
+    add_lock(more)
+    add_source(add)
+
+
+def _num_images(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        hint = f"put it behind the input, or write --quick={QUICK}"
+        raise argparse.ArgumentTypeError(f"expected a number of images, got {text!r}: {hint}") from None
+
+
+def _demo(add: Options, parser: Parser) -> None:
+    add("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data)", Path)
+    add_output(add, "folder for everything the demo makes", default="demo_output")
+    add_threads(parser)
+
+
+def _robot(add: Options, parser: Parser, spheres: str = "those of the URDF itself") -> None:
+    """``--urdf``, ``--packages``, and ``--spheres`` unless they are fitted."""
+    add("--urdf FILE", "the robot's URDF (expanded, no xacro)", Path, required=True)
+    add_packages(add)
+    if spheres:
+        add("--spheres FILE", f"YAML (also cuRobo's) or URDF with the spheres (default: {spheres})", Path)
+
+
+def _robot_spheres(add: Options, parser: Parser) -> None:
+    _robot(add, parser, spheres="")
+    add_output(add, "YAML file of the spheres", default="spheres.yaml")
+    number = add.either()
+    most = "spheres over all links, sticking out as little as that allows (default: 64)"
+    number("--max-spheres N", most, whole(1, 100_000))
+    number("--max-protrusion M", "or: the fewest found that stick out no more [m]", real(1e-6, 10, "m"))
+    outside = "how far surface points may stay outside all spheres [m]; at 0 all are covered"
+    add("--max-deficit M", outside, real(0, 10, "m"), 0.0)
+    add_seed(add, "the greedy covers")
+    _robot_judged(add)
+
+
+def _robot_check(add: Options, parser: Parser) -> None:
+    _robot(add, parser)
+    _robot_judged(add)
+
+
+def _robot_judged(add: Options) -> None:
+    add("--picture FILE.png", "draw the spheres over the collision shapes", Path)
+    add_gates(add)
+
+
+def _robot_pairs(add: Options, parser: Parser) -> None:
+    _robot(add, parser)
+    add_lock(add)
+    add("--srdf FILE", "leave out what its disable_collisions name", Path)
+    add("--postures N", "without --srdf: joint configurations sampled", whole(1, 10_000_000), 2000)
+    add("--drop-never", "leave out what never comes near in the sample (a guess, no proof)")
+    add_seed(add, "the sampling")
+
+
+def _robot_info(add: Options, parser: Parser) -> None:
+    _robot(add, parser, spheres="none, or those of the URDF")
+    add_lock(add)
+
+
+def _capture_pack(add: Options, parser: Parser) -> None:
+    add("CAPTURE", "capture folder", Path)
+    add_output(add, "MCAP file", default="CAPTURE.mcap")
+
+
+def _capture_unpack(add: Options, parser: Parser) -> None:
+    add("PACKED", "MCAP file", Path)
+    add_output(add, "capture folder", default="PACKED.capture")
+
+
+COMMANDS = {
+    "simulate": Command(
+        summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
+        examples=("simulate -o out/log", "simulate --human-arm near-goal --seed 3 -o out/shared"),
+        run="recordings:run_simulate",
+        options=_simulate,
+    ),
+    "ingest": Command(
+        summary="turn a log or image folder into a capture folder",
+        examples=(f"ingest {LOG} -o out/x.capture", "ingest run1.bag run2.bag --cameras front,wrist"),
+        run="recordings:run_ingest",
+        options=_ingest,
+    ),
+    "info": Command(
+        summary="describe a log, capture, scene, grid, robot or other file",
+        examples=(f"info {LOG}", "info out/scene --json"),
+        run="recordings:run_info",
+        options=_info,
+    ),
+    "check": Command(
+        summary="say what is wrong with a log, capture or image folder",
+        examples=(f"check {LOG} {ROBOT}", "check run.bag --quick --fail-on warning"),
+        run="check:run",
+        options=_check,
+    ),
+    "reconstruct": Command(
+        summary="fit splats to a log, a capture or a DTU scan",
+        examples=(
+            f"reconstruct out/x.capture --cameras cam0,cam1 {ROBOT} -o out/scene",
+            "reconstruct --dtu sample_data/dtu --protocol holdout:2,5 -o out/scan",
+        ),
+        run="reconstruct:run",
+        options=reconstruct_options,
+    ),
+    "export": Command(
+        summary="write splats as a file that viewers open, and check what reads back",
+        examples=("export out/scene -o out/scene.ply", "export out/scene --labels object -o out/scene.spz"),
+        run="export:run",
+        options=export_options,
+    ),
+    "sdf-bake": Command(
+        summary="bake a scene's splats into a distance grid with gradient",
+        examples=(
+            f"sdf-bake out/scene {ROBOT} -o out/field",
+            "sdf-bake out/scene --box=-1,-1,0,1,1,1 --voxel 0.02 --formats npz,nrrd -o out/grid",
+        ),
+        run="sdf_bake:run",
+        options=sdf_bake_options,
+    ),
+    "score": Command(
+        summary="compare renders of a scene with recorded views (by default of the cameras that did not train it): "
+        "PSNR, SSIM, depth error, by a named protocol; or fit scans first (--fit)",
+        examples=(
+            "score out/scene --reference out/x.capture --cameras cam3 -o out/score",
+            "score out/scan --dtu sample_data/dtu --protocol holdout:2,5 --require 'psnr_all>=20'",
+        ),
+        run="score:run",
+        options=score_options,
+    ),
+    "replay": Command(
+        summary="audit logged joint states, ask the controller at each, or drive the arm in closed loop",
+        examples=(
+            f"replay out/x.capture --scene out/scene {ROBOT} -o out/audit",
+            f"replay out/x.capture --scene out/scene {ROBOT} --mode closed-loop --start-time 1.6",
+        ),
+        run="replay:run",
+        options=replay_options,
+    ),
+    "robot": Command(
+        summary="fit and measure a robot's collision spheres, list its self-collision pairs and limits",
+        examples=("robot spheres --urdf arm.urdf --max-spheres 80 -o spheres.yaml", f"robot check {ROBOT}"),
+        actions={
+            "spheres": Command(
+                summary="fit spheres that cover all of each link's collision geometry",
+                run="robot:run_spheres",
+                options=_robot_spheres,
+            ),
+            "check": Command(
+                summary="measure how much of the collision surface a set of spheres covers",
+                run="robot:run_check",
+                options=_robot_check,
+            ),
+            "pairs": Command(
+                summary="list which links may collide with each other, and why others may not",
+                run="robot:run_pairs",
+                options=_robot_pairs,
+            ),
+            "info": Command(
+                summary="show joints with limits, links, shapes and spheres",
+                run="robot:run_info",
+                options=_robot_info,
+            ),
+        },
+    ),
+    "demo": Command(
+        summary="run the main job on a sample recording, with pictures",
+        examples=("demo", "demo --data out/log -o out/demo"),
+        run="demo:run",
+        options=_demo,
+    ),
+    "capture": Command(
+        summary="pack a capture into one MCAP that viewers open, and unpack it",
+        examples=("capture pack out/x.capture -o x.mcap", "capture unpack x.mcap -o back.capture"),
+        actions={
+            "pack": Command(summary="write a capture as one MCAP", run="recordings:run_pack", options=_capture_pack),
+            "unpack": Command(
+                summary="write the capture that `pack` made an MCAP of",
+                run="recordings:run_unpack",
+                options=_capture_unpack,
+            ),
+        },
+    ),
+}

@@ -1,0 +1,249 @@
+"""Options that several subcommands have, and what is made of them; imports nothing heavy, for help is to be quick."""
+
+import argparse
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from splatctrl_cli.cli.parser import MAX_LENGTH, MAX_SEED, Options, Parser, real, several, whole
+from splatctrl_cli.config.declared import shown
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.gates import gate
+from splatctrl_cli.logs.options import CameraTopics, PoseTopic, SourceOptions
+
+T = TypeVar("T")
+
+POSE = "X,Y,Z,QX,QY,QZ,QW"
+BOX = "X0,Y0,Z0,X1,Y1,Z1"
+SEVERAL_LOGS = "several logs of one session are read as one"
+
+
+def add_output(add: Options, what: str, *, default: str) -> None:
+    """``-o/--out`` and ``--force``."""
+    add("-o/--out PATH", f"{what} (default: {default})", Path)
+    add("--force", "replace the output if it exists")
+
+
+def add_common(parser: Parser) -> None:
+    """``--json``, ``-v``, ``-q``, which every command has."""
+    Options(parser)("--json", "print one JSON object instead of a table")
+    add = Options(parser.run_group)
+    add("-v/--verbose", "say more; show tracebacks", action="count", default=0)
+    add("-q/--quiet", "no progress, no log lines")
+
+
+def add_config(add: Options, parser: Parser) -> None:
+    """``--config``, ``--set``, and among the options of a run ``--seed``, ``--threads``."""
+    add("--config FILE.toml", "configuration, see docs/config.md", Path)
+    add("--set SECTION.KEY=VALUE ...", "one setting")
+    add_seed(Options(parser.run_group), "everything random")
+    add_threads(parser)
+
+
+def add_seed(add: Options, what: str) -> None:
+    """``--seed``."""
+    add("--seed SEED", f"seed of {what}", whole(0, MAX_SEED), 0)
+
+
+def add_threads(parser: Parser) -> None:
+    """``--threads``."""
+    threads = "threads, at most 16 or one per core (default: one per core)"
+    Options(parser.run_group)("--threads THREADS", threads, whole(0, 1024))
+
+
+def add_gates(add: Options) -> None:
+    """``--require 'metric>=value'``."""
+    add("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
+
+
+def add_source(add: Options) -> None:
+    """``--cameras``, and the other options of a source in a group of their own."""
+    add("--cameras A,B", "only these cameras", _Listed("--cameras"))
+    add = add.group("input")
+    add("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found")
+    add(
+        f"--camera-pose NAME={POSE} ...",
+        "pose of a fixed camera in the world, instead of the recorded one, or NAME=identity; or NAME=TOPIC[@FRAME], a"
+        " topic of poses (Odometry, PoseStamped, ...) of FRAME where tf has none",
+    )
+    add(
+        "--intrinsics NAME=FX,FY,CX,CY ...",
+        "intrinsics of a camera in pixels, without distortion, instead of the recorded ones",
+    )
+    add("--human-topic NAME=TOPIC ...", "mono8 masks of a camera's colour images, not 0 where they show a person")
+    add("--world-frame FRAME", "tf frame of poses (default: root of the tf tree)")
+    add("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m"))
+    add("--pairing-tolerance S", "colour to depth, seconds", real(0, 3600, "s"), 0.02)
+    add("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header")
+    add("--joint-topic TOPIC", "JointState topic (default: /joint_states)")
+    add("--root DIR", "folder of the images that a .toml describes", Path)
+    add("--holdout 0,6", "frames of an image folder that become camera 'holdout'", _Listed("--holdout"))
+
+
+def add_scan(add: Options) -> None:
+    """``--scan``, ``--protocol``, ``--depths`` and ``--downscale``: the options of a DTU scan."""
+    add("--scan NAME", "which scan of --dtu (default: the only one)")
+    add(
+        "--protocol NAME",
+        "which views train and which are scored: dtu-train, dtu-holdout8, regnerf-3, regnerf-6, regnerf-9, mvsnerf,"
+        " holdout:everyN, holdout:everyN+FIRST or holdout:2,5 (docs/score.md)",
+    )
+    add("--depths DIR", "depth_map_0000.pfm and so on of a scan in IDR's layout", Path)
+    add(
+        "--downscale N",
+        "make images of --dtu N times smaller (default: down to the size of the protocol, if a whole factor)",
+        whole(1, 64),
+    )
+
+
+def add_disagreement(add: Options) -> None:
+    """``--max-pose-jump`` and ``--allow-disagreement``: by how much a log may contradict itself."""
+    jump = "how far a camera may move between frames less than a second apart, in metres"
+    add("--max-pose-jump M", jump, real(1e-3, MAX_LENGTH, "m"), 1.0)
+    add("--allow-disagreement", "continue although cameras disagree about surfaces")
+
+
+def add_declare(add: Options) -> None:
+    """``--declare``."""
+    add("--declare FILE.toml", "what the robot carries, and contact that is meant (docs/declare.md)", Path)
+
+
+def add_packages(add: Options) -> None:
+    """``--packages``."""
+    packages = "folder in which package:// paths of the URDF's meshes are found; default: the folders above it"
+    add("--packages DIR ...", packages, Path)
+
+
+def add_lock(add: Options) -> None:
+    """``--lock``."""
+    held = "hold a joint still at a value [rad or m], and what mimics it, such as a finger that no log moves"
+    add("--lock JOINT=VALUE ...", held)
+
+
+def request_of(kind: type[T], args: argparse.Namespace, **given: Any) -> T:
+    """A request: fields that are `given`, or that an option of the same name has; the others keep their default."""
+    names = {field.name for field in fields(kind)} - given.keys()  # type: ignore[arg-type]
+    parsed = {name: value for name, value in vars(args).items() if name in names and value is not None}
+    return kind(**given, **{name: tuple(v) if isinstance(v, list) else v for name, v in parsed.items()})
+
+
+def source_options(args: argparse.Namespace) -> SourceOptions:
+    """What `add_source` parsed. Raises UsageError for a value of the wrong form."""
+    return request_of(
+        SourceOptions,
+        args,
+        cameras=_names(args.cameras),
+        camera_topics=tuple(_topics(text) for text in args.camera),
+        camera_poses=dict(_pose(text) for text in args.camera_pose if not _is_topic(text)),
+        camera_pose_topics=dict(_pose_topic(text) for text in args.camera_pose if _is_topic(text)),
+        human_topics=dict(_human_topic(text) for text in args.human_topic),
+        intrinsics=dict(_intrinsics(text) for text in args.intrinsics),
+        pairing_tolerance_s=args.pairing_tolerance,
+        holdout=_names(args.holdout),
+    )
+
+
+def locked_joints(args: argparse.Namespace) -> dict[str, float]:
+    """Values by joint of ``--lock JOINT=VALUE``. Raises UsageError for a value that is no number."""
+    locked = {}
+    for assignment in args.lock:
+        name, _, text = assignment.partition("=")
+        value = several(text)
+        if len(value) != 1:
+            raise UsageError(f"--lock {assignment}: expected JOINT=VALUE, got {text!r} for the value")
+        locked[name] = value[0]
+    return locked
+
+
+def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: str) -> tuple[str, ...]:
+    """The names in a list with commas. Raises UsageError for one that is no choice, or none at all."""
+    names = tuple(dict.fromkeys(_names(text) or ()))
+    unknown = [name for name in names if name not in choices]
+    if unknown or not names:
+        raise UsageError(f"{option} {text}: expected some of: {', '.join(choices)}")
+    return names
+
+
+def pose(text: str) -> tuple[float, ...]:
+    """A pose as POSE, for argparse."""
+    values = numbers(text)
+    if len(values) != 7:
+        raise argparse.ArgumentTypeError(f"expected 7 numbers {POSE.lower()}, got {len(values)}")
+    length = math.hypot(*values[3:])
+    if abs(length - 1.0) > 0.01:
+        expected = "expected a unit quaternion qx,qy,qz,qw"
+        raise argparse.ArgumentTypeError(f"{expected}, got one of length {length:.3f}")
+    return values
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """Finite numbers joined by commas, for argparse."""
+    values = several(text)
+    if not values:
+        raise argparse.ArgumentTypeError(f"expected finite numbers joined by commas, up to 1e6, got {shown(text)}")
+    return values
+
+
+class _Listed:
+    """A list for argparse, without spaces around its names. Raises UsageError for one that names nothing."""
+
+    def __init__(self, option: str) -> None:
+        self.option = option
+
+    def __call__(self, text: str) -> str:
+        names = _names(text)
+        if not names:
+            raise UsageError(f"{self.option} {text!r}: expected names, got none", remedy="leave the option out")
+        return ",".join(names)
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _topics(text: str) -> CameraTopics:
+    name, equals, rest = text.partition("=")
+    topics = rest.split(",")
+    if not (re.fullmatch(r"\w[\w.-]*", name) and equals and len(topics) in {2, 3} and all(topics)):
+        raise UsageError(f"--camera {text}: expected NAME=COLOR,DEPTH or NAME=COLOR,DEPTH,INFO")
+    return CameraTopics(name=name, color=topics[0], depth=topics[1], info=topics[2] if len(topics) == 3 else "")
+
+
+def _human_topic(text: str) -> tuple[str, str]:
+    name, _, topic = text.partition("=")
+    if not name or not topic:
+        raise UsageError(f"--human-topic {text}: expected NAME=TOPIC")
+    return name, topic
+
+
+def _pose(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, rest = text.partition("=")
+    if name and rest == "identity":
+        return name, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    values = several(rest)
+    if not name or len(values) != 7 or not 0.5 < sum(v * v for v in values[3:]) < 2.0:
+        raise UsageError(f"--camera-pose {text}: expected NAME={POSE} with a unit quaternion, or NAME=identity")
+    return name, values
+
+
+def _is_topic(text: str) -> bool:
+    return text.partition("=")[2].startswith("/")
+
+
+def _pose_topic(text: str) -> tuple[str, PoseTopic]:
+    name, _, rest = text.partition("=")
+    topic, at, frame = rest.partition("@")
+    if not name or not topic or bool(at) != bool(frame):
+        raise UsageError(f"--camera-pose {text}: expected NAME=TOPIC or NAME=TOPIC@FRAME")
+    return name, PoseTopic(topic=topic, frame=frame.strip("/"))
+
+
+def _intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
+    name, _, rest = text.partition("=")
+    values = several(rest)
+    if not name or len(values) != 4 or not min(values[:2]) > 0:
+        raise UsageError(f"--intrinsics {text}: expected NAME=FX,FY,CX,CY in pixels")
+    return name, values

@@ -1,0 +1,128 @@
+"""A check from its request to its result: what is wrong with a recording, before it costs an hour."""
+
+import statistics
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from splatctrl_cli.checks.check_log import check_log
+from splatctrl_cli.checks.check_source import check_source
+from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, error, note
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.consistency import CAUSES, agreements
+from splatctrl_cli.sources.source import open_logs
+
+RANGE = (0.2, 6.0)  # [m] of depth that is compared between views
+NEVER = "never"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckRequest:
+    """One check of a recording, `paths` of which are several only where they are logs of one session.
+
+    num_images: only so many of a topic are read, None for all. urdf: a robot to compare joint states and depth with;
+    base: its pose in world as x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves.
+    fail_on: "error", "warning" or NEVER, the least severity that fails.
+    """
+
+    paths: tuple[Path, ...]
+    options: SourceOptions = field(default_factory=SourceOptions)
+    num_images: int | None = None
+    urdf: Path | None = None
+    spheres: Path | None = None
+    base: tuple[float, ...] | None = None
+    locked: Mapping[str, float] = field(default_factory=dict)
+    fail_on: str = "error"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckResult:
+    """What was found, and the verdict on it."""
+
+    report: CheckReport
+    verdict: Verdict
+    exit_code: int
+
+
+def check(request: CheckRequest) -> CheckResult:
+    """Read the recording once. Raises UsageError for options that contradict each other, InputError for a recording
+    that cannot be opened.
+    """
+    if request.num_images is not None and request.num_images < 1:
+        raise UsageError(f"--quick {request.num_images}: expected 1 or more")
+    model, log = _robot(request), open_logs(request.paths)
+    if log is None:
+        report = check_source(request.paths[0], request.options, model=model, num_images=request.num_images)
+    else:
+        report = check_log(log, request.options, model=model, num_images=request.num_images)
+    report = replace(report, findings=[*report.findings, *_agreement(report)])
+    verdict = _verdict(report, request.fail_on)
+    return CheckResult(report=report, verdict=verdict, exit_code=0 if request.fail_on == NEVER else verdict.exit_code)
+
+
+def _robot(request: CheckRequest) -> RobotModel | None:
+    if request.urdf is None:
+        given = {"spheres": request.spheres, "base": request.base, "lock": request.locked or None}
+        for name, value in given.items():
+            if value is not None:
+                raise UsageError(f"--{name}: expected --urdf beside it")
+        return None
+    T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
+    return RobotModel.from_urdf(request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked)
+
+
+def _agreement(report: CheckReport) -> Iterator[Finding]:
+    """Whether views agree on where the surfaces are that both see."""
+    good: list[float] = []
+    for pair in agreements(list(report.frames), *RANGE):
+        both = list(dict.fromkeys(pair.cameras))
+        if pair.holds:
+            good.append(pair.median)
+            continue
+        where = f"camera {both[0]}" if len(both) == 1 else f"cameras {both[0]} and {both[1]}"
+        text = f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see)"
+        text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
+        remedy = f"{CAUSES}: calibrate the cameras' poses again (hand-eye), or widen the range of depth"
+        remedy += f", or keep one with --cameras {both[0]}" if len(both) > 1 else ": is it the pose of another frame?"
+        yield error("agreement", where, text, remedy, value=round(1e3 * pair.median, 2), unit="mm")
+    if good:
+        text = f"where views see one surface their depths differ by {1e3 * max(good):.1f} mm (median of its pixels)"
+        if len(good) > 1:
+            middle = 1e3 * statistics.median(good)
+            text = f"{text} in the worst of {len(good)} pairs of cameras or views of one, by {middle:.1f} mm in most"
+        yield note("agreement", "cameras", text, value=round(1e3 * max(good), 2), unit="mm")
+
+
+def _verdict(report: CheckReport, fail_on: str) -> Verdict:
+    """Of the findings: errors, and warnings where asked for, fail; the other warnings are notes."""
+    fatal = {Severity.ERROR, *([Severity.WARNING] if fail_on == Severity.WARNING else [])}
+    read = Reason(
+        criterion="messages",
+        outcome=Outcome.PASSED if report.num_messages else Outcome.NOT_EVALUABLE,
+        sentence=f"{report.num_messages} {report.unit} read",
+        value=float(report.num_messages),
+        threshold=1.0,
+        count=report.num_messages,
+    )
+    found = [
+        Reason(
+            criterion=finding.code,
+            outcome=Outcome.FAILED if finding.severity in fatal else Outcome.PASSED,
+            sentence=f"{finding.where}: {finding.what}",
+            value=finding.value,
+            unit=finding.unit,
+            time_s=report.seconds(finding),
+            who=finding.where,
+            remedy=finding.remedy,
+            is_note=finding.severity is Severity.WARNING,
+        )
+        for finding in report.sorted_findings
+    ]
+    counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in report.counts.items())
+    return verdict_of(
+        "check", [read, *found], scope=f"{Path(report.path).name}: {counts}", counts={"messages": report.num_messages}
+    )

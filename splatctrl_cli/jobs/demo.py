@@ -1,0 +1,275 @@
+"""The whole main job on the sample recording, one job after the other, with pictures."""
+
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.presets import with_preset
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.images import psnr
+from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
+from splatctrl_cli.files.summary import Summary
+from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.jobs.bake import BakeResult, bake
+from splatctrl_cli.jobs.bake_request import BakeRequest
+from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
+from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
+from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
+from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
+from splatctrl_cli.jobs.replay import ReplayResult, replay
+from splatctrl_cli.jobs.replays.request import ReplayRequest
+from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
+from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.records import JointState, RgbdFrame, SplatSet
+from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.render import render
+from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.sources.source import open_source
+
+TRAINING, SCORING = ("cam0", "cam1", "cam2"), ("cam3",)
+CLOSED_LOOP_START = 1.6  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
+INPUTS = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
+CAPTURE, USING, TRUTH = "{out}/tabletop.capture", "--threads {threads}", "--truth {data}/truth.json"
+ROBOT = "--urdf {data}/robot.urdf --spheres {data}/robot_spheres.yaml"
+AGAINST = f"replay {CAPTURE} --scene {{out}}/scene {ROBOT} {TRUTH}"
+PICTURES = {
+    "renders.png": "photo, render and depth error of each camera",
+    "field_slice.png": "a slice of the distance field with the arm's spheres",
+    "audit/clearance.png": "clearance of the logged motion over time",
+    "closed_loop/clearance.png": "clearance of the controller's motion over time",
+}
+
+StepResult = Summary | IngestResult | ReconstructResult | ExportResult | BakeResult | ScoreResult | ReplayResult
+Told = Callable[[StepResult, Path], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoRequest:
+    """Run on the folder `data`, which `splatctrl simulate` wrote, and write everything into the folder `out`."""
+
+    data: Path = SAMPLE
+    out: Path = Path("demo_output")
+    threads: int = 0
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoResult:
+    """Whether each step ended as expected, the wall time [s], and pictures by path, with a description each."""
+
+    out: Path
+    verdict: Verdict
+    seconds: float
+    pictures: Mapping[Path, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One step: the words after `splatctrl` that do the same, what does it, and the label that its verdict should
+    have ("done" where it has none).
+    """
+
+    words: Sequence[str]
+    run: Callable[[], StepResult]
+    expected: str = "done"
+
+    @property
+    def name(self) -> str:
+        """The command, and the mode of a replay that drives the arm."""
+        return f"{self.words[0]} --mode closed-loop" if "closed-loop" in self.words else self.words[0]
+
+
+def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda result, folder: None) -> DemoResult:
+    """Run all steps, and draw pictures of what they made. Raises InputError for a folder that is no recording.
+
+    told: takes the result of each step at once, and the folder that stands for `out` until all is done.
+    """
+    start, stopwatch, data, out = time.perf_counter(), Stopwatch(), request.data, request.out
+    missing = [name for name in INPUTS if not (data / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
+        )
+    if out.resolve() == data.resolve():
+        raise UsageError(f"{out}: is the input folder", remedy="give another --out")
+    with output_path(out, force=request.force, is_folder=True) as folder:
+        with stopwatch.stage("commands"):
+            steps = _steps(request, folder, progress)
+            reasons = [_reason(step, request, folder, progress, told) for step in steps]
+        with stopwatch.stage("pictures"):
+            _draw(data, folder, request.threads)
+        verdict = verdict_of("demo", reasons, scope=f"{len(reasons)} steps")
+        write_run(
+            folder,
+            command="demo",
+            config={"threads": request.threads},
+            inputs={name: sha256(data / name) for name in INPUTS},
+            metrics={},
+            stopwatch=stopwatch,
+            verdict=verdict.as_dict(),
+        )
+    pictures = {out / name: description for name, description in PICTURES.items()}
+    return DemoResult(out=out, verdict=verdict, seconds=time.perf_counter() - start, pictures=pictures)
+
+
+def _steps(request: DemoRequest, out: Path, progress: Progress) -> list[Step]:
+    """The steps, to be run in this order; each writes into the folder `out`, which stands for the request's."""
+    data, threads = request.data, request.threads
+    log, truth, urdf, spheres = (data / name for name in INPUTS)
+    capture, scene = out / "tabletop.capture", out / "scene"
+    training = RecordingRequest(path=capture, options=SourceOptions(cameras=TRAINING))
+    scoring = RecordingRequest(path=capture, options=SourceOptions(cameras=SCORING))
+    measured = BakeRequest(
+        scene=scene, out=out / "field", urdf=urdf, spheres=spheres, truth=truth, seen_by=capture, threads=threads
+    )
+    scored = ScoreRequest(scene=scene, recording=scoring, out=out / "score", threads=threads)
+    audited = ReplayRequest(
+        log=capture,
+        scene=scene,
+        urdf=urdf,
+        spheres=spheres,
+        truth=truth,
+        out=out / "audit",
+        config=with_preset(Config()),
+        threads=threads,
+    )
+    driven = replace(audited, out=out / "closed_loop", mode="closed-loop", start_time=CLOSED_LOOP_START)
+
+    def reconstructed() -> ReconstructResult:
+        asked = ReconstructRequest(
+            source=open_to_train(training),
+            out=scene,
+            urdf=urdf,
+            spheres=spheres,
+            options={**DECIDING_OPTIONS, "cameras": ",".join(TRAINING)},
+            threads=threads,
+        )
+        return reconstruct(asked, progress)
+
+    def step(text: str, run: Callable[[], StepResult], expected: str = "done") -> Step:
+        words = [word.format(data=data, out=out, threads=threads) for word in text.split()]
+        return Step(words=words, run=run, expected=expected)
+
+    return [
+        step("info {data}/log.mcap", lambda: describe(log, SourceOptions())),
+        step(
+            f"ingest {{data}}/log.mcap -o {CAPTURE}",
+            lambda: ingest(IngestRequest(paths=(log,), out=capture), progress),
+        ),
+        step(
+            f"reconstruct {CAPTURE} --cameras {','.join(TRAINING)} {ROBOT} -o {{out}}/scene {USING}",
+            reconstructed,
+            "passed",
+        ),
+        step(
+            "export {out}/scene -o {out}/tabletop.ply",
+            lambda: export(ExportRequest(scene=scene, out=out / "tabletop.ply"), progress),
+        ),
+        step(
+            f"sdf-bake {{out}}/scene {ROBOT} {TRUTH} --seen-by {CAPTURE} -o {{out}}/field {USING}",
+            lambda: bake(measured, progress),
+            "passed",
+        ),
+        step(
+            f"score {{out}}/scene --reference {CAPTURE} --cameras {','.join(SCORING)} -o {{out}}/score {USING}",
+            lambda: score(scored, progress),
+            "passed",
+        ),
+        step(f"{AGAINST} -o {{out}}/audit {USING}", lambda: replay(audited, progress), "safe"),
+        step(
+            f"{AGAINST} --mode closed-loop --start-time {CLOSED_LOOP_START} -o {{out}}/closed_loop {USING}",
+            lambda: replay(driven, progress),
+            "margin broken",  # the map errs by millimetres, and the truth shows it
+        ),
+    ]
+
+
+def _reason(step: Step, request: DemoRequest, folder: Path, progress: Progress, told: Told) -> Reason:
+    """Run a step as a person would type it; whether it ends as expected."""
+    shown = [word.replace(str(folder), str(request.out)) for word in step.words]
+    progress.log(f"\n$ splatctrl {shlex.join(shown)}")
+    with _recorded_as(shown):
+        result = step.run()
+    told(result, folder)
+    label = _label(result)
+    reason = Reason(
+        criterion=step.name,
+        outcome=Outcome.PASSED if label == step.expected else Outcome.FAILED,
+        sentence=f"expected '{step.expected}', got '{label}'",
+        label="not as expected",
+    )
+    progress.log(f"demo: {reason}")
+    return reason
+
+
+@contextmanager
+def _recorded_as(words: Sequence[str]) -> Iterator[None]:
+    """What a run.json says of its arguments meanwhile: those that make the same again."""
+    arguments = sys.argv
+    sys.argv = [arguments[0], *words]
+    try:
+        yield
+    finally:
+        sys.argv = arguments
+
+
+def _label(result: StepResult) -> str:
+    """The label of the verdict; of a step without one whether it is done, or its input was damaged."""
+    if isinstance(result, Summary):
+        return f"exit code {DAMAGED}" if result.damaged else "done"
+    if isinstance(result, IngestResult):
+        return f"exit code {result.exit_code}" if result.exit_code else "done"
+    return "done" if isinstance(result, ExportResult) else result.verdict.label
+
+
+def _draw(data: Path, out: Path, threads: int) -> None:
+    """Draw the first two of PICTURES."""
+    newest: dict[str, RgbdFrame] = {}
+    joints: JointState | None = None
+    source = open_source(out / "tabletop.capture")
+    for record in source.records():
+        if isinstance(record, JointState):
+            joints = record
+        else:
+            newest[record.camera] = record
+    splats = open_scene(out / "scene").splats()
+    rows = [_comparison(frame, splats, threads) for frame in newest.values()]
+    comparison_picture(out / "renders.png", rows)
+    model = RobotModel.from_urdf(data / "robot.urdf", data / "robot_spheres.yaml")
+    assert joints is not None
+    centers = model.sphere_centers(joints.position[model.joint_order(source.joint_names)])
+    height = float(np.median(centers[model.moving_spheres][-4:, 2]))
+    field_slice_picture(
+        out / "field_slice.png",
+        read_npz(out / "field" / "field.npz"),
+        2,
+        height,
+        (centers, model.sphere_set.radii),
+        "distance to the map, with the arm's spheres",
+    )
+
+
+def _comparison(frame: RgbdFrame, splats: SplatSet, threads: int) -> ComparisonRow:
+    view = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
+    figure = psnr(view.color, frame.color / 255.0, view.opacity >= 0.5)
+    return ComparisonRow(
+        title=f"{frame.camera} ({'scoring only' if frame.camera in SCORING else 'training'})",
+        figures=f"{figure:.1f} dB on mapped pixels",
+        photo=frame.color,
+        render=view.color,
+        photo_depth=frame.depth,
+        render_depth=view.normalised_depth(),
+    )
