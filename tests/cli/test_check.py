@@ -113,19 +113,3 @@ def test_a_capture_is_checked_as_its_log(tmp_path: Path, capsys: pytest.CaptureF
     (capture / "depth/cam0/000003.png").write_bytes(b"")
     code, printed, _ = run(capsys, "check", capture, "--fail-on", "warning")
     assert "depth/cam0/000003.png: its checksum differs" in printed
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (("--quick", "0"), 2, "--quick 0: expected 1 or more"),
-        (("--spheres", "x.yaml"), 2, "--spheres: expected --urdf beside it"),
-        (("--fail-on", "note"), 2, "invalid choice"),
-    ],
-)
-def test_options_that_mean_nothing_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
-) -> None:
-    found, printed, error = run(capsys, "check", make_log(tmp_path / "log.mcap"), *arguments)
-    assert (found, printed) == (code, "")
-    assert words in error

@@ -162,64 +162,6 @@ def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, comma
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("scor",), "did you mean score?"),
-        (("score", "a", "--reference", "b", "--thread", "3"), "--thread 3; did you mean --threads?"),
-        (("score", "a", "--refrence", "b"), "--refrence; did you mean --reference?"),
-        (("score", "a", "--reference", "b", "--snapshots", "fin"), "did you mean final?"),
-        (("score", "--reference", "b"), "expected a SCENE, got none; give what reconstruct wrote, or --fit"),
-        (("export", "-o", "b"), "required: SCENE; see splatctrl export --help"),
-        ((), "required: COMMAND; see splatctrl --help"),
-        (("sdf-bake", "a", "--box", "-1,-1,0,1,1,1"), "expected one argument; write --box=VALUE"),
-        (("sdf-bake", "a", "-o", "-x"), "expected one argument; write --out=VALUE"),
-    ],
-)
-def test_wrong_arguments_are_one_line_with_a_remedy(
-    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], words: str
-) -> None:
-    assert main(arguments) == 2
-    done = capsys.readouterr()
-    assert (done.out, done.err.count("\n")) == ("", 1)
-    assert done.err.startswith("splatctrl: ")
-    assert words in done.err
-
-
-@pytest.mark.parametrize("command", ["reconstruct", "sdf-bake", "replay"])
-def test_an_unknown_configuration_key_names_the_nearest(work: Work, tmp_path: Path, command: str) -> None:
-    arguments = work.arguments(command, tmp_path / "out")
-    assert_refused(here.splatctrl(*arguments, "--set", "scene.max_splat=9"), 2, "did you mean scene.max_splats?")
-    (tmp_path / "my.toml").write_text("[contrl]\nmargin = 0.1\n")
-    assert_refused(
-        here.splatctrl(*arguments, "--config", tmp_path / "my.toml"), 2, "my.toml", "did you mean control?"
-    )
-    assert [path.name for path in tmp_path.iterdir()] == ["my.toml"]
-
-
-def test_a_configuration_that_is_missing_or_no_toml_is_refused(work: Work, tmp_path: Path) -> None:
-    arguments = work.arguments("reconstruct", tmp_path / "out")
-    assert_refused(here.splatctrl(*arguments, "--config", tmp_path / "none.toml"), 4, "none.toml: no such file")
-    (tmp_path / "bad.toml").write_text("[scene\n")
-    assert_refused(here.splatctrl(*arguments, "--config", tmp_path / "bad.toml"), 2, "bad.toml: not valid TOML")
-    assert_refused(
-        here.splatctrl(*arguments, "--config", tmp_path), 4, "cannot be read: Is a directory; check the path"
-    )
-    assert_refused(
-        here.splatctrl(*arguments, "--set", "scene.max_splats=many"), 2, "expected int, 1 to 10000000, got 'many'"
-    )
-    assert_refused(
-        here.splatctrl(*arguments, "--set", "scene.max_splats=-5"),
-        2,
-        "scene.max_splats: expected 1 to 10000000, got -5",
-    )
-    assert_refused(
-        here.splatctrl(*arguments, "--seed=-1"), 2, "argument --seed: expected a whole number, 0 to 2147483647"
-    )
-    assert_refused(here.splatctrl(*arguments, "--seed", 2**32), 2, "2147483647, got '4294967296'")
-    assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
-
-
-@pytest.mark.parametrize(
     "command", ["ingest", "info", "check", "reconstruct", "export", "sdf-bake", "score", "replay", "demo"]
 )
 def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command: str) -> None:
@@ -276,12 +218,6 @@ def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path:
     assert done.returncode == 0, done.stderr
     assert isinstance(json.loads(done.stdout), dict)
     assert (tmp_path / "out").exists()
-
-
-def test_cuda_is_refused_where_there_is_none(work: Work, tmp_path: Path) -> None:
-    done = here.splatctrl(*work.arguments("reconstruct", tmp_path / "out"), "--device", "cuda")
-    assert_refused(done, 2, "--device cuda", "give --device cpu")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -375,3 +311,61 @@ def test_an_error_with_v_shows_where_it_came_from(tmp_path: Path) -> None:
     assert done.returncode == 4
     assert "Traceback" in done.stderr
     assert done.stderr.splitlines()[-1].startswith("splatctrl: ")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of one camera."""
+    return make_log(tmp_path_factory.mktemp("log") / "log.mcap", LogRecipe(cameras=("cam0",)))
+
+
+@pytest.mark.parametrize(
+    ("closed", "words", "code", "said"),
+    [
+        (">&-", ["info", "{log}"], 6, "splatctrl: stdout: closed, so the result was not printed"),
+        (">&-", ["info", "absent"], 4, "splatctrl: absent: no such file"),
+        ("2>&-", ["info", "absent"], 4, ""),
+        ("<&- >&- 2>&-", ["info", "{log}"], 6, ""),
+    ],
+)
+def test_a_stream_that_is_closed_is_told_where_there_was_something_to_print(
+    log: Path, closed: str, words: list[str], code: int, said: str
+) -> None:
+    command = [sys.executable, "-m", "splatctrl_cli", *(word.format(log=log) for word in words)]
+    shell = ["sh", "-c", f'"$@" {closed}', "sh", *command]
+    done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert done.stderr.startswith(said) and done.stderr.count("\n") == bool(said)
+
+
+def test_an_output_is_written_though_stdout_is_closed(log: Path, tmp_path: Path) -> None:
+    capture = tmp_path / "x.capture"
+    write_capture(capture, open_source(log))
+    command = [
+        sys.executable,
+        "-m",
+        "splatctrl_cli",
+        "capture",
+        "pack",
+        str(capture),
+        "-o",
+        str(tmp_path / "out.mcap"),
+    ]
+    shell = ["sh", "-c", '"$@" >&-', "sh", *command]
+    done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 6 and "stdout: closed" in done.stderr
+    assert (tmp_path / "out.mcap").read_bytes().startswith(b"\x89MCAP")
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "ingest"])
+def test_an_output_that_cannot_be_written_is_refused_before_the_input_is_read(tmp_path: Path, command: str) -> None:
+    (tmp_path / "file").write_text("x")
+    done = here.splatctrl(command, tmp_path / "absent.mcap", "-o", tmp_path / "file" / "a" / "out")
+    assert_refused(done, 2, "file/a/out: cannot be written", "file is no folder; give another --out")
+
+
+def test_a_partial_that_is_an_input_is_not_replaced(log: Path, tmp_path: Path) -> None:
+    given = tmp_path / "log.partial"
+    given.write_bytes(log.read_bytes())
+    assert_refused(here.splatctrl("ingest", given, "-o", tmp_path / "log", "--force"), 2, "would replace the input")
+    assert given.read_bytes() == log.read_bytes()

@@ -1,10 +1,21 @@
-"""``splatctrl reconstruct`` on a small simulated log."""
+"""``splatctrl reconstruct``: small logs and scans, by both methods, with people, and with something wrong."""
 
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.records import Label, RgbdFrame
+from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from tests.logs.make_log import LogRecipe, make_log
+from tests.scene.wall import INTRINSICS, frame
 
 FAST = ["--max-splats", "800", "--set", "scene.first_iterations=30", "--set", "scene.iterations_per_step=5", "-q"]
 
@@ -41,39 +52,6 @@ def test_one_thread_and_two_give_the_same_bytes(recording: Path, tmp_path: Path)
     assert contents(tmp_path / "other")["splats.ply"] != one["splats.ply"]
 
 
-def test_gates_decide_the_exit_code(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert reconstruct(recording, tmp_path / "a", "--require", "psnr>=10") == 0
-    assert reconstruct(recording, tmp_path / "b", "--require", "psnr>=99") == 1
-    assert "psnr is" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "said"),
-    [
-        (["LOG", "--device", "cuda"], 2, "no CUDA kernels"),
-        (["LOG", "--spheres", "x.yaml"], 2, "give its --urdf"),
-        (["LOG", "--max-splats", "0"], 2, "--max-splats"),
-        (["LOG", "--box", "1,2,3"], 2, "x0,y0,z0,x1,y1,z1"),
-        (["LOG", "--box=0,0,0,1,1,-1"], 2, "x0 < x1"),
-        (["LOG", "--cameras", "cam9"], 4, "cam0"),
-        (["LOG", "--box=50,50,50,51,51,51"], 4, "no pixel"),
-        (["--dtu", "DTU", "--holdout", "a"], 2, "'a'"),
-        (["LOG", "--require", "pnsr>=3"], 2, "did you mean psnr"),
-        ([], 2, "SOURCE"),
-    ],
-)
-def test_what_cannot_be_done_is_one_line(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], code: int, said: str
-) -> None:
-    words = {"LOG": str(recording / "log.mcap"), "DTU": str(recording / "dtu")}
-    given = [words.get(option, option) for option in options]
-    assert main(["reconstruct", *given, "-o", str(tmp_path / "out"), "-q"]) == code
-    err = capsys.readouterr().err
-    assert said in err
-    assert err.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
 def test_views_that_trained_a_scene_are_not_scored_as_held_out(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,3 +73,234 @@ def test_an_output_that_is_or_holds_the_input_is_refused(
         assert main(["reconstruct", str(log), "-o", str(out), "--force", "-q"]) == 2
         assert "would replace the input" in capsys.readouterr().err
     assert log.read_bytes() == before
+
+
+FEW = [
+    *("--box=-0.45,-0.35,-0.05,0.45,0.35,0.6", "--set", "scene.first_iterations=5"),
+    *("--set", "scene.iterations_per_step=2", "--set", "scene.refine_iterations=10", "--max-splats", "1500"),
+]
+
+
+def write_folder(folder: Path, frames: Sequence[RgbdFrame], *, has_clock: bool = True) -> Path:
+    """An image folder of the frames, each camera's numbered, and its description."""
+    folder.mkdir()
+    k = INTRINSICS
+    lens = f"width = {k.width}\nheight = {k.height}\nfx = {k.fx}\nfy = {k.fy}\ncx = {k.cx}\ncy = {k.cy}\n"
+    text = '[depth]\nencoding = "float32"\nscale = 1.0\n[poses]\nformat = "matrix-files"\nfile = ""\n'
+    text += "[stamps]\nrate = 5.0\n" if has_clock else ""
+    for camera in sorted({one.camera for one in frames}):
+        own = [one for one in frames if one.camera == camera]
+        for number, one in enumerate(own):
+            name = f"{folder}/{camera}-{number}"
+            cv2.imwrite(f"{name}.png", cv2.cvtColor(one.color, cv2.COLOR_RGB2BGR))
+            np.save(f"{name}.npy", one.depth)
+            np.savetxt(f"{name}.txt", one.T_world_camera)
+        text += f'[[cameras]]\nname = "{camera}"\n{lens}'
+        text += f'color = "{camera}-*.png"\ndepth = "{camera}-*.npy"\nposes = "{camera}-*.txt"\n'
+    (folder / "views.toml").write_text(text)
+    return folder / "views.toml"
+
+
+def reconstruct_folder(description: Path, out: Path, *options: str) -> int:
+    return main(["reconstruct", str(description), "-o", str(out), *FEW, *options])
+
+
+def audit(scene: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (scene / "audit.jsonl").read_text().splitlines()]
+
+
+def test_a_frame_without_depth_is_counted_and_seeds_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = [frame() for _ in range(4)]
+    views[2].depth[:] = 0.0
+    assert reconstruct_folder(write_folder(tmp_path / "in", views), tmp_path / "scene", "-q") == 0
+    assert "  note: depth: 1 frame has none, which seeds nothing" in capsys.readouterr().out
+    rows = audit(tmp_path / "scene")
+    assert [row["without_depth"] for row in rows] == [0, 0, 1, 0]
+    assert [len(row["blind"]) for row in rows] == [0, 0, 1, 0]
+    assert json.loads((tmp_path / "scene" / "run.json").read_text())["metrics"]["frames_without_depth"] == 1
+
+
+def test_depth_that_is_not_finite_is_counted_and_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odd, plain = [frame() for _ in range(2)], [frame() for _ in range(2)]
+    for view, values in ((odd[1], [np.nan, np.inf, -np.inf, -1.0]), (plain[1], [0.0] * 4)):
+        view.depth[20, 10:14] = values
+    assert reconstruct_folder(write_folder(tmp_path / "odd", odd), tmp_path / "a", "-q") == 0
+    assert "  note: input: 4 pixels of depth NaN, infinite or negative: taken as none" in capsys.readouterr().out
+    assert reconstruct_folder(write_folder(tmp_path / "plain", plain), tmp_path / "b", "-q") == 0
+    assert "infinite" not in capsys.readouterr().out
+    assert audit(tmp_path / "a") == audit(tmp_path / "b")
+
+
+def test_a_camera_that_jumps_is_refused_by_distance_and_stamps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = [frame(), frame(x=0.1), frame(x=0.1)]
+    views[2].T_world_camera[0, 3] += 3.0
+    description = write_folder(tmp_path / "in", views)
+    assert reconstruct_folder(description, tmp_path / "scene", "-q") == 4
+    err = capsys.readouterr().err
+    assert "camera cam0 jumps by 3.00 m from stamp 200000000 to 400000000 ns, 0.2 s later" in err
+    assert "--max-pose-jump 3.01" in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "scene").exists()
+    assert reconstruct_folder(description, tmp_path / "scene", "-q", "--max-pose-jump", "3.01") == 0
+    still = write_folder(tmp_path / "still", views, has_clock=False)  # views of a still scene may lie anywhere
+    assert reconstruct_folder(still, tmp_path / "other", "-q") == 0
+    assert reconstruct_folder(still, tmp_path / "none", "-q", "--max-pose-jump", "0") == 2
+
+
+def two_cameras(offset: float) -> list[RgbdFrame]:
+    views = [frame(block=0.2), frame(block=0.2, x=0.05, camera="cam1")]
+    views[1].T_world_camera[2, 3] += offset
+    return views
+
+
+@pytest.mark.parametrize("has_clock", [True, False])
+def test_cameras_that_disagree_are_refused_before_anything_is_fitted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], has_clock: bool
+) -> None:
+    description = write_folder(tmp_path / "in", two_cameras(0.09), has_clock=has_clock)
+    assert reconstruct_folder(description, tmp_path / "scene", "-q") == 4
+    err = capsys.readouterr().err
+    assert "camera cam0 and cam1: depths disagree by 90 mm" in err
+    assert "expected at most 30 mm" in err
+    assert "poses are off, or so little depth is left (a short range, a clip, holes)" in err
+    assert "--cameras cam0" in err
+    assert "--allow-disagreement" in err
+    assert err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["in"]
+    assert reconstruct_folder(description, tmp_path / "one", "-q", "--cameras", "cam0") == 0
+    capsys.readouterr()
+    assert reconstruct_folder(description, tmp_path / "both", "--allow-disagreement") == 0
+    assert "warning: views.toml: camera cam0 and cam1: depths disagree by 90 mm" in capsys.readouterr().err
+    metrics = json.loads((tmp_path / "both" / "run.json").read_text())["metrics"]
+    assert metrics["disagreement"] == {"cam0 and cam1": 0.09}
+
+
+def test_cameras_that_differ_by_a_sensors_error_pass(tmp_path: Path) -> None:
+    assert reconstruct_folder(write_folder(tmp_path / "in", two_cameras(0.012)), tmp_path / "scene", "-q") == 0
+
+
+def test_the_two_real_cameras_that_disagree_are_refused(
+    real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example = Path(__file__).parent.parent.parent / "docs" / "examples" / "arc_bin_2cam.toml"
+    given = ["--root", str(real_data / "arc_bin_2cam"), "-o", str(tmp_path / "scene"), "-q"]
+    assert main(["reconstruct", str(example), *given]) == 4
+    assert "disagree by 99 mm" in capsys.readouterr().err
+
+
+def test_a_budget_too_small_for_the_first_frames_is_warned_about_with_one_that_is_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    description = write_folder(tmp_path / "in", [frame()])
+    assert reconstruct_folder(description, tmp_path / "small", "--max-splats", "100") == 0
+    err = capsys.readouterr().err
+    assert "warning: a budget of 100 splats is too small for the first frames" in err
+    enough = err.split("--max-splats ")[1].split()[0]
+    assert reconstruct_folder(description, tmp_path / "enough", "--max-splats", enough) == 0
+    assert "too small" not in capsys.readouterr().err
+
+
+def test_colour_and_depth_of_different_sizes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    description = write_folder(tmp_path / "in", [replace(frame(), depth=np.ones((30, 40), np.float32))])
+    assert reconstruct_folder(description, tmp_path / "scene", "-q") == 4
+    assert "cam0-0.npy: expected 80x60 as described, got 40x30" in capsys.readouterr().err
+
+
+MASK = ("--human-topic", "cam0=/cam0/people/mask")
+
+
+def run(*arguments: object) -> None:
+    assert main([*map(str, arguments), "-q"]) == 0
+
+
+def test_who_the_masks_show_is_human_in_scene_and_field(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1, num_frames=3))
+    run("ingest", log, *MASK, "-o", tmp_path / "x.capture")
+    for name, source in (("a", (log, *MASK)), ("b", (tmp_path / "x.capture",))):
+        run(
+            "reconstruct", *source, "-o", tmp_path / name, "--max-splats", "300", "--set", "scene.first_iterations=20"
+        )
+    scene = open_scene(tmp_path / "a")
+    is_human = scene.splats().labels == Label.HUMAN
+    assert 10 < is_human.sum() < 0.6 * len(is_human)
+    assert (open_scene(tmp_path / "b").splats().labels == scene.splats().labels).all()
+    row = json.loads((tmp_path / "a/audit.jsonl").read_text().splitlines()[-1])
+    assert row["human"] == is_human.sum()
+    assert np.count_nonzero(scene.occupancy().entity & Label.HUMAN) > 10
+    run("sdf-bake", tmp_path / "a", "-o", tmp_path / "field")
+    run("sdf-bake", tmp_path / "a", "--include", "none", "-o", tmp_path / "without")
+    capsys.readouterr()
+    used = [json.loads((tmp_path / name / "field.json").read_text())["splats_used"] for name in ("field", "without")]
+    assert [counts["human"] for counts in used] == [is_human.sum(), 0]
+
+
+SAMPLES = Path(__file__).parents[2] / "sample_data"
+DTU = ["--dtu", str(SAMPLES / "dtu"), "--holdout", "2,5"]
+SHORT = [
+    *("--method", "3dgs", "-q"),
+    *("--set", "gaussians.iterations=24", "--set", "gaussians.densify_from=8"),
+    *("--set", "gaussians.densify_every=8", "--set", "gaussians.densify_until=0.9"),
+]
+
+
+@pytest.fixture(scope="module")
+def gaussians_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("gaussians") / "scene"
+    assert main(["reconstruct", *DTU, *SHORT, "--threads", "2", "-o", str(out)]) == 0
+    return out
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    return err
+
+
+def test_the_scene_holds_a_gaussian_file_and_an_audit_that_agree(gaussians_scene: Path) -> None:
+    gaussians, comments = read_gaussian_ply(gaussians_scene / "splats.ply")
+    rows = [json.loads(line) for line in (gaussians_scene / "audit.jsonl").read_text().splitlines()]
+    metrics = json.loads((gaussians_scene / "run.json").read_text())["metrics"]
+    assert comments["format"].startswith("splatctrl-scene")
+    assert len(gaussians) == rows[-1]["gaussians"] == metrics["splats"] > 4500
+    assert metrics["method"] == "3dgs"
+    assert metrics["iterations"] == rows[-1]["iteration"] == 24
+    assert len(metrics["training_stamps_ns"]) == 6
+
+
+def test_score_renders_the_held_out_views(gaussians_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["score", str(gaussians_scene), *DTU, "-q", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["metrics"]["num_views"] == 2
+    assert result["metrics"]["psnr_all"] > 5
+    assert main(["score", str(gaussians_scene), "--dtu", str(SAMPLES / "dtu"), "--holdout", "3", "-q"]) == 2
+    assert "trained the scene" in said(capsys)
+
+
+def test_score_refuses_a_scene_without_gaussians(
+    gaussians_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty"
+    shutil.copytree(gaussians_scene, empty)
+    gaussians, comments = read_gaussian_ply(gaussians_scene / "splats.ply")
+    write_gaussian_ply(empty / "splats.ply", gaussians.select(np.zeros(len(gaussians), dtype=np.bool_)), comments)
+    run = json.loads((gaussians_scene / "run.json").read_text())
+    (empty / "run.json").write_text(json.dumps({name: run[name] for name in run if name != "parts"}))
+    assert main(["score", str(empty), *DTU, "-q", "-o", str(tmp_path / "scores")]) == 4
+    assert "empty: expected Gaussians, got none: there is nothing to render" in said(capsys)
+    assert not (tmp_path / "scores").exists()
+
+
+def test_what_needs_distances_is_refused_in_one_line(
+    gaussians_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["sdf-bake", str(gaussians_scene), "-o", str(tmp_path / "field"), "-q"]) == 4
+    assert "reconstruct without --method" in said(capsys)
+    log, urdf = str(SAMPLES / "tabletop" / "log.mcap"), str(SAMPLES / "tabletop" / "robot.urdf")
+    spheres = str(SAMPLES / "tabletop" / "robot_spheres.yaml")
+    robot = ["--urdf", urdf, "--spheres", spheres]
+    assert main(["replay", log, *robot, "--scene", str(gaussians_scene), "-o", str(tmp_path / "run"), "-q"]) == 4
+    assert "reconstruct without --method" in said(capsys)

@@ -1,9 +1,11 @@
-"""``splatctrl replay`` against scenes whose distances are known."""
+"""``splatctrl replay`` against scenes whose distances are known: states, goals, detours, twists, pictures."""
 
 import json
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.bake import bake
 from splatctrl_cli.grid_files.grid import write_npz
-from splatctrl_cli.records import Box, LossReport
+from splatctrl_cli.records import Box, LossReport, Record
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import (
     BALL,
@@ -25,6 +27,9 @@ from tests.cli.replay_desk import (
     splats_of,
     write_scene,
 )
+from tests.evaluate.test_worst_frames import frame
+from tests.logs.make_states import START_NS, states_of, write_mcap
+from tests.states.test_twists import stamped
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -95,7 +100,9 @@ def test_a_path_that_leaves_known_space_is_not_evaluated(desk: Desk, capsys: pyt
 def test_unknown_space_is_said_after_the_outputs_are_written(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)), is_seen=False)
     assert desk.replay("--scene", str(scene), "-q", is_judged=True) == 5
-    assert "100.0 % of the sphere centres lie in space no camera ever saw" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "100.0 % of the sphere centres lie in space no camera ever saw" in said
+    assert "allowed 5 %, first at 0.00 s" in said
     assert desk.metrics()["unknown_share"] == 1.0
     assert desk.replay("--scene", str(scene), "-q", "--max-unknown", "1", out="again") == 0
 
@@ -142,53 +149,6 @@ def test_the_truth_is_reported_beside_the_scene(
     assert metrics["truth_largest_over_exact"] > 0.05  # the scene of this test lacks the table
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (["--mode", "closed-loop", "--goal", "9,0,0,0,0,0,1"], 4, "goal: expected within"),
-        (["--mode", "closed-loop", "--goal-joints", "0,0"], 4, "--goal-joints: expected 7 joints"),
-        (["--mode", "closed-loop", "--start-time", "60"], 4, "give an earlier --start-time"),
-        (["--mode", "closed-loop", "--set", "control.period=0"], 2, "control.period"),
-        (["--mode", "closed-loop", "--frame", "nose"], 4, "no frame 'nose'"),
-        (["--set", "control.perod=1"], 2, "did you mean control.period"),
-        (["--lock", "joint7"], 2, "--lock joint7: expected JOINT=VALUE"),
-        (["--lock", "nose=0"], 4, "no joint 'nose' to lock"),
-        (["--truth", "nowhere.json"], 4, "nowhere.json"),
-        (["--require", "clearence>=1"], 2, "unknown metric"),
-        (["--start-time", "nan"], 2, "expected 0 to 100000000 s or first-map"),
-        (["--start-time", "60"], 4, "give an earlier --start-time"),
-        (["--mode", "open-loop", "--re-anchor", "1"], 2, "--re-anchor: expected --mode closed-loop, got open-loop"),
-        (["--goal", "0,0,1,0,0,0,1"], 2, "--goal: expected --mode open-loop or closed-loop, got audit"),
-        (["--follow"], 2, "--follow: expected --mode open-loop or closed-loop, got audit"),
-    ],
-)
-def test_bad_input_is_one_line_with_its_code(
-    desk: Desk, capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, words: str
-) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q", *arguments) == code
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line
-    assert not (desk.folder / "out.partial").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "one of the arguments --field --scene --lockstep is required"),
-        (["--scene", "x", "--goal", "1,2,3"], "expected 7 numbers"),
-        (["--scene", "x", "--goal", "0,0,1,0,0,0,2"], "unit quaternion"),
-        (["--scene", "x", "--goal-joints", "a,b"], "expected finite numbers"),
-        (["--scene", "x", "--base", "nan,0,0,0,0,0,1"], "finite"),
-    ],
-)
-def test_usage_is_refused_before_anything_is_read(
-    desk: Desk, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
-) -> None:
-    assert desk.replay(*arguments) == 2
-    assert words in capsys.readouterr().err
-
-
 def test_a_start_in_collision_names_the_sphere(
     desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -213,8 +173,116 @@ def test_logs_that_do_not_fit_are_refused(desk: Desk, capsys: pytest.CaptureFixt
     assert desk.replay("--scene", scene, "-q") == 3
 
 
-def test_an_existing_output_is_kept_without_force(desk: Desk) -> None:
+GOAL = np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 1.6])
+WALL = tuple(((x, 0.0, z), 0.04) for x in np.arange(0.3, 0.85, 0.05) for z in np.arange(0.05, 0.5, 0.05))
+
+
+def test_a_way_is_planned_where_the_controller_stalls(desk: Desk) -> None:
+    desk.source.states = logged(GOAL)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(*WALL)))
+    options = ("--scene", str(scene), "--mode", "closed-loop", "--set", "control.solver=daqp")
+    assert desk.replay(*options, out="alone") == 0
+    assert desk.metrics("alone")["stalled"] == 1 and desk.metrics("alone")["num_detours"] == 0
+    assert desk.replay(*options, "--set", "control.max_detours=2", "--require", "goal_reached>=1") == 0
+    metrics = desk.metrics()
+    assert metrics["num_detours"] >= 1 and metrics["stalled"] == 0
+    assert metrics["min_clearance_barrier"] >= 0.0199
+    events = json.loads((desk.folder / "out" / "events.json").read_text())
+    assert len(events["detours"]) == metrics["num_detours"]
+    assert events["detours"][0] == desk.metrics("alone")["num_steps"] - 1
+
+
+NUM_STATES = 41  # states, every 10 ms
+TWIST = [0.0, -0.1, 0.05, 0.0, 0.0, 0.0]
+
+
+def twisted(desk: Desk, *options: str, frame: str = "link0", out: str = "out") -> int:
+    """A replay of an arm that stands still in the log, while somebody asked it to move for 0.2 s."""
+    names = desk.source.joint_names
+    twists = [stamped(TWIST, START_NS + i * 50_000_000, frame) for i in range(5)]
+    log = write_mcap(desk.folder / f"{out}.mcap", [*states_of(np.tile(START, (NUM_STATES, 1)), names), *twists])
+    scene = desk.folder / "scene"
+    if not scene.exists():
+        write_scene(scene, (START_NS, splats_of(BALL)))
+    known = ["--scene", str(scene), "-o", str(desk.folder / out), "-q"]
+    return main(
+        ["replay", str(log), *desk.robot, *known, "--set", "control.twist_timeout=0.1", "--report-only", *options]
+    )
+
+
+def test_a_driven_arm_does_what_the_log_asked_for(desk: Desk, arm: RobotModel) -> None:
+    assert twisted(desk, "--twist-topic", "/cmd", "--mode", "closed-loop") == 0
+    q = np.array([[float(row[f"q_{name}"]) for name in arm.joint_names] for row in desk.rows()])
+    frame = arm.frame_names[-1]
+    moved = arm.frame_pose(q[-1], frame)[:3, 3] - arm.frame_pose(q[0], frame)[:3, 3]
+    np.testing.assert_allclose(moved, 0.31 * np.array(TWIST[:3]), atol=2e-3)  # 0.2 s, the time-out, one step
+    metrics = desk.metrics()
+    assert metrics["num_steps"] == NUM_STATES and metrics["goal_reached"] == 0
+    assert metrics["twist_share"] == pytest.approx(31 / NUM_STATES) and metrics["twist_share_capped"] == 0
+    assert metrics["max_twist_error_linear"] < 5e-3
+    about = json.loads((desk.folder / "out" / "summary.json").read_text())["about"]
+    assert about["outcome"] == "log-ended"
+
+
+@pytest.mark.painted
+def test_open_loop_says_how_the_command_misses_a_twist(desk: Desk) -> None:
+    assert twisted(desk, "--twist-topic", "/cmd", "--mode", "open-loop", "--require", "twist_share>=0.7") == 0
+    assert desk.metrics()["mean_velocity_difference"] > 0.05 > desk.metrics()["mean_twist_error_linear"]
+    fast = ["--set", "control.max_linear_speed=0.05"]
+    assert twisted(desk, "--twist-topic", "/cmd", "--mode", "open-loop", *fast, out="fast") == 0
+    assert desk.metrics("fast")["twist_share_capped"] == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "frame", "code", "said"),
+    [
+        (["--twist-topic", "/cmd"], "link0", 2, "an audit asks nobody"),
+        (["--twist-frame", "link0"], "link0", 2, "expected --twist-topic"),
+        (["--twist-topic", "/cmd", "--mode", "open-loop"], "odom", 4, "got frame 'odom'; give --twist-frame"),
+        (["--twist-topic", "/no", "--mode", "open-loop"], "link0", 4, "topics with twists: /cmd"),
+        (["--twist-topic", "/cmd", "--follow", "--mode", "open-loop"], "link0", 2, "not allowed with"),
+    ],
+)
+def test_twists_that_cannot_be_used_are_said(
+    desk: Desk, options: list[str], frame: str, code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert twisted(desk, *options, frame=frame) == code
+    assert said in capsys.readouterr().err
+
+
+def test_a_frame_of_ones_own_stands_for_one_that_is_not_known(desk: Desk) -> None:
+    options = ["--twist-topic", "/cmd", "--mode", "open-loop", "--twist-frame", "world"]
+    assert twisted(desk, *options, frame="odom") == 0
+    assert Path(desk.folder / "out" / "steps.csv").is_file()
+
+
+@dataclass(kw_only=True)
+class FilmedSource(FakeSource):
+    """A recording of an arm with a camera above it."""
+
+    def records(self) -> Iterator[Record]:
+        yield from sorted([*self.states, *(frame(k * SECOND // 5) for k in range(6))], key=lambda r: r.stamp_ns)
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.glob("worst_*")}
+
+
+def test_a_replay_shows_its_worst_moments(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    desk.source = FilmedSource(states=logged(START + 0.3))
+    scene = ["--scene", str(write_scene(desk.folder / "scene", (0, splats_of(BALL)))), "-q"]
+    for mode in ("audit", "closed-loop"):
+        assert desk.replay(*scene, "--mode", mode, "--set", "control.max_time=0.5", out=mode) == 0
+        assert names(desk.folder / mode) >= {"worst_1.png"}
+        picture = cv2.imread(str(desk.folder / mode / "worst_1.png"))
+        assert picture is not None and picture.shape[1] == 960
+    assert desk.replay(*scene, "--worst-frames", "0", out="none") == 0
+    assert not names(desk.folder / "none")
+
+
+def test_a_log_without_cameras_says_that_there_is_no_picture(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = str(write_scene(desk.folder / "scene", (0, splats_of(BALL))))
-    assert desk.replay("--scene", scene, "-q") == 0
-    assert desk.replay("--scene", scene, "-q") == 2
-    assert desk.replay("--scene", scene, "-q", "--force") == 0
+    desk.source.states = logged(START + 0.3)
+    assert desk.replay("--scene", scene) == 0
+    assert "worst frames: no camera image at or before 1 of 1 moments" in capsys.readouterr().out
+    assert not names(desk.folder / "out")

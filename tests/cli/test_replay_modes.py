@@ -2,12 +2,10 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from splatctrl_cli.jobs.replays import files
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.records import JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
@@ -134,45 +132,12 @@ def test_a_replay_agrees_with_its_own_steps_and_another_is_told_by_step_and_join
     assert desk.metrics("loose")["num_steps"] == desk.metrics()["num_steps"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (("--golden", "nowhere.csv"), 2, "--golden: an audit commands nothing"),
-        (("--mode", "closed-loop", "--golden", "nowhere.csv"), 4, "nowhere.csv: cannot be read"),
-        (("--mode", "open-loop", "--golden", "x", "--golden-tolerance", "-1"), 2, "--golden-tolerance"),
-        (("--mode", "closed-loop", "--waypoints", "nowhere.toml"), 4, "nowhere.toml: cannot be read"),
-        (
-            ("--mode", "closed-loop", "--re-anchor", "0"),
-            2,
-            "argument --re-anchor: expected 0.001 to 100000000 s, got '0'",
-        ),
-        (("--max-map-age", "nan"), 2, "argument --max-map-age: expected 0.001 to 100000000 s, got 'nan'"),
-        (("--max-unknown", "nan"), 2, "argument --max-unknown: expected 0 to 1, got 'nan'"),
-        (("--max-unknown", "inf"), 2, "argument --max-unknown: expected 0 to 1, got 'inf'"),
-        (("--mode", "closed-loop", "--goal=nan,0,0,0,0,0,1"), 2, "expected finite numbers joined by commas"),
-        (("--set", "control.margin=-0.05"), 2, "control.margin: expected 0 to 1 m, got -0.05"),
-        (("--require", "intervention_share<=0"), 2, "a figure of --mode"),
-    ],
-)
-def test_what_cannot_be_is_refused_in_words(
-    desk: Desk, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, words: str
-) -> None:
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q", *arguments) == code
-    assert words in capsys.readouterr().err
-
-
 def test_a_golden_file_without_commands_is_refused(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     assert desk.replay("--scene", str(scene), "-q", out="audit") == 0
     arguments = ("--mode", "open-loop", "--golden", str(desk.folder / "audit"))
     assert desk.replay("--scene", str(scene), "-q", *arguments) == 4
     assert "expected commands (columns v_JOINT), got none" in capsys.readouterr().err
-
-
-def test_an_unknown_gate_is_refused_before_anything_is_read(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
-    assert desk.replay("--scene", "nowhere", "-q", "--require", "min_clearence>=0") == 2
-    assert "unknown metric; did you mean min_clearance" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])
@@ -257,28 +222,6 @@ def test_waypoints_are_reached_one_after_the_other(desk: Desk, arm: RobotModel, 
         assert np.linalg.norm(rows - arm.frame_pose(posture, frame)[:3, 3], axis=1).min() <= 0.01
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        ("a.toml", "waypoint = 3", "waypoint 0: expected pose"),
-        ("b.toml", "[[waypoint]]\npose = [1, 2]", "waypoint 0: expected 7 numbers"),
-        ("c.toml", "[[waypoint]]\njoints = [1, 2]", "waypoint 0: expected 7 joints"),
-        ("d.toml", "", "expected at least one waypoint, got none"),
-        ("e.toml", "x = [", "not valid TOML"),
-        ("f.csv", "a,b\n1,2\n", "expected the columns x,y,z,qx,qy,qz,qw or joint1"),
-        ("g.csv", "x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,a\n", "waypoint 0: expected numbers"),
-    ],
-)
-def test_a_file_of_waypoints_that_is_none_is_refused(
-    desk: Desk, capsys: pytest.CaptureFixture[str], name: str, text: str, words: str
-) -> None:
-    file: Path = desk.folder / name
-    file.write_text(text)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", "--waypoints", str(file)) == 4
-    assert words in capsys.readouterr().err
-
-
 def with_person(arm: RobotModel, *, is_there: bool = True) -> tuple[SplatSet, SplatSet]:
     """Nobody, then a person 30 cm ahead of the arm at the log's end."""
     ball = ball_ahead(arm, 0.3)
@@ -310,42 +253,3 @@ def test_the_standstill_waits_where_the_controller_goes_on(
     assert "Beside people, from the same moment:" in capsys.readouterr().out
     names = metric_names("closed-loop", ("exact", "barrier"), has_truth=False, baselines=["standstill"])
     assert set(metrics) == set(names)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        ((), 2, "--baseline: expected --mode closed-loop"),
-        (("--mode", "closed-loop", "--zone", "1"), 2, "--zone 1: expected STOP,RESUME"),
-        (("--mode", "closed-loop", "--zone", "2,1"), 2, "zone: expected 0 < stop <= resume"),
-        (("--mode", "closed-loop", "--zone", "0.5,inf"), 2, "expected 0 < stop <= resume <= 100, got 0.5 and inf m"),
-        (("--mode", "closed-loop", "--zone-box", "0,0,0,1,1,0"), 2, "expected finite x0,y0,z0,x1,y1,z1"),
-        (("--mode", "closed-loop", "--human", "visitor"), 2, "--human: expected --truth"),
-        (("--mode", "closed-loop"), 5, "expected splats labelled human, got none"),
-    ],
-)
-def test_a_standstill_without_people_is_refused(
-    desk: Desk,
-    arm: RobotModel,
-    capsys: pytest.CaptureFixture[str],
-    arguments: tuple[str, ...],
-    code: int,
-    words: str,
-) -> None:
-    moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, with_person(arm, is_there=False)[1]))
-    assert desk.replay("--scene", str(scene), "-q", "--baseline", "standstill", *arguments) == code
-    assert words in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("mode", ["open-loop", "closed-loop"])
-def test_steps_are_the_same_however_many_are_written_at_once(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch, mode: str
-) -> None:
-    moving(desk)
-    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
-    for chunk, out in ((4096, "whole"), (3, "chunked")):
-        monkeypatch.setattr(files, "CHUNK", chunk)
-        assert desk.replay("--scene", str(scene), "-q", "--mode", mode, out=out) == 0
-    whole, chunked = ((desk.folder / out / "steps.csv").read_bytes() for out in ("whole", "chunked"))
-    assert whole == chunked

@@ -1,20 +1,43 @@
-"""What replay says of the states of a log: their kinds, losses, fit to the robot and to the cameras."""
+"""What replay says of the states of a log or capture: their kinds, losses and faults, fit to robot and cameras."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 
 from splatctrl_cli.cli.main import main
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.bake import bake
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.records import Float64
+from splatctrl_cli.grid_files.grid import write_npz
+from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.records import Box, Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
-from tests.cli.replay_desk import BALL, START, Desk, splats_of, write_scene
-from tests.logs.make_states import START_NS, STEP_NS, states_of, write_mcap
+from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.states.state_source import open_states
+from tests.cli.replay_desk import BALL, START, Desk, grid_seen, splats_of, write_scene
+from tests.logs.make_log import LogRecipe, make_log
+from tests.logs.make_states import (
+    NEW_CONTROLLER,
+    START_NS,
+    STEP_NS,
+    Message,
+    header,
+    joint_state,
+    states_of,
+    store_with,
+    write_mcap,
+)
 
 pytestmark = pytest.mark.usefixtures("without_plots")
+
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 
 
@@ -136,3 +159,253 @@ def test_a_state_with_nan_is_damage(desk: Desk, scene: str) -> None:
     q[7, 2] = np.nan
     assert replayed(desk, scene, write_mcap(desk.folder / "x.mcap", states_of(q, JOINTS)), "-q") == 3
     assert states_of_run(desk)["loss"]["damaged"] == 1
+
+
+JOINTS = tuple(f"joint{i}" for i in range(1, 8))
+
+
+def replayed_of(desk: Desk, q: np.ndarray, stamps: list[int], *more: str) -> int:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    log = write_mcap(desk.folder / "x.mcap", states_of(q, JOINTS, stamps=stamps))
+    desk.source.name = "none"
+    arguments = ["replay", str(log), *desk.robot, "--scene", str(scene), "-o", str(desk.folder / "out"), *more]
+    return main([*arguments, "--max-unknown", "1"])
+
+
+def test_stamps_that_go_back_repeat_and_pause_are_said(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    q = START + 0.01 * np.arange(30)[:, None]
+    stamps = [START_NS + i * STEP_NS + (i > 20) * 10**9 for i in range(30)]
+    stamps[5], stamps[6], stamps[12] = stamps[6], stamps[5], stamps[11]
+    assert replayed_of(desk, q, stamps) == 5
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("log: /joint_states:")]
+    assert any("stamps go back at 1 of 30 states: sorted" in line for line in said)
+    assert any(
+        "1 states repeat a stamp, 1 of them with other positions: the first of each is kept" in line for line in said
+    )
+    assert any("1 gaps between states, the longest 1.010 s" in line for line in said)
+    found = [int(row["stamp_ns"]) for row in desk.rows()]
+    assert found == sorted(set(stamps))
+
+
+def test_a_posture_outside_the_limits_is_an_event_with_its_joint(desk: Desk) -> None:
+    q = np.repeat(START[None], 10, axis=0)
+    q[4:7, 3] = 0.5  # its limit is below 0
+    assert replayed_of(desk, q, [START_NS + i * STEP_NS for i in range(10)], "-q") == 1
+    events = json.loads((desk.folder / "out" / "events.json").read_text())["events"]
+    (outside,) = [event for event in events if event["kind"] == "outside-limits"]
+    assert (outside["worst_name"], outside["num_states"]) == ("joint4", 3) and outside["worst"] < -0.5
+
+
+@pytest.mark.parametrize("mode", ["audit", "closed-loop"])
+def test_a_grid_without_the_robot_is_refused_by_where_both_are(
+    desk: Desk, capsys: pytest.CaptureFixture[str], tmp_path: Path, mode: str
+) -> None:
+    box = Box(lower=np.array([3.0, 3.0, 0.0]), upper=np.array([3.4, 3.4, 0.4]))
+    (tmp_path / "field").mkdir()
+    grid = bake(splats_of(BALL), box, replace(FieldConfig(), voxel=0.1), occupancy=grid_seen(), threads=1)
+    write_npz(tmp_path / "field" / "field.npz", grid)
+    assert desk.replay("--field", str(tmp_path / "field"), "-q", "--mode", mode, "--max-unknown", "1") == 5
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--field: expected the robot in the grid from (3.00, 3.00, 0.00) to (" in line
+    assert "moving spheres outside it, the nearest by 2." in line and "check --base" in line
+
+
+@pytest.mark.parametrize("fault", ["other-clock", "empty"])
+def test_a_table_that_no_robot_wrote_is_refused_in_one_line(
+    desk: Desk, capsys: pytest.CaptureFixture[str], fault: str
+) -> None:
+    q, t = np.repeat(START[None], 10, axis=0), 0.001 * np.arange(10)
+    t[6:] += 1.7e9
+    num = 10 if fault == "other-clock" else 0
+    np.savez(desk.folder / "x.npz", t=t[:num], q=q[:num])
+    log = desk.folder / "x.toml"
+    log.write_text(f'[states]\nfile = "x.npz"\njoints = {list(JOINTS)}\ntime = "t"\nposition = ["q"]\n')
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert main(["replay", str(log), *desk.robot, "--scene", str(scene), "-o", str(desk.folder / "out")]) == 4
+    *_, line = capsys.readouterr().err.splitlines()
+    said = {
+        "other-clock": "joint states: mixed clocks: stamps jump by 1700000000 s at state 6 of 10; cut the log there",
+        "empty": "x.npz: q: expected rows, got none; record it again",
+    }[fault]
+    assert said in line
+
+
+def test_a_goal_outside_the_limits_names_the_joint(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    goal = "--goal-joints=0,0,0,-2,0,2,9"
+    assert desk.replay("--scene", str(scene), "-q", "--mode", "closed-loop", goal) == 4
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "goal: joint joint7: expected within [" in line and "got 9.0000; choose another goal" in line
+
+
+NUM_STATES = 60  # states, every 10 ms
+STORE = store_with(control_msgs__JointTrajectoryControllerState=NEW_CONTROLLER)
+STATE, CONTROLLER = "sensor_msgs/msg/JointState", "control_msgs/msg/JointTrajectoryControllerState"
+
+
+def arm_messages() -> list[Message]:
+    """An arm whose joints 1 to 4 are in one topic, 5 to 7 in another at other times, and all commands in a third."""
+    names = [f"joint{i}" for i in range(1, 8)]
+    messages = []
+    for i in range(NUM_STATES):
+        stamp = START_NS + i * 10_000_000
+        q = START + 0.3 * np.sin(0.5 * i * 0.01 + np.arange(7))
+        messages += [
+            Message(log_ns=stamp, topic="/left", type_name=STATE, content=joint_state(stamp, names[:4], q[:4])),
+            Message(
+                log_ns=stamp + 4_000_000,
+                topic="/right",
+                type_name=STATE,
+                content=joint_state(stamp + 4_000_000, names[4:], q[4:]),
+            ),
+        ]
+        if i % 7 == 0:
+            messages.append(
+                Message(log_ns=stamp, topic="/left", type_name=STATE, content=joint_state(stamp, ["finger"], [0.0]))
+            )
+    return messages
+
+
+def controller_messages() -> list[Message]:
+    """A controller that reports all joints, with what it was asked for."""
+    names = [f"joint{i}" for i in range(1, 8)]
+    point, kind = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"], STORE.types[CONTROLLER]
+    nothing = np.zeros(0)
+    since = STORE.types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+
+    def at(position: Any, velocity: Any = nothing) -> Any:
+        return point(
+            positions=position,
+            velocities=velocity,
+            accelerations=nothing,
+            effort=nothing,
+            time_from_start=since,
+        )
+
+    messages = []
+    for i in range(NUM_STATES):
+        stamp = START_NS + i * 10_000_000 + 1_000_000
+        q = START + 0.3 * np.sin(0.5 * i * 0.01 + np.arange(7))
+        content = kind(
+            header=header(STORE, stamp),
+            joint_names=names,
+            feedback=at(q, 0.01 * q),
+            reference=at(q, 0.02 * q),
+            **{name: at(nothing) for name in ("error", "output", "desired", "actual")},
+        )
+        messages.append(Message(log_ns=stamp, topic="/controller", type_name=CONTROLLER, content=content))
+    return messages
+
+
+def log_with(path: Path, messages: Sequence[Message]) -> Path:
+    """A log of a camera, with these messages beside its own."""
+    plain = make_log(path.with_name("plain.mcap"), LogRecipe(has_joints=False, num_frames=6))
+    with plain.open("rb") as source, path.open("wb") as stream:
+        writer = McapWriter(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="tests")
+        channels: dict[str, int] = {}
+
+        def add(topic: str, kind: str, text: bytes, log_ns: int, data: bytes) -> None:
+            if topic not in channels:
+                schema = writer.register_schema(name=kind, encoding="ros2msg", data=text)
+                channels[topic] = writer.register_channel(topic=topic, message_encoding="cdr", schema_id=schema)
+            writer.add_message(channels[topic], log_time=log_ns, publish_time=log_ns, data=data)
+
+        for schema, channel, message in make_reader(source).iter_messages():
+            assert schema is not None
+            add(channel.topic, schema.name, schema.data, message.log_time, message.data)
+        for item in messages:
+            text, _ = STORE.generate_msgdef(item.type_name, ros_version=2)
+            data = bytes(STORE.serialize_cdr(item.content, item.type_name))
+            add(item.topic, item.type_name, text.encode(), item.log_ns, data)
+        writer.finish()
+    return path
+
+
+def audited(source: Path, arm_files: list[str], out: Path, *options: str) -> tuple[bytes, dict[str, Any], Any]:
+    scene = out.parent / "scene"
+    if not scene.exists():
+        write_scene(scene, (START_NS, splats_of(BALL)))
+    words = ["replay", str(source), *arm_files, "--scene", str(scene), "-o", str(out), "-q", "--max-unknown", "1"]
+    assert main([*words, "--report-only", *options]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    return (out / "steps.csv").read_bytes(), summary["metrics"], json.loads((out / "states.json").read_text())
+
+
+@pytest.fixture
+def arm_files(sample_data: Path) -> list[str]:
+    tabletop = sample_data / "tabletop"
+    return ["--urdf", str(tabletop / "robot.urdf"), "--spheres", str(tabletop / "robot_spheres.yaml")]
+
+
+@pytest.mark.parametrize("kind", ["two-topics", "all", "chosen"])
+def test_a_capture_is_replayed_as_its_log(tmp_path: Path, arm_files: list[str], kind: str) -> None:
+    messages = arm_messages() + ([] if kind == "two-topics" else controller_messages())
+    log, capture = log_with(tmp_path / "log.mcap", messages), tmp_path / "x.capture"
+    assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
+    options = ["--mode", "open-loop", *(["--joint-topic", "/controller"] if kind == "chosen" else [])]
+    steps, metrics, states = audited(log, arm_files, tmp_path / "of_log", *options)
+    assert metrics["num_states"] == (NUM_STATES - 1 if kind == "two-topics" else NUM_STATES)
+    again = audited(capture, arm_files, tmp_path / "of_capture", *options)
+    assert again == (steps, metrics, states)
+    assert any("interpolated" in note for note in states["loss"]["notes"]) == (kind == "two-topics")
+
+
+def test_a_topic_that_was_chosen_while_ingesting_is_that_of_the_replay(tmp_path: Path, arm: RobotModel) -> None:
+    log, capture = log_with(tmp_path / "log.mcap", [*arm_messages(), *controller_messages()]), tmp_path / "x.capture"
+    assert main(["ingest", str(log), "-o", str(capture), "-q", "--joint-topic", "/left"]) == 0
+    assert open_states(capture, SourceOptions(), arm.joint_names).joint_names == arm.joint_names[:4]
+    chosen = SourceOptions(joint_topic="/controller")
+    assert open_states(capture, chosen, arm.joint_names).joint_names == arm.joint_names
+
+
+def test_a_capture_keeps_commands_and_they_can_be_read_plainly(tmp_path: Path, arm: RobotModel) -> None:
+    log, capture = log_with(tmp_path / "log.mcap", controller_messages()), tmp_path / "x.capture"
+    assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
+    for source in (open_states(capture, SourceOptions(), arm.joint_names), open_source(capture)):
+        states = [record for record in source.records() if isinstance(record, JointState)]
+        assert len(states) == NUM_STATES
+        for state in states:
+            assert state.commanded_velocity is not None
+            np.testing.assert_allclose(state.commanded_velocity, 0.02 * state.position)
+    kept = np.load(capture / "joint_topics" / "0" / "commanded_velocity.npy")
+    assert kept.shape == (NUM_STATES, 7)
+    assert "commanded_velocity" in np.load(capture / "joints.npz").files
+    sums = (capture / "SHA256SUMS").read_text()
+    assert "  joint_topics/0/commanded_velocity.npy\n" in sums
+
+
+def test_a_damaged_topic_is_refused_and_an_old_capture_is_read(
+    tmp_path: Path, arm_files: list[str], arm: RobotModel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, capture = log_with(tmp_path / "log.mcap", controller_messages()), tmp_path / "x.capture"
+    assert main(["ingest", str(log), "-o", str(capture), "-q"]) == 0
+    file = capture / "joint_topics" / "0" / "position.npy"
+    content = file.read_bytes()
+    file.write_bytes(content[:-8] + b"\0" * 8)
+    assert main(["replay", str(capture), *arm_files, "--scene", str(tmp_path / "scene")]) == 4
+    assert "position.npy: missing, or its checksum differs" in capsys.readouterr().err
+    old = as_of_old(capture)
+    assert audited(old, arm_files, tmp_path / "out")[1]["num_states"] == NUM_STATES
+    assert main(["replay", str(old), *arm_files, "--scene", str(tmp_path / "scene"), "--joint-topic", "/x"]) == 4
+    assert "--joint-topic does not apply" in capsys.readouterr().err
+
+
+def as_of_old(capture: Path) -> Path:
+    """The capture as it was written before topics were kept."""
+    import hashlib
+    import shutil
+
+    shutil.rmtree(capture / "joint_topics")
+    document = json.loads((capture / "capture.json").read_text())
+    del document["joint_topics"]
+    (capture / "capture.json").write_text(json.dumps(document))
+    states = dict(np.load(capture / "joints.npz"))
+    np.savez(capture / "joints.npz", **{name: states[name] for name in ("stamp_ns", "position", "velocity")})
+    lines = []
+    for line in (capture / "SHA256SUMS").read_text().splitlines():
+        name = line[66:]
+        if not name.startswith("joint_topics/"):
+            lines.append(f"{hashlib.sha256((capture / name).read_bytes()).hexdigest()}  {name}\n")
+    (capture / "SHA256SUMS").write_text("".join(lines))
+    return capture

@@ -111,45 +111,6 @@ def test_pairs_are_listed_with_the_reason_of_those_left_out(
     assert (listed["num_sphere_pairs"], listed["num_postures"]) == (0, 0)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        ((), 2, "required: ACTION"),
-        (("sphere",), 2, "did you mean spheres?"),
-        (("spheres", "--urdf", "none.urdf"), 4, "none.urdf: cannot be read"),
-        (("spheres", "--urdf", "URDF", "--max-spheres", "1"), 2, "1 spheres for 2 links"),
-        (("spheres", "--urdf", "URDF", "--max-protrusion", "1e-4"), 2, "largest protrusion: expected at least"),
-        (("spheres", "--urdf", "URDF", "--max-spheres", "9", "--max-protrusion", "1"), 2, "not allowed with"),
-        (
-            ("spheres", "--urdf", "URDF", "--max-deficit=-1"),
-            2,
-            "argument --max-deficit: expected 0 to 10 m, got '-1'",
-        ),
-        (("spheres", "--urdf", "URDF", "--seed=-1"), 2, "--seed: expected a whole number, 0 to"),
-        (("check", "--urdf", "URDF"), 4, "expected collision geometry of spheres only, got 1 other shapes"),
-        (("check", "--urdf", "URDF", "--spheres", "none.yaml"), 4, "none.yaml: cannot be read"),
-        (("info", "--urdf", "URDF", "--lock", "elbow=0"), 4, "no joint 'elbow' to lock; movable joints there: hinge"),
-        (("info", "--urdf", "URDF", "--lock", "hinge"), 2, "expected JOINT=VALUE"),
-        (("info", "--urdf", "URDF", "--lock", "hinge=0"), 4, "every joint is locked"),
-        (("pairs", "--urdf", "URDF", "--postures", "0"), 2, "--postures: expected a whole number, 1 to"),
-    ],
-)
-def test_mistakes_are_one_line_and_leave_nothing(
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    urdf: Path,
-    arguments: tuple[str, ...],
-    code: int,
-    words: str,
-) -> None:
-    monkeypatch.chdir(urdf.parent)
-    got, out, err = run(capsys, *[str(urdf) if word == "URDF" else word for word in arguments])
-    lines = [line for line in err.splitlines() if not line.startswith("robot spheres: fitting")]
-    assert (got, out, len(lines)) == (code, "", 1), err
-    assert words in lines[0]
-    assert list(urdf.parent.iterdir()) == [urdf]
-
-
 def test_spheres_of_another_robots_names_are_matched_and_doubted(
     capsys: pytest.CaptureFixture[str], urdf: Path
 ) -> None:

@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from splatctrl_cli.cli import scene_options
-from splatctrl_cli.cli.main import main
 from splatctrl_cli.cli.parser import words
 from splatctrl_cli.cli.sdf_bake import split_cameras
 from splatctrl_cli.config import ControlConfig, FieldConfig
@@ -86,74 +85,6 @@ def test_a_failed_gate_keeps_the_output(tmp_path: Path, splats: Path) -> None:
     assert result.returncode == 1
     assert "num_splats is 600, required > 1e+06" in result.stderr
     assert (tmp_path / "field" / "field.npz").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (["--box=1,2"], 2, "--box 1,2: expected finite x0,y0,z0,x1,y1,z1"),
-        (["--box=a,b,c,d,e,f"], 2, "--box a,b,c,d,e,f: expected finite"),
-        (["--box=0,0,0,1,1,0"], 2, "--box 0,0,0,1,1,0: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1"),
-        (["--box=0,0,0,1,1,nan"], 2, "--box 0,0,0,1,1,nan: expected finite"),
-        (["--require", "num_cell>1"], 2, "unknown metric; did you mean num_cells?"),
-        (["--require", "seen.hard.0_2cm.rmse<1"], 2, "unknown metric; known here: num_splats"),
-        (["--require", "num_cells=1"], 2, "expected METRIC>=NUMBER (or <=, >, <); quote it for the shell"),
-        (
-            ["--formats", "off"],
-            2,
-            "--formats off: expected some of: npz, vti, nrrd, vdb, curobo, moveit, ply",
-        ),
-        (["--channels", "sdf,colour"], 2, "--channels sdf,colour: expected some of: sdf, gradient, bound"),
-        (["--channels", "sdf", "--formats", "moveit"], 2, "expected one of the channels bound, hard, got sdf"),
-        (["--distance", "tsdf"], 2, "invalid choice: 'tsdf' (choose from"),
-        (["--weights", "mean"], 2, "invalid choice: 'mean' (choose from"),
-        (["--unknown", "wall"], 2, "invalid choice: 'wall' (choose from"),
-        (["--channels", "sdf", "--reference-mesh", "a.ply"], 2, "--reference-mesh: compares with the exact distance"),
-        (["--previous-scene", "scene"], 2, "belongs to --update"),
-        (["--update", "nowhere"], 4, "--update nowhere: no such folder"),
-        (["--include", "cat"], 2, "--include cat: expected some of: robot, human"),
-        (["--voxel", "0.00001"], 2, "GiB of memory"),
-        (["--voxel", "nan"], 2, "argument --voxel: expected 1e-06 to 10 m, got 'nan'"),
-        (["--length-scale", "-1"], 2, "argument --length-scale: expected 1e-10 to 1000 m, got '-1'"),
-        (
-            ["--voxel", "0.3"],
-            2,
-            "field.voxel: expected at most 0.023 m, which loses up to field.max_loss = 0.04",
-        ),
-        (["--voxel", "0.0231"], 2, "got 0.0231 m, which loses up to 0.04001 m; give --voxel 0.023 or less"),
-        (["--voxel", "0.06", "--set", "field.max_loss=0.1"], 2, "field.voxel: expected at most 0.0577 m"),
-        (["--voxel", "1e20"], 2, "argument --voxel: expected 1e-06 to 10 m, got '1e20'"),
-        (["--box=1e300,0,0,2e300,1,1"], 2, "z0 < z1, within 1e6"),
-        (["--at", "inf"], 2, "argument --at: expected -100000000 to 100000000 s, got 'inf'"),
-        (["--at", "3"], 2, "is one splat set"),
-        (["--truth", "truth.json"], 2, "expected both or neither"),
-        (
-            ["--set", "field.distance=tsdf"],
-            2,
-            "field.distance: expected safe, safe_gpdf, hard, se or gpdf, got 'tsdf'",
-        ),
-    ],
-)
-def test_bad_arguments_are_one_line_and_leave_nothing(
-    tmp_path: Path,
-    splats: Path,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    code: int,
-    message: str,
-) -> None:
-    assert main(["sdf-bake", str(splats), "-o", str(tmp_path / "field"), *arguments]) == code
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert message in said.err
-    assert said.err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_missing_scene_is_named(tmp_path: Path) -> None:
-    result = here.splatctrl("sdf-bake", tmp_path / "none", "-o", tmp_path / "field")
-    assert result.returncode == 4
-    assert "none: no such file or folder; give what reconstruct wrote" in result.stderr
 
 
 @pytest.mark.painted
@@ -249,12 +180,6 @@ def test_a_box_that_no_camera_saw_is_not_evaluable(tmp_path: Path, scene: Path) 
     )
     assert inside.returncode == 0
     assert inside.stdout.splitlines()[0] == "sdf-bake: PASSED (3 x 3 x 5 cells of 0.1 m, 1 splats)"
-
-
-def test_a_time_before_the_scene_was_known_is_refused(tmp_path: Path, scene: Path) -> None:
-    result = here.splatctrl("sdf-bake", scene, "-o", tmp_path / "field", "--at", -1)
-    assert result.returncode == 5
-    assert "no snapshot at or before" in result.stderr
 
 
 def test_the_names_that_the_options_list_are_those_of_the_rooms() -> None:

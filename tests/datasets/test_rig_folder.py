@@ -10,7 +10,7 @@ from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
-from tests.cli.test_bad_input import write_folder
+from tests.cli.test_reconstruct import write_folder
 from tests.scene.wall import frame
 
 

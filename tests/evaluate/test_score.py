@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.evaluate import score_report
 from splatctrl_cli.evaluate.score import PROTOCOL, ViewScore, as_json, metric_names, score_view, total_score
 from splatctrl_cli.records import Bool, Float32, Intrinsics, RgbdFrame
 
@@ -165,3 +166,12 @@ def test_the_names_of_the_totals_are_known_beforehand() -> None:
     total = total_score([score(perfect(), np.ones((H, W), np.float32), NONE)])
     assert set(metric_names()) >= set(total)
     assert set(metric_names()) == set(total_score([masked_score()]))
+
+
+def test_a_figure_of_views_rests_on_the_views_that_have_it() -> None:
+    views = [{"psnr_seen": 20.0, "in_front_seen": None}, {"psnr_seen": 21.0, "in_front_seen": 0.0}]
+    metrics = {"num_views": 2, "psnr_seen": 20.5, "in_front_seen": 0.0, "num_warnings": 0, "change_psnr_seen": 0.1}
+    counts = score_report.counts_of({"metrics": metrics, "views": views})
+    assert counts == {"num_views": 2, "psnr_seen": 2, "in_front_seen": 1, "num_warnings": 2, "change_psnr_seen": 2}
+    both = {"metrics": metrics | {"num_views": 4}, "results": {"a": {"views": views}, "b": {"views": views}}}
+    assert score_report.counts_of(both)["in_front_seen"] == 2

@@ -1,5 +1,6 @@
-"""An export as a function: what of the splats each format keeps, and what is refused."""
+"""An export as a function, and what the command prints of it."""
 
+import json
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError, WriteError
 from splatctrl_cli.jobs import export as job
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult
-from splatctrl_cli.records import Float64, Intrinsics, SplatSet
+from splatctrl_cli.records import Float64, Intrinsics, Label, SplatSet
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
 from splatctrl_cli.splat_files.splat_formats import FORMATS
@@ -28,7 +30,7 @@ def export(scene: Path, name: str, **options: Any) -> ExportResult:
     return job.export(ExportRequest(scene=scene, out=scene.parent / name, **options))
 
 
-def test_a_scene_is_exported_and_renders_the_same(scene: Path) -> None:
+def test_scene_is_exported_and_renders_the_same(scene: Path) -> None:
     result = export(scene, "out.ply")
     assert result.largest_pixel_difference <= 3 / 255
     assert result.covered_share > 0.1
@@ -180,3 +182,34 @@ def test_anisotropic_gaussians_are_made_isotropic_on_request_alone(gaussians: Pa
     result = export(gaussians, "out.ply", isotropic=True, force=True)
     assert result.was_rounded and result.isotropic_psnr is not None and 15 < result.isotropic_psnr < 60
     np.testing.assert_allclose(read_ply(out)[0].radii, 0.02 * 0.45 ** (1 / 3), rtol=1e-5)
+
+
+def run_export(*arguments: object) -> int:
+    return main(["export", *map(str, arguments)])
+
+
+def test_json_has_what_was_written_and_how_it_looks(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = scene.parent / "out.ply"
+    assert run_export(scene, "-o", out, "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["file"] == str(out)
+    assert result["bytes"] == out.stat().st_size
+    assert result["num_views_compared"] == 4
+    assert result["largest_pixel_difference"] <= 3 / 255
+
+
+def test_labels_choose_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = scene.parent / "out.ply"
+    assert run_export(scene / "splats.ply", "--labels", "object,human", "-o", out) == 0
+    assert set(read_ply(out)[0].labels) == {Label.OBJECT, Label.HUMAN}
+    assert "267 splats, 133 left out by label" in capsys.readouterr().out
+
+
+def test_what_a_format_has_no_room_for_is_said(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bright = ball()
+    bright.colors[:7] = 1.8
+    write_ply(scene / "splats.ply", bright, {})
+    assert run_export(scene, "-o", scene.parent / "out.splat") == 0
+    said = capsys.readouterr().out
+    assert "not kept: labels" in said
+    assert "7 splats have a size or colour beyond the format's range: put at its edge" in said

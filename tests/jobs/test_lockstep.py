@@ -147,21 +147,3 @@ def test_the_fields_of_two_scenes_are_kept_and_no_more(tmp_path: Path, monkeypat
         scene.step_at(stamp)
         assert sum(ref() is not None for ref in made) <= 2
     assert len(made) == 6
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "said"),
-    [
-        (["--lockstep"], 4, "expected cameras, got joint states alone"),
-        (["--field", "x", "--latency", "0.1"], 2, "one scene for all times"),
-        (["--scene", "x", "--allow-disagreement"], 2, "expected --lockstep"),
-        (["--lockstep", "--latency=-1"], 2, "argument --latency: expected 0 to 100000000 s, got '-1'"),
-        (["--lockstep", "--scene", "x"], 2, "not allowed with"),
-    ],
-)
-def test_what_cannot_be_in_lockstep_is_said(
-    desk: Desk, options: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    desk.source.cameras = ()
-    assert desk.replay("-q", *options) == code
-    assert said in capsys.readouterr().err

@@ -109,23 +109,6 @@ def test_all_baselines_stand_in_one_table(desk: Desk, arm: RobotModel) -> None:
     assert metrics["standstill_duration_s"] > metrics["log_duration_s"] + 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--baseline", "prm"), "expected standstill, birrt, birrt-ik, got 'prm'"),
-        (("--baseline", "birrt", "--follow"), "--baseline birrt: expected a single goal, got --follow"),
-        (("--baseline", "birrt", "--require", "standstill_success>=1"), "standstill_success"),
-        (("--baseline", "birrt", "--require", "birrt_min_clearance_true>=0"), "birrt_min_clearance_true"),
-    ],
-)
-def test_a_comparison_that_makes_no_sense_is_refused(
-    desk: Desk, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], words: str
-) -> None:
-    moving(desk)
-    assert desk.replay(*scene_of(desk, BALL), *CLOSED, *arguments) == 2
-    assert words in capsys.readouterr().err
-
-
 def test_what_is_planned_in_never_exceeds_the_exact_distance_and_the_kernel_field_is_no_proof(tmp_path: Path) -> None:
     """Beside and between splats of many sizes: certified <= the exact distance in float64 everywhere, which is
     1-Lipschitz; the controller's own field is steeper than that somewhere, so nothing follows from its samples.

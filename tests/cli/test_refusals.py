@@ -1,0 +1,319 @@
+"""What each command refuses: one line on stderr with its remedy, its exit code, and nothing is printed or written."""
+
+import shlex
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.records import Label
+from splatctrl_cli.splat_files.splats import write_ply
+from tests.cli import here
+from tests.cli.replay_desk import BALL, START, splats_of, write_scene
+from tests.jobs.export_scene import ball
+from tests.logs.make_log import LogRecipe, make_log
+from tests.logs.make_states import START_NS, states_of, write_mcap
+from tests.robot.shapes import BALL as SPHERE
+from tests.robot.shapes import BOX, arm_of, written
+
+ROBOT = "--urdf robot.urdf --spheres robot_spheres.yaml"
+REPLAY = f"replay states.mcap --scene scene {ROBOT}"
+DRIVE, ASK = f"{REPLAY} --mode closed-loop", f"{REPLAY} --mode open-loop"
+FIT = "score --dtu dtu --fit --fit-iterations 6 --fit-splats 400 --threads 1"
+GAUSSIANS = "reconstruct --method 3dgs --dtu dtu --holdout 2,5"
+BAKE = "sdf-bake splats.ply"
+Refusal = tuple[str, int, str]
+REFUSED: dict[str, list[Refusal]] = {
+    "": [
+        ("", 2, "required: COMMAND; see splatctrl --help"),
+        ("scor", 2, "did you mean score?"),
+    ],
+    "simulate": [("--duration 0.1", 2, "argument --duration: expected 0.5 to 600 s, got '0.1'")],
+    "ingest": [
+        ("log.mcap --depth-scale -1", 2, "--depth-scale"),
+        ("log.mcap --camera cam0", 2, "--camera cam0: expected NAME=COLOR,DEPTH"),
+        ("log.mcap --camera cam0=/a", 2, "--camera cam0=/a"),
+        ("log.mcap --camera ../x=/a,/b", 2, "--camera ../x=/a,/b"),
+        ("log.mcap --camera-pose cam0=1,2,3", 2, "--camera-pose cam0=1,2,3: expected NAME=X,Y,Z"),
+        ("log.mcap --camera-pose cam0=0,0,0,0,0,0,0", 2, "with a unit quaternion, or NAME=identity"),
+        ("log.mcap --human-topic cam0", 2, "--human-topic cam0: expected NAME=TOPIC"),
+        ("log.mcap --pairing-tolerance -0.1", 2, "--pairing-tolerance"),
+        *(
+            (f"log.mcap {o}={t!r}", 2, f"{o} '{' '.join(t.split())}")
+            for o in ("--cameras", "--holdout")
+            for t in ("", ",")
+        ),
+    ],
+    "check log.mcap": [
+        ("--quick 0", 2, "--quick 0: expected 1 or more"),
+        ("--spheres x.yaml", 2, "--spheres: expected --urdf beside it"),
+        ("--fail-on note", 2, "invalid choice"),
+        ("--urdf robot.urdf --base 0,0,0,0,0,0,3", 2, "argument --base: expected a unit quaternion"),
+    ],
+    "export": [
+        ("-o out.ply", 2, "required: SCENE; see splatctrl export --help"),
+        ("none", 4, "none: no such scene"),
+        ("empty", 4, "empty: has no splats.ply"),
+        ("scene --labels cat", 2, "unknown label 'cat'; known here: object, robot, human"),
+        ("scene -o scene/splats.ply --force", 2, "is the input itself"),
+        ("scene -o out.stl", 2, "out.stl: expected a suffix of .ply, .splat, .spz, .glb, .usda, .usdc"),
+        ("scene -o out.spz --layout full", 2, "--layout full: out.spz is no PLY"),
+        ("notes.txt", 4, "notes.txt: expected a suffix of .ply, .splat, .spz"),
+        ("scene -o taken.ply", 2, "taken.ply: already exists; give --force"),
+        ("cut.ply -o out.ply", 4, "cut.ply: cut short: expected"),
+        ("robot.ply --labels human -o out.ply", 5, "no splat to write among 3"),
+    ],
+    "reconstruct": [
+        ("", 2, "expected a SOURCE or --dtu ROOT, and not both"),
+        ("log.mcap --device cuda", 2, "--device cuda: this build has no CUDA kernels; give --device cpu"),
+        ("log.mcap --spheres x.yaml", 2, "give its --urdf"),
+        ("log.mcap --max-splats 0", 2, "--max-splats"),
+        ("log.mcap --box 1,2,3", 2, "x0,y0,z0,x1,y1,z1"),
+        ("log.mcap --box=0,0,0,1,1,-1", 2, "x0 < x1"),
+        ("log.mcap --cameras cam9", 4, "cam0"),
+        ("log.mcap --box=50,50,50,51,51,51 -o new", 4, "no pixel"),
+        ("--dtu dtu --holdout a", 2, "'a'"),
+        ("log.mcap --require pnsr>=3", 2, "did you mean psnr"),
+        ("log.mcap --config none.toml", 4, "none.toml: no such file"),
+        ("log.mcap --config bad.toml", 2, "bad.toml: not valid TOML"),
+        ("log.mcap --config odd.toml", 2, "did you mean control?"),
+        ("log.mcap --config .", 4, "cannot be read: Is a directory; check the path"),
+        ("log.mcap --set scene.max_splat=9", 2, "did you mean scene.max_splats?"),
+        ("log.mcap --set scene.max_splats=many", 2, "expected int, 1 to 10000000, got 'many'"),
+        ("log.mcap --set scene.max_splats=-5", 2, "scene.max_splats: expected 1 to 10000000, got -5"),
+        ("log.mcap --seed=-1", 2, "argument --seed: expected a whole number, 0 to 2147483647"),
+        (f"log.mcap --seed {2**32}", 2, "2147483647, got '4294967296'"),
+    ],
+    GAUSSIANS: [
+        ("--urdf robot.urdf", 2, "--urdf: does not apply"),
+        ("--resume", 2, "--resume: does not apply"),
+        ("--points cloud.ply", 2, "--points: does not apply"),
+        ("--box=50,50,50,51,51,51 -o new", 4, "no pixel of any view"),
+        ("--require relocated>=1", 2, "unknown metric"),
+        ("--set gaussians.max_degree=4", 2, "gaussians.max_degree"),
+    ],
+    "reconstruct --method 3dgs": [("log.mcap", 2, "has a clock")],
+    "sdf-bake": [
+        ("none", 4, "none: no such file or folder; give what reconstruct wrote"),
+        ("scene --at -1", 5, "no snapshot at or before"),
+        ("a --box -1,-1,0,1,1,1", 2, "expected one argument; write --box=VALUE"),
+        ("a -o -x", 2, "expected one argument; write --out=VALUE"),
+    ],
+    BAKE: [
+        ("--box=1,2", 2, "--box 1,2: expected finite x0,y0,z0,x1,y1,z1"),
+        ("--box=a,b,c,d,e,f", 2, "--box a,b,c,d,e,f: expected finite"),
+        ("--box=0,0,0,1,1,0", 2, "--box 0,0,0,1,1,0: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1"),
+        ("--box=0,0,0,1,1,nan", 2, "--box 0,0,0,1,1,nan: expected finite"),
+        ("--box=1e300,0,0,2e300,1,1", 2, "z0 < z1, within 1e6"),
+        ("--require 'num_cell>1'", 2, "unknown metric; did you mean num_cells?"),
+        ("--require 'seen.hard.0_2cm.rmse<1'", 2, "unknown metric; known here: num_splats"),
+        ("--require num_cells=1", 2, "expected METRIC>=NUMBER (or <=, >, <); quote it for the shell"),
+        ("--formats off", 2, "--formats off: expected some of: npz, vti, nrrd, vdb, curobo, moveit, ply"),
+        ("--channels sdf,colour", 2, "--channels sdf,colour: expected some of: sdf, gradient, bound"),
+        ("--channels sdf --formats moveit", 2, "expected one of the channels bound, hard, got sdf"),
+        ("--distance tsdf", 2, "invalid choice: 'tsdf' (choose from"),
+        ("--weights mean", 2, "invalid choice: 'mean' (choose from"),
+        ("--unknown wall", 2, "invalid choice: 'wall' (choose from"),
+        ("--channels sdf --reference-mesh a.ply", 2, "--reference-mesh: compares with the exact distance"),
+        ("--previous-scene scene", 2, "belongs to --update"),
+        ("--update nowhere", 4, "--update nowhere: no such folder"),
+        ("--include cat", 2, "--include cat: expected some of: robot, human"),
+        ("--voxel 0.00001", 2, "GiB of memory"),
+        ("--voxel nan", 2, "argument --voxel: expected 1e-06 to 10 m, got 'nan'"),
+        ("--voxel 1e20", 2, "argument --voxel: expected 1e-06 to 10 m, got '1e20'"),
+        ("--voxel 0.3", 2, "field.voxel: expected at most 0.023 m, which loses up to field.max_loss = 0.04"),
+        ("--voxel 0.0231", 2, "got 0.0231 m, which loses up to 0.04001 m; give --voxel 0.023 or less"),
+        ("--voxel 0.06 --set field.max_loss=0.1", 2, "field.voxel: expected at most 0.0577 m"),
+        ("--length-scale -1", 2, "argument --length-scale: expected 1e-10 to 1000 m, got '-1'"),
+        ("--at inf", 2, "argument --at: expected -100000000 to 100000000 s, got 'inf'"),
+        ("--at 3", 2, "is one splat set"),
+        ("--truth truth.json", 2, "expected both or neither"),
+        ("--set field.distance=tsdf", 2, "field.distance: expected safe, safe_gpdf, hard, se or gpdf, got 'tsdf'"),
+    ],
+    "score": [
+        ("a --reference b --thread 3", 2, "--thread 3; did you mean --threads?"),
+        ("a --refrence b", 2, "--refrence; did you mean --reference?"),
+        ("a --reference b --snapshots fin", 2, "did you mean final?"),
+        ("--reference b", 2, "expected a SCENE, got none; give what reconstruct wrote, or --fit"),
+        ("empty --reference log.mcap", 4, "expected a scene folder with splats.ply and run.json"),
+        (
+            f"--reference log.mcap {FIT.partition('dtu dtu ')[2]}",
+            2,
+            "expected scans (--dtu) or an image folder, got ",
+        ),
+    ],
+    "score scene --reference log.mcap": [
+        ("--cameras cam9", 4, "log.mcap: no camera 'cam9'; use one of: cam0, cam1"),
+        ("--require sharpness>=1", 2, "unknown metric; known here: num_views, valid_share, "),
+        ("--require sharpness>=1", 2, ", chamfer, accuracy_beyond, "),
+        ("--require psnr_sen>=1", 2, "unknown metric; did you mean psnr_seen?"),
+        ("--require psnr_seen", 2, "--require psnr_seen: expected METRIC>=NUMBER"),
+        ("--require psnr_seen>=nan", 2, "--require psnr_seen>=nan: expected METRIC>=NUMBER"),
+        ("--scan scan1", 2, "--scan scan1: only with --dtu"),
+        ("--dtu root", 2, "not allowed with argument"),
+        ("--images all", 2, "--images all: expected a folder for them; give -o"),
+        ("--seed 3", 2, "--seed: only with --fit"),
+        ("--fit-iterations 3", 2, "--fit-iterations: only with --fit"),
+        ("--cloud-unit 1", 2, "--cloud-unit: only with --cloud"),
+        ("--cloud a.ply --cloud-max 0", 2, "--cloud-max: expected 1e-06 to 1000 m, got '0'"),
+    ],
+    FIT: [
+        ("scene", 2, "--fit: makes the scenes itself, got scene"),
+        ("--holdout 2", 2, "--fit: goes by a protocol; give --protocol holdout:2"),
+        ("--fit-splats 0", 2, "--fit-splats: expected a whole number, 1 to 10000000"),
+        ("--scan scan1,scan9", 4, "no scan 'scan9'; scans: scan1"),
+        ("--require psnr_best>=1", 2, "unknown metric"),
+        ("--cloud .", 4, "expected the points of scan1, scan1.ply or stl001_total.ply, got neither"),
+        ("--lpips x.npz", 4, "x.npz: cannot be read: No such file"),
+        ("--set scene.nothing=1", 2, "scene.nothing"),
+    ],
+    f"replay states.mcap {ROBOT}": [
+        ("", 2, "one of the arguments --field --scene --lockstep is required"),
+        ("--lockstep", 4, "expected cameras, got joint states alone"),
+        ("--lockstep --scene x", 2, "not allowed with"),
+        ("--lockstep --latency=-1", 2, "argument --latency: expected 0 to 100000000 s, got '-1'"),
+        ("--field x --latency 0.1", 2, "one scene for all times"),
+        ("--field x --evidence cam9", 2, "a baked field does not say which cameras made it; give --scene"),
+        ("--scene x --allow-disagreement", 2, "expected --lockstep"),
+        ("--scene nowhere --require min_clearence>=0", 2, "unknown metric; did you mean min_clearance"),
+    ],
+    REPLAY: [
+        ("--goal 1,2,3", 2, "expected 7 numbers"),
+        ("--goal 0,0,1,0,0,0,2", 2, "unit quaternion"),
+        ("--goal 0,0,1,0,0,0,1", 2, "--goal: expected --mode open-loop or closed-loop, got audit"),
+        ("--goal-joints a,b", 2, "expected finite numbers joined by commas"),
+        ("--follow", 2, "--follow: expected --mode open-loop or closed-loop, got audit"),
+        ("--base nan,0,0,0,0,0,1", 2, "finite"),
+        ("--set control.perod=1", 2, "did you mean control.period"),
+        ("--set control.margin=-0.05", 2, "control.margin: expected 0 to 1 m, got -0.05"),
+        ("--set control.max_detours=-1", 2, "control.max_detours: expected 0 to 1000, got -1"),
+        ("--lock joint7", 2, "--lock joint7: expected JOINT=VALUE"),
+        ("--lock nose=0", 4, "no joint 'nose' to lock"),
+        ("--truth nowhere.json", 4, "nowhere.json"),
+        ("--require clearence>=1", 2, "unknown metric"),
+        ("--require intervention_share<=0", 2, "a figure of --mode"),
+        ("--require num_detours<=0", 2, "--require num_detours<=0: a figure of --mode closed-loop"),
+        ("--start-time nan", 2, "expected 0 to 100000000 s or first-map"),
+        ("--start-time 60", 4, "give an earlier --start-time"),
+        ("--worst-frames x", 2, "argument --worst-frames"),
+        ("--max-map-age nan", 2, "argument --max-map-age: expected 0.001 to 100000000 s, got 'nan'"),
+        ("--max-unknown nan", 2, "argument --max-unknown: expected 0 to 1, got 'nan'"),
+        ("--max-unknown inf", 2, "argument --max-unknown: expected 0 to 1, got 'inf'"),
+        ("--golden nowhere.csv", 2, "--golden: an audit commands nothing"),
+        ("--twist-topic /cmd", 2, "an audit asks nobody"),
+        ("--twist-frame link0", 2, "expected --twist-topic"),
+        ("--evidence 1", 2, "--evidence 1: expected a camera or every how many frame sets, at least 2"),
+        ("--evidence 0", 2, "at least 2"),
+        ("--evidence=-3", 2, "at least 2"),
+        ("--evidence cam0", 2, "the camera trained"),
+        ("--evidence cam9 --set verdict.evidence_reach=nan", 2, "expected 0.001 to 10 m"),
+        ("--baseline standstill", 2, "--baseline: expected --mode closed-loop"),
+        ("--baseline prm", 2, "expected standstill, birrt, birrt-ik, got 'prm'"),
+    ],
+    ASK: [
+        ("--re-anchor 1", 2, "--re-anchor: expected --mode closed-loop, got open-loop"),
+        ("--golden x --golden-tolerance -1", 2, "--golden-tolerance"),
+        ("--twist-topic /cmd --follow", 2, "not allowed with"),
+    ],
+    DRIVE: [
+        ("--goal 9,0,0,0,0,0,1", 4, "goal: expected within"),
+        ("--goal=nan,0,0,0,0,0,1", 2, "expected finite numbers joined by commas"),
+        ("--goal-joints 0,0", 4, "--goal-joints: expected 7 joints"),
+        ("--start-time 60", 4, "give an earlier --start-time"),
+        ("--set control.period=0", 2, "control.period"),
+        ("--frame nose", 4, "no frame 'nose'"),
+        ("--golden nowhere.csv", 4, "nowhere.csv: cannot be read"),
+        ("--re-anchor 0", 2, "argument --re-anchor: expected 0.001 to 100000000 s, got '0'"),
+        ("--waypoints nowhere.toml", 4, "nowhere.toml: cannot be read"),
+        ("--waypoints a.toml", 4, "waypoint 0: expected pose"),
+        ("--waypoints b.toml", 4, "waypoint 0: expected 7 numbers"),
+        ("--waypoints c.toml", 4, "waypoint 0: expected 7 joints"),
+        ("--waypoints d.toml", 4, "expected at least one waypoint, got none"),
+        ("--waypoints bad.toml", 4, "not valid TOML"),
+        ("--waypoints f.csv", 4, "expected the columns x,y,z,qx,qy,qz,qw or joint1"),
+        ("--waypoints g.csv", 4, "waypoint 0: expected numbers"),
+        ("--baseline birrt --follow", 2, "--baseline birrt: expected a single goal, got --follow"),
+        ("--baseline birrt --require standstill_success>=1", 2, "standstill_success"),
+        ("--baseline birrt --require birrt_min_clearance_true>=0", 2, "birrt_min_clearance_true"),
+        ("--baseline standstill --zone 1", 2, "--zone 1: expected STOP,RESUME"),
+        ("--baseline standstill --zone 2,1", 2, "zone: expected 0 < stop <= resume"),
+        ("--baseline standstill --zone 0.5,inf", 2, "expected 0 < stop <= resume <= 100, got 0.5 and inf m"),
+        ("--baseline standstill --zone-box 0,0,0,1,1,0", 2, "expected finite x0,y0,z0,x1,y1,z1"),
+        ("--baseline standstill --human visitor", 2, "--human: expected --truth"),
+        ("--baseline standstill", 5, "expected splats labelled human, got none"),
+    ],
+    "robot": [
+        ("", 2, "required: ACTION"),
+        ("sphere", 2, "did you mean spheres?"),
+        ("spheres --urdf none.urdf", 4, "none.urdf: cannot be read"),
+        ("spheres --urdf arm.urdf --max-spheres 1 -q", 2, "1 spheres for 2 links"),
+        ("spheres --urdf arm.urdf --max-protrusion 1e-4 -q", 2, "largest protrusion: expected at least"),
+        ("spheres --urdf arm.urdf --max-spheres 9 --max-protrusion 1", 2, "not allowed with"),
+        ("spheres --urdf arm.urdf --max-deficit=-1", 2, "argument --max-deficit: expected 0 to 10 m, got '-1'"),
+        ("spheres --urdf arm.urdf --seed=-1", 2, "--seed: expected a whole number, 0 to"),
+        ("check --urdf arm.urdf", 4, "expected collision geometry of spheres only, got 1 other shapes"),
+        ("check --urdf arm.urdf --spheres none.yaml", 4, "none.yaml: cannot be read"),
+        ("info --urdf arm.urdf --lock elbow=0", 4, "no joint 'elbow' to lock; movable joints there: hinge"),
+        ("info --urdf arm.urdf --lock hinge", 2, "expected JOINT=VALUE"),
+        ("info --urdf arm.urdf --lock hinge=0", 4, "every joint is locked"),
+        ("pairs --urdf arm.urdf --postures 0", 2, "--postures: expected a whole number, 1 to"),
+    ],
+}
+TEXTS = {
+    "notes.txt": "notes",
+    "taken.ply": "taken",
+    "bad.toml": "[scene\n",
+    "odd.toml": "[contrl]\nmargin = 0.1\n",
+    "a.toml": "waypoint = 3",
+    "b.toml": "[[waypoint]]\npose = [1, 2]",
+    "c.toml": "[[waypoint]]\njoints = [1, 2]",
+    "d.toml": "",
+    "f.csv": "a,b\n1,2\n",
+    "g.csv": "x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,a\n",
+}
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """A folder with something of every kind that the table names."""
+    folder, sample_data = tmp_path_factory.mktemp("world"), request.getfixturevalue("sample_data")
+    for name in ("dtu", "tabletop/robot.urdf", "tabletop/robot_spheres.yaml", "tabletop/truth.json"):
+        (folder / Path(name).name).symlink_to(sample_data / name)
+    for name, text in TEXTS.items():
+        (folder / name).write_text(text)
+    (folder / "empty").mkdir()
+    make_log(folder / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    joints = tuple(f"joint{i}" for i in range(1, 8))
+    write_mcap(folder / "states.mcap", states_of(np.tile(START, (11, 1)), joints))
+    write_scene(folder / "scene", (START_NS, splats_of(BALL)))
+    written(folder, arm_of(BOX, SPHERE), "arm.urdf")
+    write_ply(folder / "splats.ply", ball(), {})
+    (folder / "cut.ply").write_bytes((folder / "splats.ply").read_bytes()[:-5])
+    robot = ball(3)
+    write_ply(folder / "robot.ply", replace(robot, labels=np.full(3, Label.ROBOT, np.uint8)), {})
+    return folder
+
+
+def refusals() -> Iterator[Refusal]:
+    for command, rows in REFUSED.items():
+        yield from ((f"{command} {words}".strip(), code, said) for words, code, said in rows)
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.usefixtures("coverage_once")
+@pytest.mark.parametrize(("words", "code", "said"), [*refusals()])
+def test_what_cannot_be_done_is_one_line_with_its_code_and_leaves_nothing(
+    world: Path, monkeypatch: pytest.MonkeyPatch, words: str, code: int, said: str
+) -> None:
+    monkeypatch.chdir(world)
+    before = contents(world)
+    done = here.splatctrl(*shlex.split(words))
+    assert (done.returncode, done.stdout) == (code, ""), done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("splatctrl: ")]
+    assert len(lines) == 1 and said in lines[0], done.stderr
+    assert contents(world) == before
