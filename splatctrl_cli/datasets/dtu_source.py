@@ -31,8 +31,12 @@ class DtuSource:
     The scene does not move, so there is no clock. Views whose number is in `holdout` belong to camera ``holdout``,
     the others to ``camera``; a `protocol` says instead which train, are held out, and are left out. masks, depths:
     folders with what the layout itself lacks. downscale: the factor by which images are made smaller; None: down to
-    the protocol's size, where that is a whole factor of theirs.
+    the protocol's size, where that is a whole factor of theirs. layout: ``MVSNet`` or ``IDR``; scan: its name in its
+    data set; split: which views train and which are held out.
     """
+
+    joint_names: tuple[str, ...] = ()
+    has_clock = False
 
     def __init__(
         self,
@@ -45,73 +49,38 @@ class DtuSource:
         depths: Path | None = None,
         downscale: int | None = None,
     ) -> None:
+        self.layout = "IDR" if not (root / "Rectified").is_dir() and idr_scans(root) else "MVSNet"
         self._root = root
-        self._layout = "IDR" if not (root / "Rectified").is_dir() and idr_scans(root) else "MVSNet"
         found = self._read(
             scan,
             masks,
             depths,
             lambda view: shrunk(view, _factor(view, protocol) if downscale is None else downscale),
         )
-        self._name, self._files = found.name, found.files
+        self.scan, self.name = found.name, f"{root.name}/{found.name}"
+        self._files = found.files
         self._views = dict(zip(found.numbers, found.views, strict=True))
         numbers = tuple(self._views)
         if protocol is not None:
             if holdout:
                 raise UsageError("--holdout: the protocol says what is held out", remedy="leave one of them out")
-            self._split = protocol.split(numbers, f"{root}/{found.name}")
+            self.split = protocol.split(numbers, f"{root}/{found.name}")
         else:
-            self._split = _held_out(numbers, frozenset(holdout), root)
-        is_left_out = self._layout == "MVSNet"
+            self.split = _held_out(numbers, frozenset(holdout), root)
+        self._held = set(self.split.scored) - set(self.split.training)
+        self.cameras = (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held else (TRAINING_CAMERA,)
+        is_left_out = self.layout == "MVSNet"
         notes = [f"{name}: without depth{', left out' if is_left_out else ''}" for name in found.without_depth]
-        self._loss = LossReport(unpaired_color=len(notes), notes=notes)
+        self.loss = LossReport(unpaired_color=len(notes), notes=notes)
 
     def _read(self, scan: str | None, masks: Path | None, depths: Path | None, shrink: Shrink) -> DtuScan:
-        if self._layout == "MVSNet":
+        if self.layout == "MVSNet":
             if depths is not None:
                 raise UsageError(f"--depths {depths}: MVSNet's layout has its own", remedy="leave it out")
             return read_dtu(self._root, scan, masks, shrink)
         if masks is not None:
             raise UsageError(f"--masks {masks}: IDR's layout has its own", remedy="leave it out")
         return read_idr(self._root, scan, depths, shrink)
-
-    @property
-    def name(self) -> str:
-        return f"{self._root.name}/{self._name}"
-
-    @property
-    def scan(self) -> str:
-        """The scan's name in its data set."""
-        return self._name
-
-    @property
-    def layout(self) -> str:
-        """``MVSNet`` or ``IDR``."""
-        return self._layout
-
-    @property
-    def split(self) -> Split:
-        """Which views train and which are held out."""
-        return self._split
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        return (TRAINING_CAMERA, HOLDOUT_CAMERA) if self._held() else (TRAINING_CAMERA,)
-
-    def _held(self) -> set[int]:
-        return set(self._split.scored) - set(self._split.training)
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        return ()
-
-    @property
-    def has_clock(self) -> bool:
-        return False
-
-    @property
-    def loss(self) -> LossReport:
-        return self._loss
 
     @property
     def has_depth(self) -> bool:
@@ -123,13 +92,13 @@ class DtuSource:
         return self._views[number].mask
 
     def records(self) -> Iterator[Record]:
-        held, left_out = self._held(), set(self._split.left_out)
+        left_out = set(self.split.left_out)
         for number, view in self._views.items():
             if number in left_out:
                 continue
             yield RgbdFrame(
                 stamp_ns=number,
-                camera=HOLDOUT_CAMERA if number in held else TRAINING_CAMERA,
+                camera=HOLDOUT_CAMERA if number in self._held else TRAINING_CAMERA,
                 color=view.color,
                 depth=view.depth,
                 intrinsics=view.intrinsics,

@@ -67,12 +67,6 @@ class GridHead:
     header: dict[str, object]
 
 
-def grid_shape(grid: DistanceGrid) -> Shape:
-    """Cells along x, y and z."""
-    x, y, z = grid.channels["sdf"].shape
-    return (x, y, z)
-
-
 def file_header(grid: DistanceGrid) -> dict[str, object]:
     """The header as files hold it: with the format and version that they are written in."""
     return {**grid.header, "format": FORMAT, "version": VERSION}

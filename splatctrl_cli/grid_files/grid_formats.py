@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.registry import entries_of
 from splatctrl_cli.grid_files.grid_format import STEM, GridFormat
 from splatctrl_cli.records import DistanceGrid
@@ -46,14 +46,3 @@ def write_grid(folder: Path, grid: DistanceGrid, names: Sequence[str]) -> tuple[
     for kind in kinds:
         kind.write(folder / f"{STEM}{kind.suffix}", grid)
     return tuple(folder / file for kind in kinds for file in kind.files(grid.channels))
-
-
-def read_grid(path: Path) -> DistanceGrid:
-    """The grid of a ``.npz`` or ``.vti`` that `write_grid` wrote. Raises InputError for any other file."""
-    readers = {kind.suffix: kind.read for kind in FORMATS.values() if kind.read is not None}
-    if path.suffix not in readers:
-        raise InputError(
-            f"{path}: expected a distance grid to read, {' or '.join(readers)}, got {path.suffix or 'no suffix'}",
-            remedy="give the field.npz of the bake",
-        )
-    return readers[path.suffix](path)

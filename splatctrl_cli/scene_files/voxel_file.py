@@ -1,7 +1,8 @@
 """Voxel files of a scene: ``occupancy.npz`` and the states beside each snapshot, with the evidence behind them."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ _HEADER = 1 << 22  # bytes
 _SHORT = 0xFF  # `UNANSWERED` in one byte
 _GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}
 _EVIDENCE = ("last_seen", "unrepresented", "unrepresented_labels")
+_STATES, _OCCUPANCY, _OURS = "the voxel states of a snapshot", "an occupancy grid of ours", "a voxel file of ours"
+
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -73,13 +76,22 @@ def _evidence(known: KnownVoxels) -> dict[str, NDArray[np.generic]]:
     }
 
 
+@contextmanager
+def _refused(path: Path, what: str) -> Iterator[None]:
+    """Whatever goes wrong within, as an InputError that says what the file is not."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:
+        raise InputError(f"{path}: not {what}: {error}") from error
+
+
 def read_states(path: Path) -> OccupancyGrid:
     """An occupancy grid with the states of `write_states`. Raises InputError for anything else, never unpickles."""
-    try:
+    with _refused(path, _STATES):
         arrays = read_arrays(path, ("header", "states"), most=_HEADER + MOST_VOXELS)
         return _grid_of_states(arrays, json.loads(str(arrays["header"])))
-    except Exception as error:
-        raise InputError(f"{path}: not the voxel states of a snapshot: {error}") from error
 
 
 def read_seen(path: Path) -> SeenVoxels | None:
@@ -88,50 +100,50 @@ def read_seen(path: Path) -> SeenVoxels | None:
     None where an older version wrote the file. Raises InputError for anything else.
     """
     try:
-        arrays = read_arrays(path, ("header", "last_seen"), most=_HEADER + 2 * MOST_VOXELS)
-        header = json.loads(str(arrays["header"]))
-        stamps_ns = np.array(header["step_stamps_ns"], np.int64)
-        return SeenVoxels(
-            origin=np.array(header["origin"], np.float64),
-            voxel=float(header["voxel"]),
-            last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
-            step_stamps_ns=stamps_ns,
-        )
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:
+        with _refused(path, _OURS):
+            arrays = read_arrays(path, ("header", "last_seen"), most=_HEADER + 2 * MOST_VOXELS)
+            header = json.loads(str(arrays["header"]))
+            stamps_ns = np.array(header["step_stamps_ns"], np.int64)
+            return SeenVoxels(
+                origin=np.array(header["origin"], np.float64),
+                voxel=float(header["voxel"]),
+                last_seen=_last_seen(arrays["last_seen"], header, len(stamps_ns)),
+                step_stamps_ns=stamps_ns,
+            )
+    except InputError:
         if _is_older(path):
             return None
-        raise InputError(f"{path}: not a voxel file of ours: {error}") from error
+        raise
 
 
 def _is_older(path: Path) -> bool:
     """Whether a file of ours says nothing of evidence."""
     try:
-        return "step_stamps_ns" not in json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+        return "step_stamps_ns" not in _read_header(path)
     except Exception:
         return False
 
 
+def _read_header(path: Path) -> dict[str, Any]:
+    header: dict[str, Any] = json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+    return header
+
+
 def read_known_states(path: Path) -> KnownVoxels | None:
     """What `write_states` wrote, None where an older version did. Raises as `read_states`."""
-    return _read_known(path, ("states",), _grid_of_states, "the voxel states of a snapshot")
+    return _read_known(path, ("states",), _grid_of_states, _STATES)
 
 
 def read_occupancy(path: Path) -> OccupancyGrid:
     """Read the grid of ``occupancy.npz``. Raises InputError for anything else, never unpickles."""
-    try:
+    with _refused(path, _OCCUPANCY):
         arrays = read_arrays(path, ("header", *_GRID), most=_HEADER + 7 * MOST_VOXELS)
         return _grid_of(arrays, json.loads(str(arrays["header"])))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:
-        raise InputError(f"{path}: not an occupancy grid of ours: {error}") from error
 
 
 def read_known_occupancy(path: Path) -> KnownVoxels | None:
     """All of ``occupancy.npz``, None where an older version wrote it. Raises as `read_occupancy`."""
-    return _read_known(path, tuple(_GRID), _grid_of, "an occupancy grid of ours")
+    return _read_known(path, tuple(_GRID), _grid_of, _OCCUPANCY)
 
 
 def read_unrepresented(path: Path) -> Balls | None:
@@ -139,22 +151,18 @@ def read_unrepresented(path: Path) -> Balls | None:
 
     Raises InputError for anything else.
     """
-    try:
-        header = json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+    with _refused(path, _OURS):
+        header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
         return _balls(read_arrays(path, _EVIDENCE[1:], most=13 * MOST_VOXELS), float(header["voxel"]))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:
-        raise InputError(f"{path}: not a voxel file of ours: {error}") from error
 
 
 def _read_known(
     path: Path, names: tuple[str, ...], grid_of: Callable[[Arrays, Mapping[str, Any]], OccupancyGrid], what: str
 ) -> KnownVoxels | None:
-    try:
-        header = json.loads(str(read_arrays(path, ("header",), most=_HEADER)["header"]))
+    with _refused(path, what):
+        header = _read_header(path)
         if "step_stamps_ns" not in header:
             return None
         arrays = read_arrays(path, (*names, *_EVIDENCE), most=22 * MOST_VOXELS)
@@ -163,10 +171,6 @@ def _read_known(
         last_seen = _last_seen(arrays["last_seen"], header, len(stamps_ns))
         balls = _balls(arrays, grid.voxel)
         return KnownVoxels(grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:
-        raise InputError(f"{path}: not {what}: {error}") from error
 
 
 def _grid_of(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
