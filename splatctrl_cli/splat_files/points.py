@@ -14,16 +14,10 @@ def read_points(path: Path) -> PointCloud:
 
     Raises InputError for a file that is not whole, lacks one of these, or has no point.
     """
-    ply = read_table(path, "vertex", ())
-    missing = [name for name in ("x", "y", "z", "red", "green", "blue") if name not in ply]
-    if missing:
-        raise InputError(f"{path}: no coloured point cloud: missing properties {' '.join(missing)}")
-    if not len(ply):
-        raise InputError(f"{path}: has no points", remedy="give a point cloud of the scene")
-    colors = np.column_stack([ply.column(name) for name in ("red", "green", "blue")]) / 255.0
+    table = _columns(path, ("x", "y", "z", "red", "green", "blue"), "coloured point cloud")
+    points, colors = table[:, :3], table[:, 3:] / 255.0
     if colors.min() < 0.0 or colors.max() > 1.0:
         raise InputError(f"{path}: red, green, blue: expected 0 to 255, got up to {255.0 * colors.max():g}")
-    points = np.column_stack([ply.column(name) for name in "xyz"])
     return PointCloud(points=points.astype(np.float32), colors=colors.astype(np.float32))
 
 
@@ -32,13 +26,18 @@ def read_positions(path: Path) -> Float64:
 
     Raises InputError for a file that is not whole, lacks x, y or z, or has no point.
     """
+    return _columns(path, ("x", "y", "z"), "point cloud")
+
+
+def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
+    """Properties (N, K) of the points, at least one."""
     ply = read_table(path, "vertex", ())
-    missing = [name for name in "xyz" if name not in ply]
+    missing = [name for name in names if name not in ply]
     if missing:
-        raise InputError(f"{path}: no point cloud: missing properties {' '.join(missing)}")
+        raise InputError(f"{path}: no {what}: missing properties {' '.join(missing)}")
     if not len(ply):
         raise InputError(f"{path}: has no points", remedy="give a point cloud of the scene")
-    return np.column_stack([ply.column(name) for name in "xyz"])
+    return np.column_stack([ply.column(name) for name in names])
 
 
 def is_mesh(path: Path) -> bool:

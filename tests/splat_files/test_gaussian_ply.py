@@ -60,11 +60,6 @@ def test_one_gaussian_has_the_bytes_of_the_reference_layout(tmp_path: Path) -> N
     np.testing.assert_allclose(struct.unpack("<62f", body), expected, rtol=1e-6)
 
 
-def test_an_empty_set_is_a_file(tmp_path: Path) -> None:
-    write_gaussian_ply(tmp_path / "a.ply", gaussian_set(2).select(np.zeros(2, dtype=bool)), {})
-    assert len(read_gaussian_ply(tmp_path / "a.ply")[0]) == 0
-
-
 def test_ascii_in_any_order_with_a_quaternion_of_any_length_reads_the_same(tmp_path: Path) -> None:
     names = ["rot_3", "rot_0", "rot_2", "rot_1", "z", "y", "x", "scale_2", "scale_1", "scale_0", "opacity"]
     names += ["f_dc_2", "f_dc_1", "f_dc_0", *(f"f_rest_{index}" for index in reversed(range(9)))]
