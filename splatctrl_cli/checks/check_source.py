@@ -14,8 +14,8 @@ from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, error, needs, note, warning
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.shot import Shot, ShotSource
 from splatctrl_cli.logs.state_columns import StateCollector
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_source
@@ -38,16 +38,16 @@ class _CameraWatch:
         self.stamps: list[int] = []
         self.poses: list[Float64] = []
 
-    def add(self, stored: StoredFrame, motion: ImageMotion) -> None:
+    def add(self, shot: Shot, motion: ImageMotion) -> None:
         """Take a frame; its images are decoded where they are wanted."""
-        self.times.add(stored.stamp_ns, stored.stamp_ns)
-        self.stamps.append(stored.stamp_ns)
-        self.poses.append(stored.T_world_camera)
-        encoding = "32FC1" if stored.depth_unit is None else "16UC1"
+        self.times.add(shot.stamp_ns, shot.stamp_ns)
+        self.stamps.append(shot.stamp_ns)
+        self.poses.append(shot.T_world_camera)
+        encoding = "32FC1" if shot.depth_unit is None else "16UC1"
         if self.images.is_wanted():
-            self.images.add_depth(stored.stamp_ns, stored.depth, encoding)
-            self.colors.add_color(stored.stamp_ns, stored.color, "rgb8")
-            motion.add(stored.frame)
+            self.images.add_depth(shot.stamp_ns, shot.depth, encoding)
+            self.colors.add_color(shot.stamp_ns, shot.color, "rgb8")
+            motion.add(shot.frame)
         else:
             self.images.add_undecoded(encoding, self.lens.width, self.lens.height)
 
@@ -68,6 +68,29 @@ class _CameraWatch:
         ]
 
 
+class _SourceWatch:
+    """What is kept of a source's frames and joint states."""
+
+    def __init__(self, num_joints: int) -> None:
+        self.cameras: dict[str, _CameraWatch] = {}
+        self.states = StateCollector(num_joints)
+        self.motion = ImageMotion()
+        self.is_whole = True
+
+    def read(self, source: ShotSource, num_images: int | None) -> None:
+        """Take all; with `num_images` up to as many of a camera."""
+        for item in source.shots():
+            if isinstance(item, JointState):
+                self.states.add(item)
+                continue
+            if item.camera not in self.cameras:
+                self.cameras[item.camera] = _CameraWatch(item.intrinsics, f"camera {item.camera}", item.depth_unit)
+            self.cameras[item.camera].add(item, self.motion)
+            if len(self.cameras[item.camera].stamps) == num_images:
+                self.is_whole = False
+                return
+
+
 def check_source(
     path: Path, options: SourceOptions, *, model: RobotModel | None = None, num_images: int | None = None
 ) -> CheckReport:
@@ -77,32 +100,20 @@ def check_source(
         source = open_source(path, options)
     except InputError as wrong:
         return _refused(path, kind if path.is_file() or is_capture(path) else "folder", wrong)
-    cameras: dict[str, _CameraWatch] = {}
-    collected = StateCollector(len(source.joint_names))
-    motion = ImageMotion()
+    watch = _SourceWatch(len(source.joint_names))
     findings: list[Finding] = []
-    is_whole = True
     try:
-        for item in source.stored():
-            if isinstance(item, JointState):
-                collected.add(item)
-                continue
-            if item.camera not in cameras:
-                cameras[item.camera] = _CameraWatch(item.intrinsics, f"camera {item.camera}", item.depth_unit)
-            cameras[item.camera].add(item, motion)
-            if len(cameras[item.camera].stamps) == num_images:
-                is_whole = False
-                break
+        watch.read(source, num_images)
     except InputError as wrong:
         findings.append(error("refused", path.name, wrong.message, wrong.remedy))
     findings += _losses(source, path.name)
+    cameras = dict(sorted(watch.cameras.items()))
     if not cameras and not any(finding.code == "refused" for finding in findings):
         findings.append(error("missing", path.name, "no frame could be read", "copy or record it again"))
-    cameras = dict(sorted(cameras.items()))
     for camera in cameras.values():
         findings += _camera_findings(camera, has_clock=source.has_clock)
     findings += sample_findings([camera.images for camera in cameras.values()])
-    logged, states = collected.columns(), None
+    logged, states = watch.states.columns(), None
     states_lack = "" if len(logged) else "no joint states; give them apart (docs/replay.md, Logs)"
     if len(logged) and source.has_clock:
         states, states_lack, of_states = robot_states(model, source.joint_names, logged)
@@ -119,10 +130,10 @@ def check_source(
         rates=[camera.times.rate(is_read=True) for camera in cameras.values()] if source.has_clock else [],
         frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
         depth_units={name: camera.images.scale for name, camera in cameras.items()},
-        motion=motion,
+        motion=watch.motion,
         states=states,
         states_lack=states_lack,
-        cut="" if is_whole else f"only the first {num_images} frames of a camera were read",
+        cut="" if watch.is_whole else f"only the first {num_images} frames of a camera were read",
     )
     return judged(evidence, findings, model)
 
@@ -139,7 +150,7 @@ def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
     )
 
 
-def _losses(source: FrameSource, where: str) -> list[Finding]:
+def _losses(source: ShotSource, where: str) -> list[Finding]:
     loss = source.loss
     findings = damage_findings(where, loss.notes[:50])
     if not loss.damaged:

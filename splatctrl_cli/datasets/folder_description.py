@@ -126,12 +126,12 @@ class Description:
     path: Path
     root: Path
     poses: PosesTable | None
-    camera: CameraTable | None
-    depth_camera: CameraTable | None
-    frames: FramesTable | None
-    depth: DepthTable
-    stamps: StampsTable
-    split: SplitTable
+    camera: CameraTable | None = None
+    depth_camera: CameraTable | None = None
+    frames: FramesTable | None = None
+    depth: DepthTable = field(default_factory=DepthTable)
+    stamps: StampsTable = field(default_factory=StampsTable)
+    split: SplitTable = field(default_factory=SplitTable)
     listed: tuple[ListedView, ...] = ()
     is_depth_resized: bool = False
     unpaired: tuple[int, int] = (0, 0)

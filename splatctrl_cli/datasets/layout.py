@@ -15,7 +15,6 @@ from splatctrl_cli.datasets.folder_description import (
     Description,
     ListedView,
     PosesTable,
-    SplitTable,
     StampsTable,
     check_camera,
 )
@@ -156,10 +155,8 @@ def described(
         poses=poses,
         camera=camera,
         depth_camera=depth_camera,
-        frames=None,
         depth=depth or DepthTable(),
         stamps=StampsTable(names=has_stamps),
-        split=SplitTable(),
         listed=tuple(pairs.views),
         is_depth_resized=is_depth_resized,
         unpaired=pairs.unpaired,

@@ -17,12 +17,9 @@ import numpy as np
 
 from splatctrl_cli.datasets.folder_description import (
     CameraTable,
-    DepthTable,
     Description,
     ListedView,
     PosesTable,
-    SplitTable,
-    StampsTable,
 )
 from splatctrl_cli.datasets.layout import Layout, Lenses, image_size
 from splatctrl_cli.datasets.poses import read_nerfstudio
@@ -49,12 +46,6 @@ def read(folder: Path, options: SourceOptions) -> Description:
         path=folder / FILE,
         root=folder,
         poses=PosesTable(format="nerfstudio", file=FILE, axes="opengl"),
-        camera=None,
-        depth_camera=None,
-        frames=None,
-        depth=DepthTable(),
-        stamps=StampsTable(),
-        split=SplitTable(),
     )
     return with_transforms(description)
 
