@@ -20,7 +20,7 @@ from splatctrl_cli.kernels.raster import (
     unpack_parameters,
 )
 from splatctrl_cli.records import Float32
-from splatctrl_cli.scene.objective import loss_weights
+from splatctrl_cli.scene.render import loss_weights
 
 STAGES = ("unpack", "bin", "forward", "loss", "backward", "adam")
 # Between the planes of kernels and reference, or they did not do the same work. An alpha within rounding of 1 / 255

@@ -4,10 +4,10 @@ Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixel
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +45,7 @@ class Label(IntEnum):
 MAX_PLACE = 1e6  # [m] of a workspace's corner from the world's origin
 UNANSWERED = 0xFFFF  # in place of a time step: a camera looked at the voxel, and none ever got depth from it
 SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
-SOLID = (
-    0b1000  # entity bit of a voxel that a pixel of an object hit since it was last seen free, in a log with a robot
-)
+SOLID = 0b1000  # entity bit, where a robot is known: an object's pixel hit the voxel since it was last seen free
 
 
 class VoxelState(IntEnum):
@@ -174,7 +172,19 @@ class RecordSource(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplatSet:
+class Columns:
+    """Arrays with one row for each of N items."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def select(self, which: Bool | NDArray[np.integer]) -> Self:
+        """The items where a mask (N,) is true, in order, or those of an index (K,)."""
+        return replace(self, **{column.name: getattr(self, column.name)[which] for column in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatSet(Columns):
     """Isotropic 3D Gaussians (paper, III-B).
 
     centers (N, 3) float32 [m], world; radii (N,) float32 [m] (the Gaussian's sigma); colors (N, 3) float32 in
@@ -189,23 +199,9 @@ class SplatSet:
     labels: UInt8
     density: Float32
 
-    def __len__(self) -> int:
-        return len(self.radii)
-
-    def select(self, keep: Bool) -> "SplatSet":
-        """The splats where `keep` (N,) is true, in order."""
-        return SplatSet(
-            centers=self.centers[keep],
-            radii=self.radii[keep],
-            colors=self.colors[keep],
-            opacities=self.opacities[keep],
-            labels=self.labels[keep],
-            density=self.density[keep],
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class GaussianSet:
+class GaussianSet(Columns):
     """Anisotropic 3D Gaussians with view-dependent colour, as 3D Gaussian splatting fits them.
 
     centers (N, 3) float32 [m], world; scales (N, 3) float32 [m], sigmas along the Gaussian's own axes; quats_wxyz
@@ -221,30 +217,13 @@ class GaussianSet:
     harmonics: Float32
     labels: UInt8
 
-    def __len__(self) -> int:
-        return len(self.opacities)
-
-    def select(self, keep: Bool) -> "GaussianSet":
-        """The Gaussians where `keep` (N,) is true, in order."""
-        return GaussianSet(
-            centers=self.centers[keep],
-            scales=self.scales[keep],
-            quats_wxyz=self.quats_wxyz[keep],
-            opacities=self.opacities[keep],
-            harmonics=self.harmonics[keep],
-            labels=self.labels[keep],
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class PointCloud:
+class PointCloud(Columns):
     """Coloured points: points (K, 3) float32 [m], world; colors (K, 3) float32 in [0, 1]."""
 
     points: Float32
     colors: Float32
-
-    def __len__(self) -> int:
-        return len(self.points)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -382,12 +361,8 @@ class KnownVoxels:
     @property
     def seen(self) -> SeenVoxels:
         """When its voxels were last seen."""
-        return SeenVoxels(
-            origin=self.grid.origin,
-            voxel=self.grid.voxel,
-            last_seen=self.last_seen,
-            step_stamps_ns=self.step_stamps_ns,
-        )
+        grid, stamps_ns = self.grid, self.step_stamps_ns
+        return SeenVoxels(origin=grid.origin, voxel=grid.voxel, last_seen=self.last_seen, step_stamps_ns=stamps_ns)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,39 +6,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.kernels.raster import Moments, unpack_parameters
-from splatctrl_cli.records import Bool, Float32, Float64, Label, SplatSet
+from splatctrl_cli.records import Bool, Columns, Float32, Float64, Label, SplatSet
 
 DEAD_LOGIT = -6.9  # opacity 0.001, below what the rasteriser blends
 CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seeds:
+class Seeds(Columns):
     """New splats: centers (K, 3) [m] world, radii (K,) [m], colors (K, 3) in [0, 1], all float32."""
 
     centers: Float32
     radii: Float32
     colors: Float32
 
-    def __len__(self) -> int:
-        return len(self.radii)
-
-    def select(self, keep: Bool) -> "Seeds":
-        """The seeds where `keep` (K,) is true, in order."""
-        return Seeds(centers=self.centers[keep], radii=self.radii[keep], colors=self.colors[keep])
-
-    def reordered(self, order: NDArray[np.intp]) -> "Seeds":
-        """The seeds at indices `order`."""
-        return Seeds(centers=self.centers[order], radii=self.radii[order], colors=self.colors[order])
-
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
     """Where seeds went: into fresh slots, into slots of dead splats, nowhere."""
 
-    added: int
-    relocated: int
-    unmet: int
+    added: int = 0
+    relocated: int = 0
+    unmet: int = 0
 
     def __add__(self, other: "Filled") -> "Filled":
         return Filled(

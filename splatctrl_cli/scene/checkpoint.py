@@ -34,12 +34,12 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     arrays |= {name: getattr(fitter.occupancy, name) for name in GRID_NAMES}
     arrays["step_stamps_ns"] = np.array(fitter.occupancy.step_stamps_ns, np.int64)
     arrays["workspace"] = np.array([fitter.workspace.lower, fitter.workspace.upper])
-    arrays["counters"] = np.array([fitter.num_steps, fitter.num_iterations], np.int64)
+    arrays["counters"] = np.array([fitter.num_steps, fitter.descent.num_iterations], np.int64)
     arrays |= {"people/voxels": fitter.people.voxels, "people/stamps_ns": fitter.people.stamps_ns}
     arrays["refined"] = _refined_array(fitter.refined)
     arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
-    if fitter.background is not None:
-        arrays["background"] = np.array(fitter.background)
+    if fitter.descent.background is not None:
+        arrays["background"] = np.array(fitter.descent.background)
     if fitter.density is not None:
         arrays["density"] = np.array([getattr(fitter.density, name) for name in DENSITY_NAMES])
     if fitter.posture is not None:
@@ -57,7 +57,7 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     for name in GRID_NAMES:
         getattr(fitter.occupancy, name)[...] = arrays[name]
     fitter.occupancy.step_stamps_ns = [int(stamp) for stamp in arrays["step_stamps_ns"]]
-    fitter.num_steps, fitter.num_iterations = (int(n) for n in arrays["counters"])
+    fitter.num_steps, fitter.descent.num_iterations = (int(n) for n in arrays["counters"])
     fitter.people.voxels = np.asarray(arrays["people/voxels"], np.int64)
     fitter.people.stamps_ns = np.asarray(arrays["people/stamps_ns"], np.int64)
     fitter.refined = _refined(arrays["refined"])
@@ -65,7 +65,7 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     fitter.mounted = {camera: np.asarray(mask, bool) for camera, mask in masks.items()}
     if "background" in arrays:
         red, green, blue = (float(value) for value in arrays["background"])
-        fitter.background = (red, green, blue)
+        fitter.descent.background = (red, green, blue)
     if "density" in arrays:
         edge, tolerance, num_candidates = (float(x) for x in arrays["density"])
         fitter.density = SeedDensity(edge=edge, tolerance=tolerance, num_candidates=int(num_candidates))

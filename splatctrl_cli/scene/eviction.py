@@ -31,7 +31,7 @@ def room_for(
     is_evicted[chosen] = True
     path = occupancy.swept_box()
     if path is not None:
-        seeds = seeds.reordered(np.argsort(distance_to_box(seeds.centers, path), kind="stable"))
+        seeds = seeds.select(np.argsort(distance_to_box(seeds.centers, path), kind="stable"))
         left, slots = num - len(chosen), may_go[~is_evicted[may_go]]
         waiting = seeds.centers[len(seeds) - left :]
         is_evicted[slots[far_away(left, waiting, buffer.centers[slots], path)]] = True

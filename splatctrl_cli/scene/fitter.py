@@ -8,21 +8,12 @@ import numpy as np
 
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
 from splatctrl_cli.kernels import num_threads
-from splatctrl_cli.kernels.raster import (
-    ImageLoss,
-    LossTerms,
-    LossWeights,
-    OptimiserSettings,
-    Rasteriser,
-    optimiser_step,
-    unpack_parameters,
-)
+from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import (
     Balls,
     Bool,
     Box,
     Float32,
-    Float64,
     KnownVoxels,
     Label,
     OccupancyGrid,
@@ -33,16 +24,15 @@ from splatctrl_cli.records import (
 from splatctrl_cli.scene.audit import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
+from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.eviction import room_for
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
-from splatctrl_cli.scene.objective import BLACK, Color, loss_weights, mean_loss, psnr_of
-from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.people import PeopleMemory
+from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
-from splatctrl_cli.scene.relocation import Misfit, clone_shape, clone_sources, detail_seeds
+from splatctrl_cli.scene.relocation import clone, detail_seeds
 from splatctrl_cli.scene.removal import REASONS, removals, seen_through
-from splatctrl_cli.scene.render import Rendering
+from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
     Candidates,
     SeedDensity,
@@ -95,34 +85,29 @@ class SceneFitter:
         self.seed = seed
         self.num_threads = num_threads(threads)
         self.buffer = SplatBuffer(config.max_splats)
+        self.descent = Descent(config, self.buffer, seed, self.num_threads)
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
         self.people = PeopleMemory((human or HumanConfig()).memory)
         self.window = Window(config)
         self.num_steps = 0
-        self.num_iterations = 0
         self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
         self.posture: RobotPosture | None = None
         self.mounted: dict[str, Bool] = {}  # by camera, pixels (H, W) that show what it carries
-        self.background: Color | None = None  # chosen by the first time step
-        self.refined = Refined(
-            num_blocks=0, filled=Filled(added=0, relocated=0, unmet=0), removed=dict.fromkeys(REASONS, 0)
-        )
+        self.refined = Refined(num_blocks=0, filled=Filled(), removed=dict.fromkeys(REASONS, 0))
         self._unrepresented: Balls | None = None
-        self._raster = Rasteriser(self.num_threads)
-        self._loss = ImageLoss(self.num_threads)
-        self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
 
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
         self._find_mounted(frames)
         with ThreadPoolExecutor(self.num_threads) as pool:
-            masks = list(pool.map(lambda frame: self._mask(frame, robot), frames))
+            config = self.occupancy.config
+            masks = list(pool.map(lambda f: object_mask(f) if robot is None else self_mask(f, robot, config), frames))
             frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
             views = list(pool.map(self.view, frames))
         seen = list(zip(frames, masks, strict=True))
-        if self.background is None:
-            self.background = self._behind(views)
+        if self.descent.background is None:
+            self.descent.background = self._behind(views)
         self.people.take_in(self.occupancy, frames)
         for frame, mask in seen:
             for points in unanswered_points(frame, mask.robot_depth, self.occupancy.config):
@@ -135,14 +120,14 @@ class SceneFitter:
         is_trail = relabel(self.buffer, self.occupancy, robot, seen)
         removed = self._remove(is_trail, self._floating(views))
         filled = self._seed(views, masks)
-        is_first = self.num_iterations == 0 and bool(self.buffer.is_alive.any())
+        is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config)
         as_they_were = self.buffer.parameters[hidden].copy()
         num_coarse = round(self.config.coarse_share * num_iterations) if is_first else 0
-        self._optimise(num_coarse, rng, self._settings(), is_coarse=True)
-        terms = self._optimise(num_iterations - num_coarse, rng, self._settings())
+        self.descent.run(_halved(self.window.schedule(num_coarse, rng)), self.descent.settings())
+        terms = self.descent.run(self.window.schedule(num_iterations - num_coarse, rng), self.descent.settings())
         self.buffer.parameters[hidden] = as_they_were
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen)
@@ -178,7 +163,8 @@ class SceneFitter:
         nowhere = np.zeros(self.config.max_splats, bool)
         rate = self.config.final_rate ** (block / (NUM_BLOCKS - 1))
         count = num_iterations * (block + 1) // NUM_BLOCKS - num_iterations * block // NUM_BLOCKS
-        self._optimise(count, rng, self._settings(rate, rate * self.config.refine_geometry))
+        settings = self.descent.settings(rate, rate * self.config.refine_geometry)
+        self.descent.run(self.window.schedule(count, rng), settings)
         # What one view sees through stays here: its removal costs 0.6 dB where poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
@@ -208,15 +194,7 @@ class SceneFitter:
 
     def known_voxels(self) -> KnownVoxels:
         """What is known of space as it is now."""
-        return KnownVoxels(
-            grid=self.occupancy_grid(),
-            last_seen=self.occupancy.last_seen.copy(),
-            step_stamps_ns=np.array(self.occupancy.step_stamps_ns, np.int64),
-            unrepresented=self.unrepresented,
-        )
-
-    def _mask(self, frame: RgbdFrame, robot: RobotPosture | None) -> SelfMask:
-        return object_mask(frame) if robot is None else self_mask(frame, robot, self.occupancy.config)
+        return self.occupancy.known(self.unrepresented)
 
     def view(self, frame: RgbdFrame) -> View:
         """A frame as the optimiser takes it."""
@@ -241,7 +219,7 @@ class SceneFitter:
             return BLACK
         counted = [view.target.counted > 0 for view in views]
         if not any(view.mappable.any() for view in views):
-            shown = [self._rendering(view).opacity for view in views]
+            shown = [self.descent.rendering(view).opacity for view in views]
             counted = [mask & (opacity < NOT_COVERED) for mask, opacity in zip(counted, shown, strict=True)]
         return background_color([view.frame for view in views], counted)
 
@@ -255,11 +233,7 @@ class SceneFitter:
 
     def _floating(self, views: Sequence[View]) -> Bool:
         """Slots (M,) of splats that some view sees through."""
-        tolerance = self.occupancy.config.see_through
-        is_floating = np.zeros(self.config.max_splats, bool)
-        for view in views:
-            is_floating |= seen_through(self.buffer.centers, view.frame, tolerance, view.nearest)
-        return is_floating & self.buffer.is_alive
+        return self.buffer.is_alive & ~self._is_grounded(self.buffer.centers, views)
 
     def _prune(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen, removed: dict[str, int]) -> None:
         """Remove what the optimiser moved off the robot, into the air or out, or made faint; counts in `removed`."""
@@ -293,19 +267,19 @@ class SceneFitter:
         """Fill dead slots at the pixels of M_add, as densely as uses `fill` of the budget on the first full view."""
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
         for view, mask in zip(views, masks, strict=True):
-            is_added = add_mask(view.frame, self._rendering(view), view.mappable, self.config)
+            is_added = add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config)
             for label, sources in found.items():
                 source = candidates(view.frame, is_added & of_label(mask, label))
                 sources.append(source.select(self._is_grounded(source.points, views)))
         everything = [source for sources in found.values() for source in sources]
         num_candidates = sum(len(source) for source in everything)
         if not num_candidates:
-            return Filled(added=0, relocated=0, unmet=0)
+            return Filled()
         if self.density is None or num_candidates > MUCH_MORE * self.density.num_candidates:
             count = max(int(self.config.fill * self.config.max_splats), 1)
             self.density = density_for(everything, count, self.config)
         reserve = int(self.config.gap_reserve * self.config.max_splats)
-        filled = Filled(added=0, relocated=0, unmet=0)
+        filled = Filled()
         for label, sources in found.items():
             if not any(len(source) for source in sources):
                 continue
@@ -314,18 +288,14 @@ class SceneFitter:
         return filled
 
     def _fill_gaps(
-        self,
-        views: Sequence[View],
-        masks: Sequence[SelfMask],
-        removed: dict[str, int],
-        half: int | None = None,
+        self, views: Sequence[View], masks: Sequence[SelfMask], removed: dict[str, int], half: int | None = None
     ) -> Filled:
         """Put splats where a measured surface is far from every sphere; half of it a time step, in turn.
 
         The robot's surface and everything else have spheres of their own. Where slots are missing, splats are evicted
         for the latter every EVICT_EVERY time steps; counts in `removed`.
         """
-        filled = Filled(added=0, relocated=0, unmet=0)
+        filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
             splats = self.splats().select(self._standing_for(label)[self.buffer.is_alive])
             bare = bare_voxels(self.occupancy, splats, self.workspace, self.config, half)
@@ -341,7 +311,7 @@ class SceneFitter:
             seeds = seeds.select(self._is_grounded(seeds.centers, views))
             num_missing = len(seeds) - int((~self.buffer.is_alive).sum())
             if label == Label.OBJECT and num_missing > 0 and self.num_steps % EVICT_EVERY == 0:
-                shown, gap = self._misfits(views)[1], self.config.max_gap
+                shown, gap = self.descent.misfits(views)[1], self.config.max_gap
                 is_evicted, seeds = room_for(seeds, num_missing, self.buffer, self.occupancy, shown, gap)
                 self.buffer.kill(is_evicted)
                 removed["evicted"] += int(is_evicted.sum())
@@ -356,7 +326,7 @@ class SceneFitter:
     def _show_contact(self, robot: RobotPosture | None, views: Sequence[View], seen: Seen) -> Filled:
         """Give objects beside the robot's moving links splats of one radius, no farther apart than it."""
         if robot is None:
-            return Filled(added=0, relocated=0, unmet=0)
+            return Filled()
         radius, is_object = self.config.contact_radius, self._standing_for(Label.OBJECT)
         slots = np.flatnonzero(is_object)
         self.buffer.set_radius(slots[is_in_contact(self.buffer.centers[slots], robot)], radius)
@@ -369,12 +339,12 @@ class SceneFitter:
         """Put dead slots, beyond the reserve for gaps, to use where nothing asks for them; counts in `removed`."""
         is_alive, reserve = self.buffer.is_alive, int(self.config.gap_reserve * self.config.max_splats)
         if self.config.when_idle == "leave" or not is_alive.any():
-            return Filled(added=0, relocated=0, unmet=0)
+            return Filled()
         if self.config.when_idle == "clone":
-            return self._clone(int((~is_alive).sum()) - reserve, rng)
-        misfits, shown = self._misfits(views)
+            return clone(self.buffer, int((~is_alive).sum()) - reserve, rng)
+        misfits, shown = self.descent.misfits(views)
         if not any(misfit.error.any() for misfit in misfits):
-            return self._clone(int((~is_alive).sum()) - reserve, rng)  # no depth says where detail would be
+            return clone(self.buffer, int((~is_alive).sum()) - reserve, rng)  # no depth says where detail would be
         weakest = np.argsort(np.where(is_alive, shown, np.inf), kind="stable")
         is_weak = np.zeros(len(is_alive), bool)
         is_weak[weakest[: int(self.config.weak_share * is_alive.sum())]] = True
@@ -383,32 +353,6 @@ class SceneFitter:
         seeds = detail_seeds(misfits, int((~is_alive).sum()) - reserve, self.config, rng)
         return self.buffer.fill(seeds, self.config.initial_opacity)
 
-    def _clone(self, num_clones: int, rng: np.random.Generator) -> Filled:
-        """Copy splats drawn by their opacity, as 3DGS-MCMC does."""
-        opacities = np.where(self.buffer.is_alive, self.buffer.opacities, 0.0).astype(np.float64)
-        sources = clone_sources(opacities, num_clones, rng)
-        count = 1 + np.bincount(sources, minlength=len(opacities))
-        shapes = clone_shape(opacities, self.buffer.radii.astype(np.float64), count)
-        return Filled(added=0, relocated=self.buffer.copy(sources, *shapes), unmet=0)
-
-    def _misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
-        """Each view's colour error where it is mappable, and how much each slot shows (M,): blended opacity, summed.
-
-        The derivative of the sum of a colour plane with respect to a splat's colour is the sum of its weights.
-        """
-        background = np.array(self.background, np.float32)[:, None, None]
-        misfits, shown = [], np.zeros(self.config.max_splats)
-        for view in views:
-            planes = self._planes(view)
-            color = planes[:3] + (1.0 - planes[4]) * background
-            error = np.abs(color - view.target.color).mean(axis=0)
-            misfits.append(Misfit(frame=view.frame, error=np.where(view.mappable, error, np.float32(0.0))))
-            ones = np.zeros_like(planes)
-            ones[0] = view.target.counted
-            self._raster.backward(planes, ones, self._gradients)
-            shown += self._gradients[:, 7]
-        return misfits, shown
-
     def _is_grounded(self, points: Float32, views: Sequence[View]) -> Bool:
         """Points (K,) that no view sees through: what one sensor measured and another looks past was noise."""
         is_grounded = np.ones(len(points), bool)
@@ -416,64 +360,13 @@ class SceneFitter:
             is_grounded &= ~seen_through(points, view.frame, self.occupancy.config.see_through, view.nearest)
         return is_grounded
 
-    def _optimise(
-        self, num_iterations: int, rng: np.random.Generator, settings: OptimiserSettings, *, is_coarse: bool = False
-    ) -> dict[int, LossTerms]:
-        """Descend; returns the loss of each view, by identity, at the last iteration that looked at it."""
-        terms = {}
-        views = self.window.schedule(num_iterations, rng)
-        if is_coarse:
-            small = {id(view): halved(view) for view in views}
-            views = [small[id(view)] for view in views]
-        for view in views:
-            planes = self._planes(view)
-            plane_gradients = np.empty_like(planes)
-            terms[id(view)] = self._loss.evaluate(planes, view.target, self._weights(), plane_gradients)
-            self._raster.backward(planes, plane_gradients, self._gradients)
-            step_seed = (self.seed << 32) + self.num_iterations
-            optimiser_step(
-                self._raster, self._gradients, self.buffer.parameters, self.buffer.moments, settings, step_seed
-            )
-            self.num_iterations += 1
-        return terms
-
-    def _planes(self, view: View) -> Float32:
-        centers, radii, colors, opacities = unpack_parameters(self.buffer.parameters, self.num_threads)
-        self._raster.prepare(view.camera, centers, radii, opacities, colors)
-        return self._raster.forward()
-
-    def _rendering(self, view: View) -> Rendering:
-        planes = self._planes(view)
-        return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
-
-    def _evaluate(self, view: View, planes: Float32) -> LossTerms:
-        return self._loss.evaluate(planes, view.target, self._weights(), np.empty_like(planes))
-
-    def _weights(self) -> LossWeights:
-        return loss_weights(self.config, self.background or BLACK)
-
-    def _settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
-        """Learning rates times `rate`, those of centre and radius times `geometry`."""
-        c = self.config
-        return OptimiserSettings(
-            lr_center=c.lr_center * geometry,
-            lr_log_radius=c.lr_log_radius * geometry,
-            lr_color=c.lr_color * rate,
-            lr_logit_opacity=c.lr_logit_opacity * rate,
-            regulariser=c.lambda_reg / max(int(self.buffer.is_alive.sum()), 1),
-            noise=c.noise * rate,
-            min_opacity=c.min_opacity,
-            min_radius=c.min_radius,
-            max_radius=c.max_radius,
-        )
-
     def _audit(
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]
     ) -> AuditRow:
         c, buffer = self.config, self.buffer
         self._unrepresented = None
         counted = [view for view in views if view.target.counted.any()]
-        terms = [known.get(id(view)) or self._evaluate(view, self._planes(view)) for view in counted]
+        terms = [known.get(id(view)) or self.descent.evaluate(view) for view in counted]
         opacity = float(buffer.opacities[buffer.is_alive].mean()) if buffer.is_alive.any() else 0.0
         loss, psnr = mean_loss(terms, c), psnr_of(terms)
         empty = [view for view in views if not (view.frame.depth > 0).any()]
@@ -495,3 +388,9 @@ class SceneFitter:
             loss=None if loss is None else round(loss + c.lambda_reg * opacity, 6),
             psnr=None if psnr is None else round(psnr, 4),
         )
+
+
+def _halved(views: Sequence[View]) -> list[View]:
+    """The views, in order, at half the size."""
+    small = {id(view): halved(view) for view in views}
+    return [small[id(view)] for view in views]

@@ -18,8 +18,8 @@ from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.densify import Densified, densify, fresh, reset_opacity
 from splatctrl_cli.scene.gaussians import gaussians_of, seeded
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
-from splatctrl_cli.scene.objective import loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.removal import seen_through
+from splatctrl_cli.scene.render import loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import candidates, density_for, inside_workspace, seeds_at, world_points
 from splatctrl_cli.scene.window import View, make_view
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float32, Float64, RgbdFrame
-from splatctrl_cli.scene.buffer import Seeds
+from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.seeding import NO_SEEDS, world_points
 
 OVERSAMPLING = 4  # pixels drawn per splat, before those too near to each other go
@@ -36,6 +36,15 @@ def clone_sources(opacities: Float64, num_clones: int, rng: np.random.Generator)
     if num_clones < 1 or total <= 0.0:
         return np.zeros(0, np.intp)
     return np.asarray(rng.choice(len(opacities), size=num_clones, p=opacities / total), np.intp)
+
+
+def clone(buffer: SplatBuffer, num_clones: int, rng: np.random.Generator) -> Filled:
+    """Copy splats drawn by their opacity, as 3DGS-MCMC does."""
+    opacities = np.where(buffer.is_alive, buffer.opacities, 0.0).astype(np.float64)
+    sources = clone_sources(opacities, num_clones, rng)
+    count = 1 + np.bincount(sources, minlength=len(opacities))
+    shapes = clone_shape(opacities, buffer.radii.astype(np.float64), count)
+    return Filled(relocated=buffer.copy(sources, *shapes))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,14 +1,19 @@
-"""Renders a splat set from a camera: eq. 1 to 3 of the paper."""
+"""Renders a splat set from a camera, eq. 1 to 3 of the paper, and weighs its loss, eq. 4."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.kernels import num_threads
-from splatctrl_cli.kernels.raster import Rasteriser, pack_camera
+from splatctrl_cli.kernels.raster import LossTerms, LossWeights, Rasteriser, pack_camera
 from splatctrl_cli.records import Float32, Float64, Intrinsics, SplatSet
 
+Color = tuple[float, float, float]
+BLACK: Color = (0.0, 0.0, 0.0)
 OPAQUE_ENOUGH = 0.5  # accumulated opacity from which a pixel has a depth of its own
 
 
@@ -24,7 +29,7 @@ class Rendering:
         """Depth divided by accumulated opacity (H, W) [m]; 0 where the opacity is below one half."""
         return normalised_depth(self.depth, self.opacity)
 
-    def before(self, background: tuple[float, float, float]) -> "Rendering":
+    def before(self, background: Color) -> "Rendering":
         """The same view with one colour behind it: color + (1 - opacity) background."""
         behind = (1.0 - self.opacity)[..., None] * np.array(background, np.float32)
         return replace(self, color=self.color + behind)
@@ -55,3 +60,34 @@ def render(splats: SplatSet, intrinsics: Intrinsics, T_world_camera: Float64, *,
     planes = raster.forward()
     color = np.ascontiguousarray(np.moveaxis(planes[:3], 0, 2))
     return Rendering(color=color, depth=planes[3].copy(), opacity=planes[4].copy())
+
+
+def loss_weights(config: SceneConfig, background: Color = BLACK) -> LossWeights:
+    """The weights that the image loss takes, and the colour behind the splats."""
+    return LossWeights(
+        dssim=config.lambda_dssim,
+        color=config.lambda_color,
+        depth=config.lambda_depth,
+        opacity=config.lambda_opacity,
+        normalised=config.depth_loss == "normalised",
+        background=background,
+    )
+
+
+def mean_loss(terms: Sequence[LossTerms], config: SceneConfig) -> float | None:
+    """Mean over images of the image part of eq. 4; None where there is no image."""
+    c = config
+    values = [
+        c.lambda_color * ((1 - c.lambda_dssim) * t.l1 + c.lambda_dssim * t.dssim)
+        + c.lambda_depth * t.depth
+        + c.lambda_opacity * t.transmittance
+        for t in terms
+    ]
+    return sum(values) / len(values) if values else None
+
+
+def psnr_of(terms: Sequence[LossTerms]) -> float | None:
+    """PSNR [dB] of the mean squared colour error over images; None where there is no image."""
+    if not terms:
+        return None
+    return -10.0 * math.log10(max(sum(t.squared for t in terms) / len(terms), 1e-12))

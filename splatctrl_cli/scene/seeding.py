@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.geometry import back_project, back_project_pixels, transform_points
-from splatctrl_cli.records import Bool, Box, Float32, Float64, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.cubes import CubeLevel, cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.render import Rendering
@@ -55,19 +55,12 @@ def add_mask(frame: RgbdFrame, rendering: Rendering, mappable: Bool, config: Sce
 
 
 @dataclass(frozen=True, kw_only=True)
-class Candidates:
+class Candidates(Columns):
     """Pixels to seed: points (K, 3) [m] world, colors (K, 3) in [0, 1], pixels (K,) their size D/f [m]."""
 
     points: Float32
     colors: Float32
     pixels: Float32
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def select(self, keep: Bool) -> "Candidates":
-        """Those where `keep` (K,) is true, in order."""
-        return Candidates(points=self.points[keep], colors=self.colors[keep], pixels=self.pixels[keep])
 
 
 def candidates(frame: RgbdFrame, mask: Bool) -> Candidates:

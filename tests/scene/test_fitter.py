@@ -214,7 +214,7 @@ def test_no_splat_ends_outside_the_workspace() -> None:
 
 def test_rates_fall_as_they_are_told() -> None:
     target = fitter()
-    full, low = target._settings(), target._settings(0.1, 0.5)
+    full, low = target.descent.settings(), target.descent.settings(0.1, 0.5)
     assert low.lr_color == pytest.approx(0.1 * full.lr_color)
     assert low.noise == pytest.approx(0.1 * full.noise)
     assert low.lr_center == pytest.approx(0.5 * full.lr_center)
@@ -258,7 +258,7 @@ def test_what_the_optimiser_moves_off_the_robot_in_the_first_time_step_goes(monk
         centers[(centers[:, 2] > 0.15) & (np.hypot(centers[:, 0], centers[:, 1]) < 0.09), 2] = 0.03
         return {}
 
-    monkeypatch.setattr(target, "_optimise", sink)
+    monkeypatch.setattr(target.descent, "run", sink)
     row = target.step([frame(0, block=0.2)], posture(0.0))
     assert row.removed["robot"] > 0
     centers = target.splats().centers

@@ -8,8 +8,7 @@ import pytest
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig
 from splatctrl_cli.records import Label, RgbdFrame, VoxelState
 from splatctrl_cli.scene.fitter import SceneFitter
-from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.people import PeopleMemory
+from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from tests.scene.test_labels import VISITOR, blind, humans, masked
 from tests.scene.wall import WORKSPACE, frame
 

@@ -1,0 +1,103 @@
+"""The descent of the loss of eq. 4: renders the splats of a buffer and moves their parameters."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.kernels.raster import (
+    ImageLoss,
+    LossTerms,
+    LossWeights,
+    OptimiserSettings,
+    Rasteriser,
+    optimiser_step,
+    unpack_parameters,
+)
+from splatctrl_cli.records import Float32, Float64
+from splatctrl_cli.scene.buffer import SplatBuffer
+from splatctrl_cli.scene.relocation import Misfit
+from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
+from splatctrl_cli.scene.window import View
+
+
+class Descent:
+    """The optimiser of a buffer's M splats; noise is drawn from the seed and the number of the iteration.
+
+    background: the colour behind the splats, None until it is chosen.
+    """
+
+    def __init__(self, config: SceneConfig, buffer: SplatBuffer, seed: int, num_threads: int) -> None:
+        self.num_iterations = 0
+        self.background: Color | None = None
+        self._config, self._buffer, self._seed, self._num_threads = config, buffer, seed, num_threads
+        self._raster = Rasteriser(num_threads)
+        self._loss = ImageLoss(num_threads)
+        self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
+
+    def run(self, views: Sequence[View], settings: OptimiserSettings) -> dict[int, LossTerms]:
+        """An iteration on each view; the loss of each, by identity, at the last iteration that looked at it."""
+        terms = {}
+        for view in views:
+            planes = self.planes(view)
+            plane_gradients = np.empty_like(planes)
+            terms[id(view)] = self._loss.evaluate(planes, view.target, self._weights(), plane_gradients)
+            self._raster.backward(planes, plane_gradients, self._gradients)
+            step_seed = (self._seed << 32) + self.num_iterations
+            optimiser_step(
+                self._raster, self._gradients, self._buffer.parameters, self._buffer.moments, settings, step_seed
+            )
+            self.num_iterations += 1
+        return terms
+
+    def planes(self, view: View) -> Float32:
+        """Red, green, blue, depth and opacity (5, H, W) of a view, as the rasteriser blends them."""
+        centers, radii, colors, opacities = unpack_parameters(self._buffer.parameters, self._num_threads)
+        self._raster.prepare(view.camera, centers, radii, opacities, colors)
+        return self._raster.forward()
+
+    def rendering(self, view: View) -> Rendering:
+        """The same as an image."""
+        planes = self.planes(view)
+        return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
+
+    def evaluate(self, view: View) -> LossTerms:
+        """The loss of a view."""
+        planes = self.planes(view)
+        return self._loss.evaluate(planes, view.target, self._weights(), np.empty_like(planes))
+
+    def _weights(self) -> LossWeights:
+        return loss_weights(self._config, self.background or BLACK)
+
+    def settings(self, rate: float = 1.0, geometry: float = 1.0) -> OptimiserSettings:
+        """Learning rates times `rate`, those of centre and radius times `geometry`."""
+        c = self._config
+        return OptimiserSettings(
+            lr_center=c.lr_center * geometry,
+            lr_log_radius=c.lr_log_radius * geometry,
+            lr_color=c.lr_color * rate,
+            lr_logit_opacity=c.lr_logit_opacity * rate,
+            regulariser=c.lambda_reg / max(int(self._buffer.is_alive.sum()), 1),
+            noise=c.noise * rate,
+            min_opacity=c.min_opacity,
+            min_radius=c.min_radius,
+            max_radius=c.max_radius,
+        )
+
+    def misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:
+        """Each view's colour error where it is mappable, and how much each slot shows (M,): blended opacity, summed.
+
+        The derivative of the sum of a colour plane with respect to a splat's colour is the sum of its weights.
+        """
+        background = np.array(self.background, np.float32)[:, None, None]
+        misfits, shown = [], np.zeros(self._config.max_splats)
+        for view in views:
+            planes = self.planes(view)
+            color = planes[:3] + (1.0 - planes[4]) * background
+            error = np.abs(color - view.target.color).mean(axis=0)
+            misfits.append(Misfit(frame=view.frame, error=np.where(view.mappable, error, np.float32(0.0))))
+            ones = np.zeros_like(planes)
+            ones[0] = view.target.counted
+            self._raster.backward(planes, ones, self._gradients)
+            shown += self._gradients[:, 7]
+        return misfits, shown
