@@ -71,7 +71,8 @@ class CaptureSource:
                 raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(self._cameras)}")
         self._sums = FileSums(path)
         self._rows = FrameRows(path / "frames.csv", self.cameras)
-        self._damaged: list[str] = []
+        self._damaged: list[str] = []  # of the last pass
+        self._damaged_before: list[str] = []  # of the pass before it that met most: the last may end early
         self._loss = LossReport(**header["loss"])
         described = header.get("joint_topics")
         self.joint_topics = None if described is None else read_topics(path, described, self._checked)
@@ -89,7 +90,8 @@ class CaptureSource:
     def loss(self) -> LossReport:
         """What `ingest` could not take, and what has been damaged since."""
         loss = self._loss
-        return replace(loss, damaged=loss.damaged + len(self._damaged), notes=[*loss.notes, *self._damaged])
+        damaged = max(self._damaged, self._damaged_before, key=len)
+        return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
@@ -97,7 +99,7 @@ class CaptureSource:
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
         """Joint states and stored frames by stamp."""
-        self._damaged = []
+        self._damaged, self._damaged_before = [], max(self._damaged, self._damaged_before, key=len)
         return merged(self._joints, self._stored_frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:

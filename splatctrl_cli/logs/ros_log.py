@@ -6,7 +6,7 @@ files that a capture can hold as they are stay undecoded.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -37,6 +37,14 @@ from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Reco
 _SECOND = 1_000_000_000
 
 
+@dataclass(kw_only=True)
+class _Pass:
+    """What one pass over the images met; one that ends early has not met all."""
+
+    damage: Damage = field(default_factory=Damage)
+    num_invalid: int = 0
+
+
 class RosLogSource:
     """Records of an MCAP, ROS 1 bag or ROS 2 bag."""
 
@@ -59,31 +67,26 @@ class RosLogSource:
         self.joint_topics = topics_of(found, loss, first_note, options)
         self._loss = with_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
-        self._damage = Damage()
-        self._num_invalid = 0
+        self._passes = [_Pass()]
 
     @property
     def loss(self) -> LossReport:
-        """What did not become records; images that do not decode are added while `records` is read."""
-        loss = self._loss
+        """What did not become records; images that do not decode are those of the pass of `records` that met most."""
+        loss, most = self._loss, max(self._passes, key=lambda one: (one.damage.count, one.num_invalid))
         return replace(
             loss,
-            damaged=loss.damaged + self._damage.count,
-            invalid_depth=self._num_invalid,
-            notes=[*loss.notes, *self._damage.notes],
+            damaged=loss.damaged + most.damage.count,
+            invalid_depth=most.num_invalid,
+            notes=[*loss.notes, *most.damage.notes],
         )
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
-        return decoded(self._merged(lazily=False))
+        return decoded(merged(self._joints, self._stored_frames(lazily=False)))
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
         """Joint states and stored frames by stamp; image files that need no change are only decoded on demand."""
-        return self._merged(lazily=True)
-
-    def _merged(self, *, lazily: bool) -> Iterator[StoredFrame | JointState]:
-        self._damage, self._num_invalid = Damage(), 0
-        return merged(self._joints, self._stored_frames(lazily=lazily))
+        return merged(self._joints, self._stored_frames(lazily=True))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every planned frame."""
@@ -158,16 +161,17 @@ class RosLogSource:
         self._loss.without_pose += len(color) - num
 
     def _stored_frames(self, *, lazily: bool) -> Iterator[StoredFrame]:
-        images = PlannedImages(self._log, self._plan)
+        images, lost = PlannedImages(self._log, self._plan), _Pass()
+        self._passes.append(lost)
         checked: set[str] = set()
 
         def decodes(camera: Camera) -> bool:
             return not lazily or camera.name not in checked  # the first depth is looked at
 
-        for planned, (color, depth, *masks), places in images.of_frames(self._damage, decodes):
+        for planned, (color, depth, *masks), places in images.of_frames(lost.damage, decodes):
             human = self._human(planned.camera, masks[0]) if masks else None
             if not depth.is_counts:
-                self._num_invalid += num_invalid(depth.pixels)
+                lost.num_invalid += num_invalid(depth.pixels)
             stored = _stored_frame(planned, color, depth, human, places)
             camera = planned.camera
             if camera.name not in checked:

@@ -224,6 +224,8 @@ def test_an_image_that_does_not_decode_is_left_out_and_counted(tmp_path: Path) -
     source = open_source(Breaking(tmp_path / "log.mcap", LogRecipe()).write())
     assert len([r for r in source.records() if isinstance(r, RgbdFrame)]) == 4
     assert source.loss.damaged == 1
+    next(source.records())
+    assert source.loss.damaged == 1, "a second pass that ends early forgets nothing"
     assert "/cam0/color/image_raw/compressed" in source.loss.notes[0] or "cam0" in source.loss.notes[0]
 
 
