@@ -14,8 +14,8 @@ from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, error, needs, note, warning
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions
-from splatctrl_cli.logs.shot import Shot, ShotSource
 from splatctrl_cli.logs.state_columns import StateCollector
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_source
@@ -38,16 +38,16 @@ class _CameraWatch:
         self.stamps: list[int] = []
         self.poses: list[Float64] = []
 
-    def add(self, shot: Shot, motion: ImageMotion) -> None:
+    def add(self, stored: StoredFrame, motion: ImageMotion) -> None:
         """Take a frame; its images are decoded where they are wanted."""
-        self.times.add(shot.stamp_ns, shot.stamp_ns)
-        self.stamps.append(shot.stamp_ns)
-        self.poses.append(shot.T_world_camera)
-        encoding = "32FC1" if shot.depth_unit is None else "16UC1"
+        self.times.add(stored.stamp_ns, stored.stamp_ns)
+        self.stamps.append(stored.stamp_ns)
+        self.poses.append(stored.T_world_camera)
+        encoding = "32FC1" if stored.depth_unit is None else "16UC1"
         if self.images.is_wanted():
-            self.images.add_depth(shot.stamp_ns, shot.depth, encoding)
-            self.colors.add_color(shot.stamp_ns, shot.color, "rgb8")
-            motion.add(shot.frame)
+            self.images.add_depth(stored.stamp_ns, stored.depth, encoding)
+            self.colors.add_color(stored.stamp_ns, stored.color, "rgb8")
+            motion.add(stored.frame)
         else:
             self.images.add_undecoded(encoding, self.lens.width, self.lens.height)
 
@@ -77,9 +77,9 @@ class _SourceWatch:
         self.motion = ImageMotion()
         self.is_whole = True
 
-    def read(self, source: ShotSource, num_images: int | None) -> None:
+    def read(self, source: FrameSource, num_images: int | None) -> None:
         """Take all; with `num_images` up to as many of a camera."""
-        for item in source.shots():
+        for item in source.stored():
             if isinstance(item, JointState):
                 self.states.add(item)
                 continue
@@ -150,7 +150,7 @@ def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:
     )
 
 
-def _losses(source: ShotSource, where: str) -> list[Finding]:
+def _losses(source: FrameSource, where: str) -> list[Finding]:
     loss = source.loss
     findings = damage_findings(where, loss.notes[:50])
     if not loss.damaged:

@@ -117,8 +117,8 @@ def _read(
         raise InputError(other.sentence, remedy=other.remedy)
     declared = declarations_of(request.declare, model)
     evidence = open_evidence(request, model)
-    scene = opened_scene(request, request.config, model, declared, folder, progress)
     source = logged.source
+    scene = opened_scene(request, model, declared, folder, progress, source)
     given = (request.urdf, request.spheres, request.srdf, request.truth, request.declare)
     files = [path for path in given if path is not None]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}

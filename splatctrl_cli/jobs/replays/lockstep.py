@@ -28,7 +28,7 @@ from splatctrl_cli.jobs.replays.known_scene import (
 from splatctrl_cli.jobs.replays.request import DEFAULT_POSE_JUMP, ReplayRequest
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.stored_frame import FrameSource
-from splatctrl_cli.records import Float64, UInt8
+from splatctrl_cli.records import Float64, RecordSource, UInt8
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
@@ -48,22 +48,24 @@ def check_lockstep(request: ReplayRequest) -> None:
 
 def opened_scene(
     request: ReplayRequest,
-    config: Config,
     model: RobotModel,
     declared: Declarations,
     folder: Path,
     console: Progress,
+    source: RecordSource,
 ) -> KnownScene:
-    """The scene that the options of a replay name; what --lockstep reconstructs goes into `folder`."""
+    """The scene that the options of a replay name; what --lockstep reconstructs, of the log `source`, goes into
+    `folder`.
+    """
     if request.field is not None:
-        if config.control.human_margin > config.control.margin:
+        if request.config.control.human_margin > request.config.control.margin:
             raise UsageError(
                 "control.human_margin: a baked field does not tell people from things", remedy="give --scene"
             )
         return from_grid(request.field)
     if request.scene is not None:
-        return from_splats(request.scene, config, request.threads, latency_ns=_latency_ns(request))
-    return from_log(request, config, model, folder, console, declared)
+        return from_splats(request.scene, request.config, request.threads, latency_ns=_latency_ns(request))
+    return from_log(request, request.config, model, folder, console, declared, source)
 
 
 def _latency_ns(request: ReplayRequest) -> int:
@@ -77,12 +79,16 @@ def from_log(
     folder: Path,
     console: Progress,
     declared: Declarations | None = None,
+    source: RecordSource | None = None,
 ) -> KnownScene:
     """The scene that a log's own cameras give as it goes; what is reconstructed is left in `folder`/scene.
 
-    Raises InputError for a log without frames or a clock.
+    source: the log, where it is open already. Raises InputError for a log without frames or a clock.
     """
     source = _open(request, model)
+    from splatctrl_cli.jobs.reconstruction import Reconstruction
+
+    source = _training_source(request, model, source)
     check_pose_jumps(source, request.max_pose_jump)
     place = folder / FOLDER
     place.mkdir()
@@ -221,9 +227,9 @@ class Lockstep:
         self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")
 
 
-def _open(request: ReplayRequest, model: RobotModel) -> FrameSource:
-    """The log once more: its frames are read in step with the replay."""
-    source = open_states(request.log, request.options, model.joint_names)
+def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSource | None) -> FrameSource:
+    """The log, whose frames are read in step with the replay; opened anew where one of its cameras is evidence."""
+    source = open_states(request.log, request.options, model.joint_names) if source is None else source
     if not source.cameras:
         raise InputError(
             f"{request.log}: --lockstep: expected cameras, got joint states alone",
