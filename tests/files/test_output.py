@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,11 +23,31 @@ def test_a_folder_appears_when_it_is_done(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "a").read_text() == "1"
 
 
-def test_an_existing_output_is_refused_untouched_without_force(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("old")
-    with pytest.raises(UsageError, match="--force"), output_path(tmp_path / "out", force=False, is_folder=False):
+def refused(path: Path, words: str, *, force: bool, is_folder: bool) -> None:
+    """The output is not begun, and what is there stays as it is."""
+    with pytest.raises(UsageError, match=words), output_path(path, force=force, is_folder=is_folder):
         pytest.fail("must not get here")
-    assert (tmp_path / "out").read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("there", "name", "is_folder", "force", "words"),
+    [
+        ("out", "out", False, False, "--force"),
+        ("out/scan1/run.json", "out", True, False, r"not written by splatctrl \(no run.json\); give another --out"),
+        ("out/scan1/run.json", "out", True, True, r"not written by splatctrl \(no run.json\); give another --out"),
+        ("out", "out", True, True, "out: is a file, expected a folder to write; give another --out"),
+        ("out/run.json", "out", False, True, "out: is a folder, expected a file to write; give another --out"),
+        ("file", "file/out", True, False, "cannot be written"),
+    ],
+)
+def test_what_must_not_be_replaced_is_refused_untouched(
+    tmp_path: Path, there: str, name: str, is_folder: bool, force: bool, words: str
+) -> None:
+    precious = tmp_path / there
+    precious.parent.mkdir(parents=True, exist_ok=True)
+    precious.write_text("mine")
+    refused(tmp_path / name, words, force=force, is_folder=is_folder)
+    assert [p for p in tmp_path.rglob("*") if p.is_file()] == [precious] and precious.read_text() == "mine"
 
 
 def test_force_replaces_a_folder_whole(tmp_path: Path) -> None:
@@ -54,61 +74,46 @@ def test_force_replaces_a_folder_that_a_command_wrote_or_that_is_empty(tmp_path:
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_a_folder_that_no_command_wrote_is_refused_untouched(tmp_path: Path, force: bool) -> None:
-    precious = tmp_path / "out" / "scan1" / "run.json"
-    precious.parent.mkdir(parents=True)
-    precious.write_text("mine")
-    with (
-        pytest.raises(UsageError, match=r"not written by splatctrl \(no run.json\); give another --out"),
-        output_path(tmp_path / "out", force=force, is_folder=True),
-    ):
-        pytest.fail("must not get here")
-    assert [p for p in tmp_path.rglob("*") if p.is_file()] == [precious]
-
-
-def test_a_file_where_a_folder_is_to_be_written_is_refused_untouched(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    with (
-        pytest.raises(UsageError, match="out: is a file, expected a folder to write; give another --out"),
-        output_path(tmp_path / "out", force=True, is_folder=True),
-    ):
-        pytest.fail("must not get here")
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-def test_a_folder_where_a_file_is_to_be_written_is_refused_untouched(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "run.json").write_text("{}")
-    with (
-        pytest.raises(UsageError, match="out: is a folder, expected a file to write; give another --out"),
-        output_path(tmp_path / "out", force=True, is_folder=False),
-    ):
-        pytest.fail("must not get here")
-    assert (tmp_path / "out" / "run.json").is_file()
-
-
-@pytest.mark.parametrize("force", [False, True])
 @pytest.mark.parametrize("name", ["", ".", "..", "/", "sub/.."])
 def test_an_output_without_a_name_of_its_own_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, force: bool
 ) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    with (
-        pytest.raises(UsageError, match="has no name of its own"),
-        output_path(Path(name), force=force, is_folder=True),
-    ):
-        pytest.fail("must not get here")
+    refused(Path(name), "has no name of its own", force=force, is_folder=True)
     assert [p.name for p in tmp_path.rglob("*")] == ["here"]
 
 
-def test_refused_input_leaves_nothing(tmp_path: Path) -> None:
+FULL = OSError(28, "No space left on device", "a")
+
+
+def fails_as(error: BaseException) -> Callable[[Path], None]:
+    def work(partial: Path) -> None:
+        (partial / "a").write_text("1")
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("work", "error", "words"),
+    [
+        (fails_as(InputError("bad")), InputError, "bad"),
+        (fails_as(ZeroDivisionError("a fault of our own")), ZeroDivisionError, "fault"),
+        (fails_as(FULL), WriteError, "No space left"),
+        (lambda partial: partial.write_text("a folder"), WriteError, r"Is a directory.*another --out"),
+        (lambda partial: (partial.parent / "input").read_text(), FileNotFoundError, "input"),
+    ],
+    ids=["refused input", "a fault of our own", "a full disk", "an output that cannot be written", "no input"],
+)
+def test_a_failure_leaves_nothing(
+    tmp_path: Path, work: Callable[[Path], object], error: type[Exception], words: str
+) -> None:
     with (
-        pytest.raises(InputError),
+        pytest.raises(error, match=words),
         output_path(tmp_path / "out", force=False, is_folder=True) as partial,
     ):
-        (partial / "a").write_text("1")
-        raise InputError("bad")
+        work(partial)
     assert not list(tmp_path.iterdir())
 
 
@@ -120,53 +125,6 @@ def test_an_interrupted_run_leaves_only_a_partial(tmp_path: Path) -> None:
         (partial / "a").write_text("1")
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["out.partial"]
-
-
-def test_a_parent_that_is_a_file_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    with (
-        pytest.raises(UsageError, match="cannot be written"),
-        output_path(tmp_path / "file" / "out", force=False, is_folder=True),
-    ):
-        pytest.fail("must not get here")
-
-
-def test_a_full_disk_is_a_write_error_and_leaves_nothing(tmp_path: Path) -> None:
-    with (
-        pytest.raises(WriteError, match="No space left"),
-        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
-    ):
-        raise OSError(28, "No space left on device", str(partial / "a"))
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_file_of_the_output_that_cannot_be_written_is_a_write_error(tmp_path: Path) -> None:
-    with (
-        pytest.raises(WriteError, match=r"Is a directory.*another --out"),
-        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
-    ):
-        partial.write_text("a folder")
-    assert not list(tmp_path.iterdir())
-
-
-def test_an_input_that_cannot_be_read_is_no_write_error_and_leaves_nothing(tmp_path: Path) -> None:
-    with (
-        pytest.raises(FileNotFoundError),
-        output_path(tmp_path / "out", force=False, is_folder=True) as partial,
-    ):
-        (partial / "a").write_text("1")
-        (tmp_path / "input").read_text()
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_fault_of_our_own_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), output_path(tmp_path / "out", force=False, is_folder=False) as partial:
-        partial.write_text("1")
-        raise ZeroDivisionError
-    assert not list(tmp_path.iterdir())
-
-
-FULL = OSError(28, "No space left on device", "a")
 
 
 @pytest.mark.parametrize(
@@ -344,13 +302,8 @@ def test_a_link_to_nothing_yet_leads_to_the_output(tmp_path: Path) -> None:
 
 def test_a_link_to_itself_and_a_place_of_a_disk_are_refused(tmp_path: Path) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    with (
-        pytest.raises(UsageError, match="is a link to itself"),
-        output_path(tmp_path / "loop", force=True, is_folder=True),
-    ):
-        pytest.fail("must not get here")
-    with pytest.raises(UsageError, match=r"/proc: .*"), output_path(Path("/proc"), force=True, is_folder=True):
-        pytest.fail("must not get here")
+    refused(tmp_path / "loop", "is a link to itself", force=True, is_folder=True)
+    refused(Path("/proc"), r"/proc: .*", force=True, is_folder=True)
 
 
 def test_whether_an_output_can_be_written_is_known_without_trying(
