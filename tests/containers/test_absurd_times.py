@@ -4,34 +4,26 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer as McapWriter
 
-from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import make_log
+from tests.logs.write_log import rewritten
 
 
 def with_last_time(log: Path, path: Path, topics: tuple[str, ...]) -> Path:
     """The log with the last time that MCAP has for the first message of each topic."""
     left = set(topics)
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start(profile="ros2")
-        channels: dict[str, int] = {}
-        for message in McapLog(log).messages(Damage()):
-            topic = message.topic
-            if topic.name in left:
-                left.remove(topic.name)
-                message = replace(message, log_time_ns=2**64 - 1)  # noqa: PLW2901
-            if topic.name not in channels:
-                schema = writer.register_schema(topic.type_name, "ros2msg", topic.definition.encode())
-                channels[topic.name] = writer.register_channel(topic.name, "cdr", schema)
-            writer.add_message(channels[topic.name], message.log_time_ns, message.data, message.log_time_ns)
-        writer.finish()
-    return path
+
+    def late(message: RawMessage) -> RawMessage:
+        if message.topic.name not in left:
+            return message
+        left.remove(message.topic.name)
+        return replace(message, log_time_ns=2**64 - 1)
+
+    return rewritten(log, path, late)
 
 
 @pytest.mark.parametrize(("stamps", "num_frames"), [("header", 5), ("log", 4)])

@@ -1,33 +1,24 @@
 """The same recording in every container gives the same records."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from rosbags.convert.converter import convert
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.containers.bag_log import open_raw_log
-from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import STORE, LogRecipe, make_log
+from tests.logs.write_log import messages_of, write_bag
 
 
 def as_ros2_folder(log: Path, folder: Path, plugin: StoragePlugin) -> Path:
     """The messages of an MCAP as a ROS 2 bag folder."""
-    with Writer(folder, version=9, storage_plugin=plugin) as writer:
-        connections: dict[str, Any] = {}
-        for message in open_raw_log(log).messages(Damage()):
-            topic = message.topic
-            if topic.name not in connections:
-                connections[topic.name] = writer.add_connection(topic.name, topic.type_name, typestore=STORE)
-            writer.write(connections[topic.name], message.log_time_ns, message.data)
-    return folder
+    return write_bag(folder, messages_of(log), plugin=plugin)
 
 
 def as_ros1_bag(log: Path, path: Path) -> Path:

@@ -7,21 +7,19 @@ import sqlite3
 import struct
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import Writer as Writer2
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from splatctrl_cli.containers.bag_log import open_raw_log
 from splatctrl_cli.containers.foxglove import DEFINITIONS
 from splatctrl_cli.containers.protobuf import MessageTypes
-from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.containers.raw_log import RawMessage, Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
 from splatctrl_cli.records import JointState, RgbdFrame
@@ -29,6 +27,8 @@ from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.containers.test_bag_log import assert_same
 from tests.logs.make_log import LogRecipe, make_log
+from tests.logs.write_log import encoded as ros_message
+from tests.logs.write_log import messages_of, rewritten, write_bag
 
 DOUBLE, INT64, INT32, FIXED32, STRING, MESSAGE, BYTES = 1, 3, 5, 7, 9, 11, 12
 TIME = ".google.protobuf.Timestamp"
@@ -185,25 +185,16 @@ def convert(
 ) -> Path:
     """The images, calibrations and transforms of a ROS 2 log in Foxglove's schemas; as_video: colour by that name."""
     write: Callable[[str, Any], bytes] = encoded if encoding == "protobuf" else as_json
-    schema_encoding, schema_data = ("protobuf", descriptor_set()) if encoding == "protobuf" else ("jsonschema", b"{}")
+    definition = descriptor_set().decode("latin-1") if encoding == "protobuf" else "{}"
     decoder = MessageDecoder()
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        channels: dict[str, int] = {}
-        for message in open_raw_log(log).messages(Damage()):
-            name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
-            topic = message.topic.name
-            if topic not in channels:
-                told = name.replace("CompressedImage", "CompressedVideo") if as_video else name
-                schema = writer.register_schema(name=told, encoding=schema_encoding, data=schema_data)
-                channels[topic] = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=schema)
-            time = message.log_time_ns
-            writer.add_message(
-                channels[topic], log_time=time, publish_time=time, data=spoil(name, write(name, fields))
-            )
-        writer.finish()
-    return path
+
+    def told(message: RawMessage) -> RawMessage:
+        name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
+        schema = name.replace("CompressedImage", "CompressedVideo") if as_video else name
+        topic = Topic(name=message.topic.name, type_name=schema, encoding=encoding, definition=definition)
+        return replace(message, topic=topic, data=spoil(name, write(name, fields)))
+
+    return rewritten(log, path, told)
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
@@ -239,17 +230,13 @@ def in_ros_types(log: Path, folder: Path, kind: str, has_definitions: bool = Tru
         store.register(get_types_from_msg(of_ros1 if kind == "bag" else definition, name))
     path = folder / "log.bag" if kind == "bag" else folder / "bag"
     decoder = MessageDecoder()
-    with Writer2(path, version=8) if kind == "db3" else Writer1(path) as writer:
-        connections: dict[str, Any] = {}
-        for message in open_raw_log(log).messages(Damage()):
-            name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
-            name = name.replace("foxglove.", "foxglove_msgs/msg/")
-            topic = message.topic.name
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=store)
-            data = built(store, name, fields)
-            write = store.serialize_cdr if kind == "db3" else store.serialize_ros1
-            writer.write(connections[topic], message.log_time_ns, write(data, name))
+    ros = 2 if kind == "db3" else 1
+    messages = []
+    for message in messages_of(log):
+        name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
+        content = built(store, name.replace("foxglove.", "foxglove_msgs/msg/"), fields)
+        messages.append(ros_message(message.log_time_ns, message.topic.name, content, store, ros=ros))
+    write_bag(path, messages, store, StoragePlugin.SQLITE3 if ros == 2 else None)
     if kind == "db3" and not has_definitions:
         with closing(sqlite3.connect(path / "bag.db3")) as database:
             database.execute("DROP TABLE IF EXISTS message_definitions")

@@ -10,17 +10,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import Writer as McapWriter
 
 from splatctrl_cli.captures.capture_writer import write_capture
-from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.raw_log import Damage
+from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import IMAGE, MessageDecoder
 from splatctrl_cli.logs.messages import read_image
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.sources.source import open_source
-from tests.logs.make_log import HEIGHT, STORE, WIDTH, LogRecipe, T, make_log
+from tests.logs.make_log import HEIGHT, WIDTH, LogRecipe, T, make_log
+from tests.logs.write_log import encoded, rewritten
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 
@@ -37,27 +36,20 @@ def with_png_depth(
 
     change: other bytes for the files of these numbers.
     """
-    decoder, files = MessageDecoder(), []
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start(profile="ros2")
-        channels: dict[str, int] = {}
-        for message in McapLog(log).messages(Damage()):
-            name, kind, data = message.topic.name, message.topic.type_name, message.data
-            if kind == IMAGE:
-                decoded: Any = decoder.decode(message)
-                pixels = read_image(decoded, IMAGE).pixels
-                file = bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1])
-                files.append((change or {}).get(len(files), file))
-                kind, image = COMPRESSED, np.frombuffer(head + files[-1], np.uint8)
-                content = T[COMPRESSED](header=decoded.header, format=form, data=image)
-                data = bytes(STORE.serialize_cdr(content, COMPRESSED))
-            if name not in channels:
-                text = STORE.generate_msgdef(kind, ros_version=2)[0]
-                schema = writer.register_schema(kind, "ros2msg", text.encode())
-                channels[name] = writer.register_channel(name, "cdr", schema)
-            writer.add_message(channels[name], message.log_time_ns, data, message.log_time_ns)
-        writer.finish()
+    decoder, files = MessageDecoder(), list[bytes]()
+
+    def as_png(message: RawMessage) -> RawMessage:
+        if message.topic.type_name != IMAGE:
+            return message
+        decoded: Any = decoder.decode(message)
+        pixels = read_image(decoded, IMAGE).pixels
+        file = bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1])
+        files.append((change or {}).get(len(files), file))
+        image = np.frombuffer(head + files[-1], np.uint8)
+        content = T[COMPRESSED](header=decoded.header, format=form, data=image)
+        return encoded(message.log_time_ns, message.topic.name, content)
+
+    rewritten(log, path, as_png)
     return files
 
 

@@ -6,11 +6,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
-from rosbags.typesys import Stores, get_typestore
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
+from tests.logs.write_log import STORE, encoded, write_raw
+
 T = STORE.types
 WIDTH, HEIGHT = 32, 24
 START_NS = 1_700_000_000_000_000_000
@@ -77,8 +75,6 @@ def mask_pixels(index: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
 class _LogWriter:
     def __init__(self, path: Path, recipe: LogRecipe) -> None:
         self.path, self.recipe = path, recipe
-        self.channels: dict[str, int] = {}
-        self.messages: list[tuple[int, str, str, Any]] = []
 
     def write(self) -> Path:
         recipe = self.recipe
@@ -87,25 +83,8 @@ class _LogWriter:
         for index in range(recipe.num_frames):
             body.extend(self._frame(index))
         ordered = [*body, *tf] if recipe.tf_last else [*tf, *body]
-        with self.path.open("wb") as stream:
-            writer = McapWriter(stream, chunk_size=recipe.chunk_size, compression=CompressionType.ZSTD)
-            writer.start(profile="ros2", library="tests")
-            for log_time, topic, type_name, message in ordered:
-                writer.add_message(
-                    self._channel(writer, topic, type_name),
-                    log_time=log_time,
-                    publish_time=log_time,
-                    data=bytes(STORE.serialize_cdr(message, type_name)),
-                )
-            writer.finish()
-        return self.path
-
-    def _channel(self, writer: Any, topic: str, type_name: str) -> int:
-        if topic not in self.channels:
-            text, _ = STORE.generate_msgdef(type_name, ros_version=2)
-            schema = writer.register_schema(name=type_name, encoding="ros2msg", data=text.encode())
-            self.channels[topic] = writer.register_channel(topic=topic, message_encoding="cdr", schema_id=schema)
-        return self.channels[topic]
+        messages = (encoded(time, topic, content) for time, topic, _, content in ordered)
+        return write_raw(self.path, messages, chunk_size=recipe.chunk_size)
 
     def _tf(self) -> Any:
         recipe = self.recipe

@@ -6,14 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
-from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
+from tests.logs.write_log import STORE, encoded, write_bag, write_raw
+
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 POINT = "trajectory_msgs/JointTrajectoryPoint"
@@ -104,44 +101,15 @@ def states_of(
 
 def write_mcap(path: Path, messages: Sequence[Message], store: Any = STORE) -> Path:
     """An MCAP log of the messages, in their order."""
-    channels: dict[str, int] = {}
-    with path.open("wb") as stream:
-        writer = McapWriter(stream, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="tests")
-        for message in messages:
-            if message.topic not in channels:
-                text, _ = store.generate_msgdef(message.type_name, ros_version=2)
-                schema = writer.register_schema(name=message.type_name, encoding="ros2msg", data=text.encode())
-                channels[message.topic] = writer.register_channel(
-                    topic=message.topic, message_encoding="cdr", schema_id=schema
-                )
-            writer.add_message(
-                channels[message.topic],
-                log_time=message.log_ns,
-                publish_time=message.log_ns,
-                data=bytes(store.serialize_cdr(message.content, message.type_name)),
-            )
-        writer.finish()
-    return path
+    return write_raw(path, [encoded(m.log_ns, m.topic, m.content, store) for m in messages])
 
 
 def write_bag2(path: Path, messages: Sequence[Message], store: Any = STORE) -> Path:
     """A ROS 2 bag folder (sqlite3)."""
-    with Bag2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        kinds = {message.topic: message.type_name for message in messages}
-        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
-        for message in messages:
-            data = store.serialize_cdr(message.content, message.type_name)
-            writer.write(connections[message.topic], message.log_ns, data)
-    return path
+    written = [encoded(m.log_ns, m.topic, m.content, store) for m in messages]
+    return write_bag(path, written, store, StoragePlugin.SQLITE3)
 
 
 def write_bag1(path: Path, messages: Sequence[Message], store: Any) -> Path:
     """A ROS 1 bag."""
-    with Bag1Writer(path) as writer:
-        kinds = {message.topic: message.type_name for message in messages}
-        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
-        for message in messages:
-            data = store.serialize_ros1(message.content, message.type_name)
-            writer.write(connections[message.topic], message.log_ns, data)
-    return path
+    return write_bag(path, [encoded(m.log_ns, m.topic, m.content, store, ros=1) for m in messages], store)

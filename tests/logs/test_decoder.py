@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer as McapWriter
 
-from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
+from splatctrl_cli.containers.raw_log import RawMessage, Topic
 from splatctrl_cli.logs import decoder
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.messages import read_image
@@ -18,6 +16,7 @@ from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import START_NS, STORE, T, header, make_log
+from tests.logs.write_log import messages_of, write_raw
 
 DEEP = "\n".join(f"{'=' * 80}\nMSG: a/T{i}\nT{i + 1} x" for i in range(2000))
 HOSTILE = {
@@ -136,21 +135,7 @@ def test_an_alien_schema_costs_one_topic(tmp_path: Path) -> None:
 
 def _with_alien(log: Path, path: Path) -> Path:
     """The log with three messages of a topic whose definition is none, and three of an unknown encoding."""
-
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start()
-        channels: dict[Topic, int] = {}
-        messages = list(McapLog(log).messages(Damage()))
-        alien = Topic(name="/alien", type_name="sensor_msgs/msg/CameraInfo", encoding="cdr", definition="!?")
-        other = Topic(name="/other", type_name="foxglove.Thing", encoding="protobuf", definition="")
-        extra = [RawMessage(topic=t, log_time_ns=1, data=bytes(40)) for t in (alien, other) for _ in range(3)]
-        for item in [*extra, *messages]:
-            topic = item.topic
-            if topic not in channels:
-                kind = "ros2msg" if topic.encoding == "cdr" else "protobuf"
-                schema = writer.register_schema(topic.type_name, kind, topic.definition.encode())
-                channels[topic] = writer.register_channel(topic.name, topic.encoding, schema)
-            writer.add_message(channels[topic], item.log_time_ns, item.data, item.log_time_ns)
-        writer.finish()
-    return path
+    alien = Topic(name="/alien", type_name="sensor_msgs/msg/CameraInfo", encoding="cdr", definition="!?")
+    other = Topic(name="/other", type_name="foxglove.Thing", encoding="protobuf", definition="")
+    extra = [RawMessage(topic=t, log_time_ns=1, data=bytes(40)) for t in (alien, other) for _ in range(3)]
+    return write_raw(path, [*extra, *messages_of(log)])

@@ -4,9 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer as McapWriter
 
-from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.logs import frame_plan
 from splatctrl_cli.logs.frame_plan import HeldMessages, PlannedImages
@@ -15,25 +13,14 @@ from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import LogRecipe, make_log
+from tests.logs.write_log import messages_of, write_raw
 
 TOPIC = Topic(name="/a", type_name="t", encoding="cdr")
 
 
 def topic_by_topic(log: Path, path: Path) -> Path:
     """The log with all messages of a topic before those of the next."""
-    messages = sorted(McapLog(log).messages(Damage()), key=lambda m: m.topic.name)
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start(profile="ros2")
-        channels: dict[str, int] = {}
-        for message in messages:
-            topic = message.topic
-            if topic.name not in channels:
-                schema = writer.register_schema(topic.type_name, "ros2msg", topic.definition.encode())
-                channels[topic.name] = writer.register_channel(topic.name, "cdr", schema)
-            writer.add_message(channels[topic.name], message.log_time_ns, message.data, message.log_time_ns)
-        writer.finish()
-    return path
+    return write_raw(path, sorted(messages_of(log), key=lambda m: m.topic.name))
 
 
 @pytest.mark.parametrize("held_bytes", [0, 1000, 1 << 20])

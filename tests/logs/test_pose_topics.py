@@ -5,17 +5,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
 
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.containers.bag_log import open_raw_log
-from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import PoseTopic, SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import FRAME_NS, START_NS, STORE, LogRecipe, camera_x, make_log
+from tests.logs.write_log import encoded, messages_of, write_raw
 
 T = STORE.types
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
@@ -52,32 +50,15 @@ def with_poses(tmp_path: Path, *topics: tuple[str, str, str, str], static: tuple
     static: an edge of /tf_static, 0.2 m along y.
     """
     log = make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False, has_joints=False))
-    folder = tmp_path / "bag"
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections: dict[str, Any] = {}
-
-        def write(name: str, kind: str, time: int, data: bytes) -> None:
-            if name not in connections:
-                connections[name] = writer.add_connection(name, kind, typestore=STORE)
-            writer.write(connections[name], time, data)
-
-        for message in open_raw_log(log).messages(Damage()):
-            write(message.topic.name, message.topic.type_name, message.log_time_ns, message.data)
-        for name, kind, parent, child in topics:
-            for index in range(5):
-                message = stamped(kind, index, parent, child)
-                write(name, kind, START_NS + index * FRAME_NS, bytes(STORE.serialize_cdr(message, kind)))
-        if static is not None:
-            edge = stamped(TRANSFORM, 0, *static)
-            edge.transform.translation.x, edge.transform.translation.y = 0.0, 0.2
-            tf = T["tf2_msgs/msg/TFMessage"](transforms=[edge])
-            write(
-                "/tf_static",
-                "tf2_msgs/msg/TFMessage",
-                START_NS,
-                bytes(STORE.serialize_cdr(tf, "tf2_msgs/msg/TFMessage")),
-            )
-    return folder
+    messages = list(messages_of(log))
+    for name, kind, parent, child in topics:
+        poses = (stamped(kind, index, parent, child) for index in range(5))
+        messages += [encoded(START_NS + index * FRAME_NS, name, pose) for index, pose in enumerate(poses)]
+    if static is not None:
+        edge = stamped(TRANSFORM, 0, *static)
+        edge.transform.translation.x, edge.transform.translation.y = 0.0, 0.2
+        messages.append(encoded(START_NS, "/tf_static", T["tf2_msgs/msg/TFMessage"](transforms=[edge])))
+    return write_raw(tmp_path / "poses.mcap", messages)
 
 
 def positions(path: Path, options: SourceOptions | None = None) -> Float64:

@@ -6,7 +6,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.containers.bag_log import open_raw_log
@@ -16,6 +15,7 @@ from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
+from tests.logs.write_log import encoded, write_bag
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 T = STORE.types
@@ -91,14 +91,7 @@ def make_bag(path: Path, *, with_extrinsics: bool = True) -> Path:
         messages.append((stamp, "/device_0/sensor_0/Infrared_1/image/data", image("mono8", grey, stamp)))
         rgb = np.full((HEIGHT, WIDTH, 3), 40 + index, np.uint8)
         messages.append((stamp, f"{COLOR}/image/data", image("rgb8", rgb, stamp)))
-    with Writer(path) as writer:
-        connections: dict[str, Any] = {}
-        for stamp, topic, message in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], max(stamp, 1), STORE.serialize_ros1(message, kind))
-    return path
+    return write_bag(path, [encoded(max(time, 1), topic, m, STORE, ros=1) for time, topic, m in messages], STORE)
 
 
 def test_depth_is_registered_by_the_extrinsics_and_counted_in_its_own_unit(tmp_path: Path) -> None:

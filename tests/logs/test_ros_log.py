@@ -1,18 +1,17 @@
 """Logs as records: what a good log gives, and what each kind of bad log says."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
-from splatctrl_cli.containers.bag_log import open_raw_log
-from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.source import CameraTopics, SourceOptions, open_source
 from tests.containers.test_bag_log import as_ros1_bag, assert_same
+from tests.files.break_log import broken_log
 from tests.logs.make_log import (
     FRAME_NS,
     HEIGHT,
@@ -24,6 +23,7 @@ from tests.logs.make_log import (
     make_log,
     mask_pixels,
 )
+from tests.logs.write_log import messages_of, write_raw
 
 
 def records_of(path: Path, options: SourceOptions | None = None) -> list[Record]:
@@ -174,15 +174,12 @@ def test_a_fixed_pose_stands_in_for_tf(tmp_path: Path) -> None:
 def test_one_camera_of_several_can_be_chosen(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
     assert {f.camera for f in frames_of(log, SourceOptions(cameras=("cam1",)))} == {"cam1"}
-    assert "no camera 'cam7'; use one of: cam0, cam1" in refusal(log, SourceOptions(cameras=("cam7",)))
 
 
 def test_topics_can_be_named(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap")
     topics = CameraTopics(name="eye", color="/cam0/color/image_raw/compressed", depth="/cam0/depth/image_raw")
     assert frames_of(log, SourceOptions(camera_topics=(topics,)))[0].camera == "eye"
-    wrong = CameraTopics(name="eye", color="/nope", depth="/cam0/depth/image_raw")
-    assert "no colour images on topic /nope" in refusal(log, SourceOptions(camera_topics=(wrong,)))
 
 
 def test_a_truncated_log_gives_what_precedes_the_cut(tmp_path: Path) -> None:
@@ -212,16 +209,12 @@ def test_a_flipped_byte_costs_its_chunk_only_and_is_counted(tmp_path: Path) -> N
 
 
 def test_an_image_that_does_not_decode_is_left_out_and_counted(tmp_path: Path) -> None:
-    from tests.logs import make_log as maker
+    def spoil(time: int, topic: str, kind: str, content: Any) -> Iterator[tuple[int, str, str, Any]]:
+        if topic.endswith("/compressed") and time == START_NS + 2 * FRAME_NS:
+            content.data[:] = 0
+        yield time, topic, kind, content
 
-    class Breaking(maker._LogWriter):
-        def _color(self, topic: str, stamp: int, frame: str, index: int) -> tuple[str, str, Any]:
-            name, kind, message = super()._color(topic, stamp, frame, index)
-            if index == 2:
-                message.data[:] = 0
-            return name, kind, message
-
-    source = open_source(Breaking(tmp_path / "log.mcap", LogRecipe()).write())
+    source = open_source(broken_log(tmp_path / "log.mcap", spoil, LogRecipe()))
     assert len([r for r in source.records() if isinstance(r, RgbdFrame)]) == 4
     assert source.loss.damaged == 1
     next(source.records())
@@ -229,87 +222,78 @@ def test_an_image_that_does_not_decode_is_left_out_and_counted(tmp_path: Path) -
     assert "/cam0/color/image_raw/compressed" in source.loss.notes[0] or "cam0" in source.loss.notes[0]
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    assert "nothing.mcap: no such file" in refusal(tmp_path / "nothing.mcap")
-
-
-def test_an_empty_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "zero.mcap").touch()
-    assert "0 bytes" in refusal(tmp_path / "zero.mcap")
-
-
-def test_a_log_without_messages_is_refused(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=0, has_tf=False))
-    assert "holds no messages" in refusal(log)
-
-
-def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("hello")
-    assert "unknown kind of file" in refusal(tmp_path / "notes.txt")
-    (tmp_path / "fake.mcap").write_text("hello")
-    assert "does not begin like a .mcap file" in refusal(tmp_path / "fake.mcap")
-
-
-def test_a_folder_of_unknown_content_is_refused(tmp_path: Path) -> None:
-    assert "neither a capture nor a ROS 2 bag" in refusal(tmp_path)
-
-
-def test_a_file_cut_before_its_first_message_is_refused(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(chunk_size=1 << 20))
+def cut_early(path: Path) -> Path:
+    log = make_log(path, LogRecipe(chunk_size=1 << 20))
     log.write_bytes(log.read_bytes()[:200])
-    assert "nothing usable before the damage" in refusal(log)
+    return log
 
 
-def test_a_log_without_depth_names_its_color_topics(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(has_depth=False)))
-    assert "no depth topic; colour topics there: /cam0/color/image_raw/compressed" in said
+def written(path: Path, name: str, content: bytes) -> Path:
+    path.with_name(name).write_bytes(content)
+    return path.with_name(name)
 
 
-def test_a_log_without_camera_info_names_camera_and_topic(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(has_info=False)))
-    assert "camera cam0: topic /cam0/color/image_raw/compressed has no usable CameraInfo" in said
+NO_FILE = {
+    "nothing.mcap: no such file": lambda path: path.with_name("nothing.mcap"),
+    "0 bytes": lambda path: written(path, "zero.mcap", b""),
+    "unknown kind of file": lambda path: written(path, "notes.txt", b"hello"),
+    "does not begin like a .mcap file": lambda path: written(path, "fake.mcap", b"hello"),
+    "neither a capture nor a ROS 2 bag": lambda path: path.parent,
+    "nothing usable before the damage": cut_early,
+}
 
 
-def test_a_log_without_tf_names_camera_and_frame_and_the_option(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False)))
-    assert "camera cam0: no tf for frame 'cam0_optical'" in said
-    assert "--camera-pose cam0=" in said
+@pytest.mark.parametrize("words", NO_FILE)
+def test_what_is_no_log_is_refused(tmp_path: Path, words: str) -> None:
+    assert words in refusal(NO_FILE[words](tmp_path / "log.mcap"))
 
 
-def test_a_world_frame_that_tf_lacks_is_refused_with_the_frames_it_has(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap"), SourceOptions(world_frame="mars"))
-    assert "tf has no frame 'mars'" in said
-    assert "cam0_link, cam0_optical, world" in said
+CAMERA, EYE = SourceOptions(cameras=("cam7",)), CameraTopics(name="eye", color="/nope", depth="/cam0/depth/image_raw")
+MASK = LogRecipe(mask_every=1)
+TF_TIME = "images 1700000000.000 to 1700000000.400 s, tf 1700000060.000 to 1700000060.400 s"
+LACKING: list[tuple[LogRecipe, SourceOptions | None, str]] = [  # ... stands for what else is said
+    (LogRecipe(num_frames=0, has_tf=False), None, "holds no messages"),
+    (LogRecipe(has_depth=False), None, "no depth topic; colour topics there: /cam0/color/image_raw/compressed"),
+    (LogRecipe(has_info=False), None, "camera cam0: topic /cam0/color/image_raw/compressed has no usable CameraInfo"),
+    (LogRecipe(has_info=False), None, "give --intrinsics cam0=FX,FY,CX,CY"),
+    (LogRecipe(has_tf=False), None, "camera cam0: no tf for frame 'cam0_optical'...--camera-pose cam0="),
+    (LogRecipe(), SourceOptions(world_frame="mars"), "tf has no frame 'mars'...cam0_link, cam0_optical, world"),
+    (LogRecipe(tf_delay_ns=60_000_000_000), None, "tf has no pose of frame 'cam0_optical' in 'world' at the time of"),
+    (LogRecipe(tf_delay_ns=60_000_000_000), None, TF_TIME),
+    (LogRecipe(depth_encoding="32FC1", depth_m=1250.0), None, "depth/image_raw: median depth 1250 m is implausible"),
+    (LogRecipe(depth_encoding="32FC1", depth_m=1250.0), None, "--depth-scale 0.001"),
+    (
+        LogRecipe(num_frames=1, depth_delay_ns=35_000_000),
+        None,
+        "no colour and depth image within 20 ms...35 ms apart",
+    ),
+    (LogRecipe(depth_size=(16, 12)), None, "depth 16UC1 16x12 of /cam0/depth/image_raw is not registered to colour"),
+    (LogRecipe(depth_size=(16, 12)), None, "/cam0/depth/image_raw has no CameraInfo"),
+    (MASK, SourceOptions(human_topics={"cam7": "/m"}), "--human-topic cam7=/m: no camera 'cam7'"),
+    (
+        MASK,
+        SourceOptions(human_topics={"cam0": "/m"}),
+        "--human-topic cam0=/m: no mono8 or 8UC1 images on that topic",
+    ),
+    (MASK, SourceOptions(human_topics={"cam0": "/cam0/depth/image_raw"}), "no mono8 or 8UC1 images on that topic"),
+    (LogRecipe(), SourceOptions(intrinsics={"cam7": (31.0, 32.0, 15.0, 11.0)}), "no camera 'cam7'; use one of: cam0"),
+    (LogRecipe(cameras=("cam0", "cam1")), CAMERA, "no camera 'cam7'; use one of: cam0, cam1"),
+    (LogRecipe(), SourceOptions(camera_topics=(EYE,)), "no colour images on topic /nope"),
+]
 
 
-def test_tf_at_another_time_than_every_image_is_refused(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(tf_delay_ns=60_000_000_000)))
-    assert "tf has no pose of frame 'cam0_optical' in 'world' at the time of any image" in said
-    assert "images 1700000000.000 to 1700000000.400 s, tf 1700000060.000 to 1700000060.400 s" in said
-
-
-def test_depth_in_counts_called_metres_is_implausible_and_the_scale_is_suggested(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(depth_encoding="32FC1", depth_m=1250.0)))
-    assert "topic /cam0/depth/image_raw: median depth 1250 m is implausible" in said
-    assert "--depth-scale 0.001" in said
+@pytest.mark.parametrize(("recipe", "options", "words"), LACKING)
+def test_a_log_names_what_it_lacks(
+    tmp_path: Path, recipe: LogRecipe, options: SourceOptions | None, words: str
+) -> None:
+    said = refusal(make_log(tmp_path / "log.mcap", recipe), options)
+    assert all(part in said for part in words.split("...")), said
 
 
 def test_depth_in_tenths_of_a_millimetre_is_implausible_until_the_scale_is_given(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(depth_counts=60000))
     assert "--depth-scale 0.0001" in refusal(log)
     assert frames_of(log, SourceOptions(depth_scale=1e-4))[0].depth[3, 3] == pytest.approx(6.0)
-
-
-def test_colour_and_depth_that_never_meet_name_the_gap(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(num_frames=1, depth_delay_ns=35_000_000)))
-    assert "no colour and depth image within 20 ms" in said
-    assert "35 ms apart" in said
-
-
-def test_depth_of_another_lens_without_calibration_names_what_is_missing(tmp_path: Path) -> None:
-    said = refusal(make_log(tmp_path / "log.mcap", LogRecipe(depth_size=(16, 12))))
-    assert "depth 16UC1 16x12 of /cam0/depth/image_raw is not registered to colour" in said
-    assert "/cam0/depth/image_raw has no CameraInfo" in said
 
 
 MASKED = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
@@ -340,19 +324,6 @@ def test_a_mask_is_not_taken_for_the_colour_of_a_grey_camera(tmp_path: Path) -> 
     assert frames_of(path, options)[0].color[0].tolist() == [[g, g, g] for g in color_pixels(0)[0, :, 1].tolist()]
 
 
-@pytest.mark.parametrize(
-    ("topics", "message"),
-    [
-        ({"cam7": "/cam0/people/mask"}, "--human-topic cam7=/cam0/people/mask: no camera 'cam7'"),
-        ({"cam0": "/cam0/nothing"}, "--human-topic cam0=/cam0/nothing: no mono8 or 8UC1 images on that topic"),
-        ({"cam0": "/cam0/depth/image_raw"}, "no mono8 or 8UC1 images on that topic"),
-    ],
-)
-def test_a_mask_topic_that_cannot_be_one_is_named(tmp_path: Path, topics: dict[str, str], message: str) -> None:
-    path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1))
-    assert message in refusal(path, SourceOptions(human_topics=topics))
-
-
 def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) -> None:
     path = make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1, distortion=(0.3, 0.0, 0.0, 0.0, 0.0)))
     human = frames_of(path, MASKED)[0].human
@@ -364,22 +335,7 @@ def test_a_distorted_lens_is_undone_on_masks_without_new_values(tmp_path: Path) 
 def test_ros1_messages_in_an_mcap_give_the_same_records(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap")
     bag = as_ros1_bag(log, tmp_path / "log.bag")
-    converted = tmp_path / "ros1.mcap"
-    with converted.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros1")
-        channels: dict[str, int] = {}
-        for message in open_raw_log(bag).messages(Damage()):
-            topic = message.topic
-            if topic.name not in channels:
-                name = topic.type_name.replace("/msg/", "/")
-                schema = writer.register_schema(name=name, encoding="ros1msg", data=topic.definition.encode())
-                channels[topic.name] = writer.register_channel(
-                    topic=topic.name, message_encoding="ros1", schema_id=schema
-                )
-            time = message.log_time_ns
-            writer.add_message(channels[topic.name], log_time=time, publish_time=time, data=message.data)
-        writer.finish()
+    converted = write_raw(tmp_path / "ros1.mcap", messages_of(bag))
     assert_same(records_of(log), records_of(converted))
 
 
@@ -388,7 +344,5 @@ def test_a_lens_that_a_person_gives_stands_in_for_camera_info(tmp_path: Path) ->
     frame = frames_of(log, SourceOptions(intrinsics={"cam0": (31.0, 32.0, 15.0, 11.0)}))[0]
     k = frame.intrinsics
     assert (k.fx, k.fy, k.cx, k.cy, k.width, k.height) == (31.0, 32.0, 15.0, 11.0, WIDTH, HEIGHT)
-    assert "give --intrinsics cam0=FX,FY,CX,CY" in refusal(log)
-    assert "no camera 'cam7'" in refusal(log, SourceOptions(intrinsics={"cam7": (31.0, 32.0, 15.0, 11.0)}))
     recorded = make_log(tmp_path / "whole.mcap")
     assert frames_of(recorded, SourceOptions(intrinsics={"cam0": (31.0, 32.0, 15.0, 11.0)}))[0].intrinsics == k

@@ -34,7 +34,7 @@ def encoded(log_ns: int, topic: str, content: Any, store: Any = STORE, *, ros: i
 
 def write_raw(path: Path, messages: Iterable[RawMessage], **options: Any) -> Path:
     """An MCAP of the messages, in their order; options are the writer's."""
-    schemas: dict[str, int] = {}
+    schemas: dict[tuple[str, str], int] = {}
     channels: dict[str, int] = {}
     with path.open("wb") as stream:
         writer = McapWriter(stream, **{"compression": CompressionType.ZSTD, **options})
@@ -44,10 +44,11 @@ def write_raw(path: Path, messages: Iterable[RawMessage], **options: Any) -> Pat
             if topic.name not in channels:
                 name = topic.schema or topic.type_name
                 name = name.replace("/msg/", "/") if topic.encoding == "ros1" else name
-                if name not in schemas:
+                key = name, topic.definition
+                if key not in schemas:
                     definition = topic.definition.encode("latin-1" if topic.encoding == "protobuf" else "utf-8")
-                    schemas[name] = writer.register_schema(name, SCHEMAS.get(topic.encoding, ""), definition)
-                channels[topic.name] = writer.register_channel(topic.name, topic.encoding, schemas[name])
+                    schemas[key] = writer.register_schema(name, SCHEMAS.get(topic.encoding, ""), definition)
+                channels[topic.name] = writer.register_channel(topic.name, topic.encoding, schemas[key])
             writer.add_message(channels[topic.name], time, message.data, time)
         writer.finish()
     return path

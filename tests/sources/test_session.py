@@ -16,6 +16,7 @@ from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_session, open_source
 from tests.containers.test_bag_log import assert_same
+from tests.files.break_log import broken_log
 from tests.logs import make_log as maker
 from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, camera_x, make_log
 
@@ -24,15 +25,7 @@ Message = tuple[int, str, str, Any]
 
 def make_part(path: Path, recipe: LogRecipe, change: Callable[[Message], list[Message]]) -> Path:
     """A log whose messages (log time, topic, type, content) are changed, left out or repeated."""
-
-    class Changing(maker._LogWriter):
-        def _frame(self, index: int) -> Any:
-            return [new for old in super()._frame(index) for new in change(old)]
-
-        def _tf(self) -> Any:
-            return [new for old in super()._tf() for new in change(old)]
-
-    return Changing(path, recipe).write()
+    return broken_log(path, lambda *message: change(message), recipe)
 
 
 def frames_of(records: list[Record]) -> list[RgbdFrame]:

@@ -175,7 +175,9 @@ def test_controller_states_give_positions_velocities_and_commands(tmp_path: Path
     for i, row in enumerate(q):
         stamp = START_NS + i * STEP_NS
         empty = {
-            f: point([], []) for f in store.types[kind].__dataclass_fields__ if f not in {"header", "joint_names"}
+            f: point([], [])
+            for f in store.types[kind].__dataclass_fields__
+            if f not in {"header", "joint_names", "__msgtype__"}
         }
         filled = {names[0]: point(row, [1.0, 2.0]), names[1]: point(row + 0.1, [1.5, 2.5])}
         content = store.types[kind](header=header(store, stamp), joint_names=list(AB), **{**empty, **filled})
