@@ -85,9 +85,6 @@ def from_log(
 
     source: the log, where it is open already. Raises InputError for a log without frames or a clock.
     """
-    source = _open(request, model)
-    from splatctrl_cli.jobs.reconstruction import Reconstruction
-
     source = _training_source(request, model, source)
     check_pose_jumps(source, request.max_pose_jump)
     place = folder / FOLDER
