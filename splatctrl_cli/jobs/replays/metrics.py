@@ -95,7 +95,8 @@ def _map_error(name: str, figure: str) -> Metric[Replay]:
 
     def value(replay: Replay) -> float | None:
         bound = None if replay.map_error is None else replay.map_error.bound
-        return None if bound is None else float(getattr(bound, figure))
+        found: float | None = None if bound is None else getattr(bound, figure)
+        return found
 
     return _single(name, value, lambda replay: 0 if replay.map_error is None else replay.map_error.num_seen)
 
