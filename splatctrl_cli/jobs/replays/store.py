@@ -15,10 +15,15 @@ from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
 from splatctrl_cli.control.step import ControlStep, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.files.rows import IN_MEMORY, RowFile, Rows, scratch_folder
-from splatctrl_cli.records import Float64, FloatRows
+from splatctrl_cli.records import Float64
 
 BLOCK = 1024  # states that are replayed at once
 RUNGS = tuple(Rung)
+STEP_FIGURES = (
+    *("clearance", "residual", "scale", "rung", "refused", "shaped"),
+    *(f"shaped {kind}" for kind in RowKind),
+)
+STEP_BLANK = (np.nan,) * len(STEP_FIGURES)
 Stamps = NDArray[np.int64]
 T = TypeVar("T")
 
@@ -74,22 +79,12 @@ class StoredObjects(Sequence[T], Generic[T]):
     def __getitem__(self, index: slice) -> list[T]: ...
     def __getitem__(self, index: int | slice) -> T | list[T]:
         if isinstance(index, slice):
-            first, last, step = index.indices(self._num)
-            return self._range(first, last) if step == 1 else [self[i] for i in range(first, last, step)]
+            return [self[i] for i in range(*index.indices(self._num))]
         at = index + (self._num if index < 0 else 0)
         if not 0 <= at < self._num:
             raise IndexError(f"{index} of {self._num}")
         number = int(np.searchsorted(self._starts, at, side="right")) - 1
         return self._block(number)[at - self._starts[number]]
-
-    def _range(self, first: int, last: int) -> list[T]:
-        found: list[T] = []
-        while first + len(found) < last:
-            at = first + len(found)
-            number = int(np.searchsorted(self._starts, at, side="right")) - 1
-            start = self._starts[number]
-            found += self._block(number)[at - start : last - start]
-        return found
 
     def _block(self, number: int) -> list[T]:
         if self._read[0] != number:
@@ -149,19 +144,17 @@ class StoredAudit:
 
     def __init__(self) -> None:
         self._stamps, self._figures = StampColumn(), Figures()
-        self._position: RowFile | None = None
         self._names: tuple[str, ...] = ()
 
     def add(self, part: AuditTrace) -> None:
         """The next states."""
-        if self._position is None:
-            self._position, self._names = RowFile(part.position.shape[1:]), tuple(part.clearance)
+        self._names = tuple(part.clearance)
         self._stamps.append(part.stamp_ns)
-        self._position.append(part.position)
         for name, clearance in part.clearance.items():
             columns = {f"distance {name}": clearance.distance, f"sphere {name}": clearance.sphere.astype(np.float64)}
             self._figures.append(**columns)
         self._figures.append(
+            position=part.position,
             limit_margin=part.limit_margin,
             limit_joint=part.limit_joint.astype(np.float64),
             self_clearance=part.self_clearance,
@@ -177,8 +170,7 @@ class StoredAudit:
     @property
     def position(self) -> Rows:
         """(T, J)."""
-        assert self._position is not None
-        return Rows(self._position)
+        return self._figures.rows("position")
 
     @property
     def clearance(self) -> Mapping[str, StoredClearance]:
@@ -208,7 +200,7 @@ class StoredAudit:
 
         return AuditTrace(
             stamp_ns=self.stamp_ns[first:last],
-            position=self.position[first:last],
+            position=part("position"),
             clearance={
                 name: Clearance(distance=part(f"distance {name}"), sphere=part(f"sphere {name}").astype(np.int64))
                 for name in self._names
@@ -229,42 +221,27 @@ class StoredSteps:
     def __init__(self) -> None:
         self.stored: StoredObjects[ControlStep | None] = StoredObjects()
         self.figures = Figures()
-        self._velocity: RowFile | None = None
 
     @property
     def velocity(self) -> Rows:
         """(T, J) [rad/s], NaN without a step."""
-        assert self._velocity is not None
-        return Rows(self._velocity)
+        return self.figures.rows("velocity")
 
     def extend(self, steps: Sequence[ControlStep | None], num_joints: int) -> None:
         """The next steps."""
         blank = np.full(num_joints, np.nan)
-        self._velocity = self._velocity or RowFile((num_joints,))
-        self._velocity.append(np.array([blank if step is None else step.velocity for step in steps]))
         self.stored.extend(steps)
-        rows = np.full((6 + len(RowKind), len(steps)), np.nan)
-        for i, step in enumerate(steps):
-            if step is not None:
-                rows[:6, i] = (
-                    step.clearance,
-                    step.residual,
-                    step.scale,
-                    RUNGS.index(step.rung),
-                    step.num_refused,
-                    is_shaped(step),
-                )
-                rows[6:, i] = [is_shaped(step, kind) for kind in RowKind]
-        names = (
-            "clearance",
-            "residual",
-            "scale",
-            "rung",
-            "refused",
-            "shaped",
-            *(f"shaped {kind}" for kind in RowKind),
+        rows = np.array([STEP_BLANK if step is None else _figures_of(step) for step in steps])
+        self.figures.append(
+            velocity=np.array([blank if step is None else step.velocity for step in steps]),
+            **dict(zip(STEP_FIGURES, rows.T, strict=True)),
         )
-        self.figures.append(**dict(zip(names, rows, strict=True)))
+
+
+def _figures_of(step: ControlStep) -> tuple[float, ...]:
+    """`STEP_FIGURES` of a step."""
+    shaped = (is_shaped(step), *(is_shaped(step, kind) for kind in RowKind))
+    return (step.clearance, step.residual, step.scale, RUNGS.index(step.rung), step.num_refused, *shaped)
 
 
 class StoredLoop:
@@ -317,8 +294,6 @@ class StoredOpenLoop:
     def __init__(self) -> None:
         self.kept, self.figures = StoredSteps(), Figures()
         self.margins: StoredObjects[VelocityMargin | None] = StoredObjects()
-        self._logged: RowFile | None = None
-        self._difference: RowFile | None = None
 
     @property
     def steps(self) -> Sequence[ControlStep | None]:
@@ -328,32 +303,22 @@ class StoredOpenLoop:
     @property
     def logged(self) -> Rows:
         """(T, J) [rad/s]."""
-        assert self._logged is not None
-        return Rows(self._logged)
-
-    @property
-    def commanded(self) -> FloatRows:
-        """(T, J) [rad/s], NaN where there is none."""
-        return self.kept.velocity
+        return self.figures.rows("logged")
 
     @property
     def difference(self) -> Rows:
         """(T, J) [rad/s] commanded less logged."""
-        assert self._difference is not None
-        return Rows(self._difference)
+        return self.figures.rows("difference")
 
     def add(self, part: OpenLoopTrace) -> None:
         """The next states."""
-        num_joints = part.logged.shape[1]
-        self._logged = self._logged or RowFile((num_joints,))
-        self._logged.append(part.logged)
-        self._difference = self._difference or RowFile((num_joints,))
-        self._difference.append(part.difference)
-        self.kept.extend(part.steps, num_joints)
+        self.kept.extend(part.steps, part.logged.shape[1])
         self.margins.extend(part.margins)
         nothing = (np.nan, np.nan)
         room = np.array([nothing if m is None else (m.barrier, m.limit) for m in part.margins])
         self.figures.append(
+            logged=part.logged,
+            difference=part.difference,
             size=np.linalg.norm(part.difference, axis=1),
             largest=np.max(np.abs(part.difference), axis=1),
             barrier=room[:, 0],
@@ -364,7 +329,7 @@ class StoredOpenLoop:
         """Some of the states."""
         return OpenLoopTrace(
             logged=self.logged[first:last],
-            commanded=np.asarray(self.commanded[first:last]),
+            commanded=self.kept.velocity[first:last],
             steps=tuple(self.steps[first:last]),
             margins=tuple(self.margins[first:last]),
         )
