@@ -10,7 +10,8 @@ from splatctrl_cli.jobs.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake_request import BakeRequest
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest

@@ -60,6 +60,8 @@ class Reason:
 failed = partial(Reason, outcome=Outcome.FAILED)
 lacking = partial(Reason, outcome=Outcome.NOT_EVALUABLE)
 """The evidence does not reach."""
+note = partial(Reason, outcome=Outcome.PASSED, is_note=True)
+"""Decides nothing and is worth a line."""
 
 
 def held(sentence: str, value: float, threshold: float, unit: str, count: int) -> Reason:
@@ -190,8 +192,8 @@ def verdict_of(
 
 
 def noted(criterion: str, sentence: str, *, remedy: str = "") -> Reason:
-    """A reason that decides nothing and is worth a line."""
-    return Reason(criterion=criterion, outcome=Outcome.PASSED, sentence=sentence, remedy=remedy, is_note=True)
+    """A `note` without a figure."""
+    return note(criterion=criterion, sentence=sentence, remedy=remedy)
 
 
 def _plain(reason: Reason) -> dict[str, Any]:

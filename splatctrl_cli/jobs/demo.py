@@ -23,7 +23,8 @@ from splatctrl_cli.jobs.bake_request import BakeRequest
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest

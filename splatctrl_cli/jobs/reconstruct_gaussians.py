@@ -6,15 +6,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.recording import first_frame
 from splatctrl_cli.evaluate.verdict import verdict_of
-from splatctrl_cli.files.output import Stopwatch, output_path, write_run
+from splatctrl_cli.files.output import Stopwatch, output_path
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult
+from splatctrl_cli.jobs.reconstruct import ReconstructResult, written_run
 from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
-from splatctrl_cli.jobs.reconstruction import training_cameras
+from splatctrl_cli.jobs.reconstruction import ReconstructRequest, no_frame, training_cameras
 from splatctrl_cli.records import RecordSource, RgbdFrame
 from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow, GaussianFitter
 from splatctrl_cli.scene.time_steps import depth_box
@@ -68,17 +68,7 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
             is_damaged=bool(source.loss.damaged),
             counts=counts,
         )
-        write_run(
-            partial,
-            command="reconstruct",
-            config=config.as_dict(),
-            inputs=source.digests(),
-            metrics=metrics,
-            stopwatch=stopwatch,
-            seed=request.seed,
-            verdict=verdict.as_dict(),
-        )
-    return ReconstructResult(out=request.out, metrics=metrics, verdict=verdict, removed={}, seconds=stopwatch.seconds)
+        return written_run(partial, request, source.digests(), metrics, verdict, stopwatch)
 
 
 def _refuse_what_needs_time(request: ReconstructRequest) -> None:
@@ -96,10 +86,7 @@ def _frames(source: RecordSource) -> list[RgbdFrame]:
     cameras = training_cameras(source)
     frames = [r for r in source.records() if isinstance(r, RgbdFrame) and r.camera in cameras]
     if not frames:
-        raise InputError(
-            f"{source.name}: no frame with colour, depth and pose from camera {', '.join(cameras)}",
-            remedy="'splatctrl info' says what the input lacks",
-        )
+        raise no_frame(source, cameras)
     return frames
 
 

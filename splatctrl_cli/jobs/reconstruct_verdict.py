@@ -6,7 +6,7 @@ from typing import Any
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.evaluate.gates import gate_reasons
-from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared import carried_words
@@ -94,15 +94,13 @@ def _map(made: Reconstructed) -> Iterator[Reason]:
     num = metrics["unrepresented_voxels"]
     yield map_reason(metrics["splats"] - metrics["robot_splats"], num)
     if num:
-        yield Reason(
+        yield note(
             criterion="represented space",
-            outcome=Outcome.PASSED,
             sentence=f"{num} voxels ({1e3 * metrics['unrepresented_volume']:.2f} l) are occupied and have no splat; "
             "they are obstacles as they are",
             value=float(num),
             remedy=f"raise --max-splats above {scene.max_splats}",
             count=metrics["splats"] + num,
-            is_note=True,
         )
 
 
@@ -115,9 +113,8 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
     long = {camera: span for camera, span in longest.items() if (span[1] - span[0]) * 1e-9 > LONGEST_BLIND}
     for camera, (first_ns, last_ns) in long.items():
         start, end = made.seconds(first_ns), made.seconds(last_ns)
-        yield Reason(
+        yield note(
             criterion="depth",
-            outcome=Outcome.PASSED,
             sentence=f"camera {camera} returned none from {start:.2f} to {end:.2f} s",
             value=end - start,
             threshold=LONGEST_BLIND,
@@ -126,7 +123,6 @@ def _blind(made: Reconstructed) -> Iterator[Reason]:
             who=camera,
             remedy="nothing it looked at is known then: check it with 'splatctrl check'",
             count=without,
-            is_note=True,
         )
     if not long:
         frames = "1 frame has" if without == 1 else f"{without} frames have"
@@ -176,14 +172,12 @@ def _inside(made: Reconstructed) -> Iterator[Reason]:
     """Measured points inside the robot that its surface does not explain."""
     num, link = made.metrics["inside_robot_points"], made.metrics["inside_robot_first_link"]
     if num:
-        yield Reason(
+        yield note(
             criterion="points inside the robot",
-            outcome=Outcome.PASSED,
             sentence=f"{num} measured points lie inside it where its surface does not explain them, first in {link}",
             value=float(num),
             time_s=made.seconds(made.metrics["inside_robot_first_ns"]),
             who=link,
             remedy="contact, a carried object, or calibration: 'splatctrl check' measures the last",
             count=num,
-            is_note=True,
         )

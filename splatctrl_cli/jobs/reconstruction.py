@@ -1,8 +1,8 @@
 """The fitter over a source's time steps, with what is written on the way and the checkpoints to go on from."""
 
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.recording import first_frame
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.records import Box, JointState, PointCloud, RecordSource
+from splatctrl_cli.records import Box, JointState, RecordSource
 from splatctrl_cli.robot.declared import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.audit import AuditRow
@@ -26,12 +26,13 @@ from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 from splatctrl_cli.scene_files.scene_folder import FORMAT
 from splatctrl_cli.scene_files.scene_writer import Checkpoint, SceneWriter
+from splatctrl_cli.splat_files.points import read_points
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
 SAME_MOMENT_NS = 20_000_000  # frames of one time step are at most so far apart
 
 
-def training_cameras(source: "RecordSource") -> list[str]:
+def training_cameras(source: RecordSource) -> list[str]:
     """The cameras that may train. Raises UsageError where there are none."""
     cameras = [camera for camera in source.cameras if camera != "holdout"]
     if not cameras:
@@ -39,43 +40,66 @@ def training_cameras(source: "RecordSource") -> list[str]:
     return cameras
 
 
-class Reconstruction:
-    """One run over `source` into `folder`; with `checkpoint` it goes on where that was written.
+def no_frame(source: RecordSource, cameras: Sequence[str]) -> InputError:
+    """For a recording without a frame to train on."""
+    return InputError(
+        f"{source.name}: no frame with colour, depth and pose from camera {', '.join(cameras)}",
+        remedy="'splatctrl info' says what the input lacks",
+    )
 
-    cloud: points to start from instead of depth, which is then not looked at. declared: what the robot carries.
-    identity: plain values that a run which goes on must have in common with this one.
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructRequest:
+    """One reconstruction of `source` into the folder `out`.
+
+    urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given.
+    points: a coloured cloud to start from, instead of depth. declare: a TOML of what the robot carries. resume: go on
+    with what an interrupted run left. require: gates on its metrics. options: what else decides the bytes, by the
+    names of the options: a run that is resumed must have the same.
+    """
+
+    source: RecordSource
+    out: Path
+    config: Config = field(default_factory=Config)
+    urdf: Path | None = None
+    spheres: Path | None = None
+    box: Box | None = None
+    points: Path | None = None
+    declare: Path | None = None
+    allow_disagreement: bool = False
+    force: bool = False
+    resume: bool = False
+    seed: int = 0
+    threads: int = 0
+    require: Sequence[str] = ()
+    options: Mapping[str, object] = field(default_factory=dict)
+
+
+class Reconstruction:
+    """One run of a request into `folder`; with `checkpoint` it goes on where that was written.
+
+    declared: what the robot carries. identity: plain values that a run which goes on must have in common with this
+    one.
     """
 
     def __init__(
         self,
-        source: "RecordSource",
-        robot: "RobotModel | None",
-        config: "Config",
+        request: ReconstructRequest,
+        robot: RobotModel | None,
         folder: Path,
         *,
-        box: "Box | None",
-        cloud: "PointCloud | None" = None,
-        seed: int,
-        threads: int,
         identity: Mapping[str, Any],
-        allow_disagreement: bool = False,
         declared: Declarations | None = None,
-        checkpoint: "Checkpoint | None" = None,
+        checkpoint: Checkpoint | None = None,
     ) -> None:
-
-        self.source = source
+        self.request, self.source, self.config = request, request.source, request.config
         self.robot = robot
-        self.config = config
-        self.box = box
-        self.cloud = cloud
-        self.seed = seed
-        self.threads = threads
+        self.cloud = None if request.points is None else read_points(request.points)  # instead of depth
         self.identity = identity
-        self.allow_disagreement = allow_disagreement
         self.declared = declared or Declarations()
         self._first_state_ns: int | None = None  # from which declared times count
-        self.cameras = training_cameras(source)
-        comments = {"format": FORMAT, "frame": "world", "units": "m", "source": source.name}
+        self.cameras = training_cameras(self.source)
+        comments = {"format": FORMAT, "frame": "world", "units": "m", "source": self.source.name}
         self.writer = SceneWriter(folder, comments, checkpoint)
         self.fitter: SceneFitter | None = None
         self.rows: list[AuditRow] = []
@@ -102,10 +126,7 @@ class Reconstruction:
         if self.fitter is None and self._early is not None:
             self._workspace(self._early)  # says that there is no depth
         if self.fitter is None:
-            raise InputError(
-                f"{self.source.name}: no frame with colour, depth and pose from camera {', '.join(self.cameras)}",
-                remedy="'splatctrl info' says what the input lacks",
-            )
+            raise no_frame(self.source, self.cameras)
         if not any(row.alive for row in self.rows):
             raise InputError(
                 f"{self.source.name}: no pixel of camera {', '.join(self.cameras)} has a depth inside the workspace",
@@ -113,7 +134,6 @@ class Reconstruction:
             )
 
     def _step_through(self, console: Progress) -> None:
-
         steps = tqdm(self.time_steps(), disable=True if console.is_quiet else None, unit=" steps")
         for index, step in enumerate(steps):
             if index < self.num_read:
@@ -130,7 +150,7 @@ class Reconstruction:
                 console.log(f"time step {index}: {row.alive} splats, {quality}")
             self._save_if_due()
 
-    def take(self, step: "TimeStep", console: Progress) -> "AuditRow | None":
+    def take(self, step: TimeStep, console: Progress) -> AuditRow | None:
         """Take in the next time step, with its snapshot where one is due; None for one that does not say yet where
         the workspace is.
         """
@@ -158,9 +178,8 @@ class Reconstruction:
             self.snapshot(step.stamp_ns)
         return row
 
-    def _check_cameras(self, step: "TimeStep", console: Progress) -> None:
+    def _check_cameras(self, step: TimeStep, console: Progress) -> None:
         """Measure once a pair how far cameras disagree on what both see. Raises InputError where that is too far."""
-
         limits = self.config.occupancy
         if not self._has_new_pairs(step):
             return
@@ -175,26 +194,25 @@ class Reconstruction:
                 f"{self.source.name}: camera {name}: depths disagree by {1e3 * pair.median:.0f} mm (median of"
                 f" {pair.num_pixels} pixels that two views see; expected at most {1e3 * pair.limit:.0f} mm)"
             )
-            if not self.allow_disagreement:
+            if not self.request.allow_disagreement:
                 others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
                 raise InputError(
                     line, remedy=f"{CAUSES}: correct poses or depth,{others} or give --allow-disagreement"
                 )
             console.log(f"warning: {line}")
 
-    def _keep_first_frames(self, step: "TimeStep") -> None:
-
+    def _keep_first_frames(self, step: TimeStep) -> None:
         for frame in step.frames:
             if frame.camera not in self.first_frames:
                 self.first_frames[frame.camera] = first_frame(frame).as_dict()
 
-    def _has_new_pairs(self, step: "TimeStep") -> bool:
+    def _has_new_pairs(self, step: TimeStep) -> bool:
         """Whether two views of this time step are from cameras that have not been compared yet."""
         names = sorted(frame.camera for frame in step.frames)
         pairs = {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)}
         return not pairs <= self.disagreement.keys()
 
-    def _warn_of_small_budget(self, row: "AuditRow", console: Progress) -> None:
+    def _warn_of_small_budget(self, row: AuditRow, console: Progress) -> None:
         if row.unmet:
             budget = self.config.scene.max_splats
             console.log(
@@ -202,7 +220,7 @@ class Reconstruction:
                 f" slot; --max-splats {budget + row.unmet} would hold them"
             )
 
-    def _refine(self, fitter: "SceneFitter", console: Progress) -> None:
+    def _refine(self, fitter: SceneFitter, console: Progress) -> None:
         total = self.config.scene.refine_iterations
 
         def progress(done: int) -> None:
@@ -252,7 +270,7 @@ class Reconstruction:
             "workspace": [*self.fitter.workspace.lower.tolist(), *self.fitter.workspace.upper.tolist()],
         }
 
-    def _record(self, row: "AuditRow") -> None:
+    def _record(self, row: AuditRow) -> None:
         self.rows.append(row)
         self.writer.audit(row)
 
@@ -284,7 +302,6 @@ class Reconstruction:
         self._save_time = self._saved_at - start
 
     def _save(self, *, is_last: bool = False) -> None:
-
         assert self.fitter is not None
         progress = {
             "run": self.identity,
@@ -296,8 +313,7 @@ class Reconstruction:
         }
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
 
-    def _restore(self, checkpoint: "Checkpoint") -> None:
-
+    def _restore(self, checkpoint: Checkpoint) -> None:
         tuples = ("cameras", "blind")
         self.rows = [
             AuditRow(**row | {name: tuple(row[name]) for name in tuples if name in row})
@@ -311,26 +327,25 @@ class Reconstruction:
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 
-    def time_steps(self) -> "Iterator[TimeStep]":
+    def time_steps(self) -> Iterator[TimeStep]:
         """Those of the source, from its beginning."""
-
         steps = time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)
         return steps if self.cloud is None else (step.without_depth() for step in steps)
 
-    def _new_fitter(self, workspace: "Box") -> "SceneFitter":
-
+    def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else replace(self.config.scene, fill=1.0)
         human = self.config.human
-        return SceneFitter(scene, self.config.occupancy, workspace, human=human, seed=self.seed, threads=self.threads)
+        return SceneFitter(
+            scene, self.config.occupancy, workspace, human=human, seed=self.request.seed, threads=self.request.threads
+        )
 
     def _needs_depth(self) -> bool:
         """Whether only depth can say where the workspace is."""
-        return self.box is None and self.robot is None and self.cloud is None
+        return self.request.box is None and self.robot is None and self.cloud is None
 
-    def _workspace(self, first: "TimeStep") -> "Box":
-
-        if self.box is not None:
-            return self.box
+    def _workspace(self, first: TimeStep) -> Box:
+        if self.request.box is not None:
+            return self.request.box
         if self.robot is not None:
             reach, base = self.robot.reach(), self.robot.base_position
             return Box(lower=base - reach, upper=base + reach)
@@ -338,8 +353,7 @@ class Reconstruction:
             return cloud_box(self.cloud)
         return depth_box(first.frames, self.config.occupancy.max_range)
 
-    def _posture(self, step: "TimeStep") -> "RobotPosture | None":
-
+    def _posture(self, step: TimeStep) -> RobotPosture | None:
         if self.robot is None or step.position is None:
             return None
         order = self.robot.joint_order(self.source.joint_names)

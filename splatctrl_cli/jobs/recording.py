@@ -8,11 +8,13 @@ from splatctrl_cli.containers.bag_log import is_bag_folder
 from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
-from splatctrl_cli.jobs.reconstruct import check_pose_jumps
-from splatctrl_cli.jobs.replays.request import DEFAULT_POSE_JUMP
 from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import RecordSource
+from splatctrl_cli.scene.consistency import largest_jump
 from splatctrl_cli.sources.source import open_source
+
+DEFAULT_POSE_JUMP = 1.0  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,3 +98,18 @@ def refuse_scan_options(recording: RecordingRequest) -> None:
     for name in ("scan", "depths", "downscale", "masks"):
         if getattr(recording, name):
             raise UsageError(f"--{name} {getattr(recording, name)}: only with --dtu", remedy="leave it out")
+
+
+def check_pose_jumps(source: FrameSource, limit: float) -> None:
+    """Raise InputError for a camera that is suddenly elsewhere; where nobody knows when, views may lie anywhere."""
+    if not limit > 0:
+        raise UsageError(f"--max-pose-jump: expected metres, got {limit}")
+    jump = largest_jump(source.poses()) if source.has_clock else None
+    if jump is not None and jump.distance > limit:
+        later = (jump.after_ns - jump.before_ns) * 1e-9
+        raise InputError(
+            f"{source.name}: camera {jump.camera} jumps by {jump.distance:.2f} m from stamp {jump.before_ns} to"
+            f" {jump.after_ns} ns, {later:.3g} s later (expected at most {limit:g} m)",
+            remedy=f"correct the poses, leave the camera out with --cameras, or give --max-pose-jump"
+            f" {jump.distance + 0.01:.2f}",
+        )

@@ -42,7 +42,6 @@ def identity(
 
 def deciding_versions() -> dict[str, str]:
     """What of this program, its kernels and its packages may change a bit."""
-
     return {
         "splatctrl": __version__,
         "kernels": native.__name__.rpartition(".")[2],
@@ -62,9 +61,8 @@ def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[No
         raise KeyboardInterrupt(f"interrupted: {kept} is kept; go on with the same command and --resume") from None
 
 
-def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> "Checkpoint":
+def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint:
     """The checkpoint in a partial folder. Raises UsageError naming what differs `now` from when it was written."""
-
     checkpoint = read_checkpoint(folder)
     check_same_run(folder, checkpoint.progress["run"], now)
     return checkpoint

@@ -10,7 +10,8 @@ import pytest
 
 from splatctrl_cli.config import load_config
 from splatctrl_cli.jobs.progress import SILENT, Progress, Silent
-from splatctrl_cli.jobs.reconstruct import ReconstructRequest, ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
+from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.records import Record
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.recording import START_NS, Recording, RecordingOptions

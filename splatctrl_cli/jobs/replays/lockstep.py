@@ -13,8 +13,8 @@ from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.reconstruct import check_pose_jumps
-from splatctrl_cli.jobs.reconstruction import Reconstruction
+from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest
+from splatctrl_cli.jobs.recording import DEFAULT_POSE_JUMP, check_pose_jumps
 from splatctrl_cli.jobs.replays.evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replays.known_scene import (
     KnownFields,
@@ -25,7 +25,7 @@ from splatctrl_cli.jobs.replays.known_scene import (
     known_space,
     splat_fields,
 )
-from splatctrl_cli.jobs.replays.request import DEFAULT_POSE_JUMP, ReplayRequest
+from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Float64, RecordSource, UInt8
@@ -89,18 +89,15 @@ def from_log(
     check_pose_jumps(source, request.max_pose_jump)
     place = folder / FOLDER
     place.mkdir()
-    fitted = Reconstruction(
-        source,
-        model,
-        config,
-        place,
-        box=None,
+    asked = ReconstructRequest(
+        source=source,
+        out=place,
+        config=config,
         seed=request.seed,
         threads=request.threads,
-        identity={"command": "replay --lockstep"},
         allow_disagreement=request.allow_disagreement,
-        declared=declared,
     )
+    fitted = Reconstruction(asked, model, place, identity={"command": "replay --lockstep"}, declared=declared)
     lockstep = Lockstep(
         fitted,
         config,
@@ -193,7 +190,7 @@ class Lockstep:
 
     def _fields(self, file: Path) -> KnownFields:
         balls = read_unrepresented(file.with_suffix(".npz"))
-        return splat_fields(read_ply(file)[0], self._config, self._fitted.threads, balls)
+        return splat_fields(read_ply(file)[0], self._config, self._fitted.request.threads, balls)
 
     def _observed(self, points: Float64) -> UInt8:
         """The known space of the log, or of as much of it as the replay has passed."""
@@ -218,7 +215,7 @@ class Lockstep:
             inputs=fitted.source.digests(),
             metrics=fitted.metrics() | {EVERY: self._held_out_every},
             stopwatch=self._stopwatch,
-            seed=fitted.seed,
+            seed=fitted.request.seed,
         )
         num, seconds = len(fitted.rows), self._stopwatch.seconds["fit"]
         self._console.log(f"lockstep: {num} frame sets, {seconds / num:.3g} s each; their maps are in {FOLDER}/")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.goals import LoggedMotion
+from splatctrl_cli.jobs.recording import DEFAULT_POSE_JUMP
 from splatctrl_cli.jobs.replays.belonging import Mismatch
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.logs.options import SourceOptions
@@ -17,7 +18,6 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import Truth
 
 MODES = ("audit", "open-loop", "closed-loop")
-DEFAULT_POSE_JUMP = 1.0  # [m]
 FIRST_MAP = "first-map"  # a start time: that of the first map
 
 
