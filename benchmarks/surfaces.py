@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import ROOT
-from splatctrl_cli.evaluate.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh
+from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Box, Float64

@@ -11,7 +11,7 @@ from benchmarks.random_tabletop import random_things
 from benchmarks.scenes import sample_robot
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.goals import pose_error
-from splatctrl_cli.evaluate.visibility import seen_by
+from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import Box, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter

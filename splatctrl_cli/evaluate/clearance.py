@@ -1,26 +1,16 @@
-"""What a row of clearances amounts to: intervals below the margin, and agreement with a known truth."""
+"""How far the clearances of a motion agree with a known truth, where a camera saw the surface."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.evaluate.visibility import seen_by
+from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame
 
 NEAR = 0.10  # [m] true clearance below which a state takes part in the comparison
 BLOCK = 4096  # states at once
 ALLOWANCE = 0.01  # [m] the clearance may be off by this and the median splat radius
-
-
-@dataclass(frozen=True, kw_only=True)
-class Interval:
-    """A run of states below the margin: first and last stamp [ns], the least clearance [m] and at which state."""
-
-    first_ns: int
-    last_ns: int
-    least: float
-    state: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,24 +26,6 @@ class ClearanceAgreement:
     largest_over: float | None
     tolerance: float
     share_within: float | None
-
-
-def intervals_below(stamp_ns: NDArray[np.int64], clearance: Float64, margin: float) -> tuple[Interval, ...]:
-    """The runs of consecutive states with a clearance (T,) below the margin [m]; NaN is not below."""
-    is_below = clearance < margin
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_below, [False]]).astype(np.int8)))
-    intervals = []
-    for first, end in zip(edges[::2], edges[1::2], strict=True):
-        at = int(first + np.argmin(clearance[first:end]))
-        intervals.append(
-            Interval(
-                first_ns=int(stamp_ns[first]),
-                last_ns=int(stamp_ns[end - 1]),
-                least=float(clearance[at]),
-                state=at,
-            )
-        )
-    return tuple(intervals)
 
 
 def clearance_agreement(

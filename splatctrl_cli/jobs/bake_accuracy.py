@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import median_radius
-from splatctrl_cli.evaluate.field_truth import TrueCells, TruthComparison, compare_with_truth
+from splatctrl_cli.evaluate.field_truth import (
+    MeshComparison,
+    TrueCells,
+    TruthComparison,
+    compare_with_mesh,
+    compare_with_truth,
+)
 from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
-from splatctrl_cli.evaluate.reference_mesh import MeshComparison, compare_with_mesh
 from splatctrl_cli.field.grid import exact_channel
 from splatctrl_cli.field.probability import probabilities
 from splatctrl_cli.field.spheres import Spheres

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.free_space import free_mass
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.perceptual import Lpips
-from splatctrl_cli.evaluate.score import PROTOCOL, as_json, total_score
+from splatctrl_cli.evaluate.score import PROTOCOL, as_json, free_mass, total_score
 from splatctrl_cli.evaluate.score_report import (
     AVERAGING,
     NAMES,

@@ -8,7 +8,7 @@ import numpy as np
 
 from splatctrl_cli.evaluate.cloud import MAX_DISTANCE, SPACING, cloud_score, points_on, spaced, thinned
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
-from splatctrl_cli.evaluate.visibility import seen_by, surface_points
+from splatctrl_cli.evaluate.views import seen_by, surface_points
 from splatctrl_cli.jobs.score_views import final_splats, rendered
 from splatctrl_cli.mesh_distance import load_mesh
 from splatctrl_cli.records import Float64, Label, RgbdFrame

@@ -5,6 +5,7 @@ extreme is lost and a long log takes no longer than a short one.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ import numpy as np
 
 from splatctrl_cli.records import Float64, FloatRows
 from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, span_of
-from splatctrl_cli.report.time_axis import column, envelope, spans
 
 Intervals = Sequence[tuple[float, float]]
 """First and last time [s] of each interval."""
@@ -50,6 +50,9 @@ FIELD_NAMES = {
     "certified": "certified bound",
     "truth": "truth",
 }
+COLUMNS = 1000  # of a picture; more states than twice as many become ranges
+BLOCK = 4096  # rows at once
+SHORTEST = 1.0 / 400.0  # share of the axis: an interval is drawn no shorter
 
 
 def clearance_picture(
@@ -280,3 +283,83 @@ def _tidy(axes: Any, seconds: Float64) -> None:
     axes.grid(axis="y", color="#e4e4e4", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def methods_picture(path: Path, clearance: Mapping[str, Float64], period: float, margin: float) -> None:
+    """Write a curve [cm] for the clearance (T,) [m] of each method, a state every `period` [s], with its least value
+    marked, the end of each as a bar, and the margin [m] as a line. Gaps (NaN) stay gaps.
+    """
+    with drawn_figure(4.8) as figure:
+        axes = figure.subplots()
+        for number, (name, values) in enumerate(clearance.items()):
+            color, centimetres = CURVE_COLORS[number % len(CURVE_COLORS)], 100.0 * np.asarray(values)
+            seconds = period * np.arange(len(values))
+            label = f"{name}, no value"
+            if np.isfinite(centimetres).any():
+                at = int(np.nanargmin(centimetres))
+                label = f"{name}, least {centimetres[at]:.1f} cm"
+                axes.plot(seconds[at], centimetres[at], "o", color=color, markersize=6, markeredgecolor="white")
+                axes.plot(seconds[-1], centimetres[-1], "|", color=color, markersize=14, markeredgewidth=2)
+            style = (0, (3, 2)) if number == len(clearance) - 1 else "-"  # what it covers shows between its dashes
+            axes.plot(seconds, centimetres, color=color, linewidth=2.0, linestyle=style, label=label)
+        axes.axhline(
+            100 * margin, color=INK, linewidth=1.0, linestyle=(0, (6, 3)), label=f"margin {100 * margin:g} cm"
+        )
+        axes.axhline(0.0, color="#cccccc", linewidth=0.8, zorder=0)
+        axes.set(xlabel="time since the start [s]", ylabel="clearance [cm]")
+        axes.set_title("Clearance of every method, by the controller's field")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=10, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        save_figure(figure, path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Envelope:
+    """K columns: middle time (K,) [s], lowest and highest value (K,) of the states in each, NaN where none is."""
+
+    seconds: Float64
+    lowest: Float64
+    highest: Float64
+
+    @property
+    def is_exact(self) -> bool:
+        """True where every column is one state."""
+        return self.lowest is self.highest
+
+
+def envelope(seconds: Float64, values: Float64, columns: int = COLUMNS) -> Envelope:
+    """The range of values (T,) in each of `columns` equal parts of the time (T,); the values themselves where there
+    are no more than two states to a column. A column without a state is left out, as a gap.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    if len(values) <= 2 * columns:
+        return Envelope(seconds=seconds, lowest=values, highest=values)
+    edges = np.linspace(seconds[0], seconds[-1], columns + 1)
+    first = np.searchsorted(seconds, edges[:-1], side="left")
+    ends = np.append(first[1:], len(values))
+    is_filled = ends > first
+    starts = first[is_filled]
+    lowest, highest = np.full(columns, np.nan), np.full(columns, np.nan)
+    lowest[is_filled], highest[is_filled] = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+    return Envelope(seconds=0.5 * (edges[:-1] + edges[1:]), lowest=lowest, highest=highest)
+
+
+def column(rows: FloatRows, number: int) -> Float64:
+    """A column (T,) of rows (T, K), which are read a block at a time."""
+    parts = [rows[first : first + BLOCK][:, number] for first in range(0, len(rows), BLOCK)]
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def spans(intervals: Sequence[tuple[float, float]], span_s: tuple[float, float]) -> list[tuple[float, float]]:
+    """Start and length [s] of intervals (first and last time) as they are drawn over an axis from and to `span_s`:
+    none shorter than `SHORTEST`, those that then touch joined.
+    """
+    least = SHORTEST * (span_s[1] - span_s[0])
+    drawn: list[tuple[float, float]] = []
+    for start, end in sorted(intervals):
+        end = max(end, start + least)  # noqa: PLW2901
+        if drawn and start <= drawn[-1][1]:
+            drawn[-1] = drawn[-1][0], max(end, drawn[-1][1])
+        else:
+            drawn.append((start, end))
+    return [(start, end - start) for start, end in drawn]

@@ -1,28 +1,13 @@
-"""Intervals below the margin, and agreement with the truth."""
+"""Agreement with the truth, where the surface was seen."""
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.evaluate import clearance as module
-from splatctrl_cli.evaluate.clearance import clearance_agreement, intervals_below, least, mark_seen
+from splatctrl_cli.evaluate.clearance import clearance_agreement, least, mark_seen
 from splatctrl_cli.records import Intrinsics, RgbdFrame
 
 STAMPS = np.arange(6, dtype=np.int64) * 10
-
-
-def test_intervals_are_runs_of_states_below_the_margin() -> None:
-    clearance = np.array([0.01, 0.03, 0.019, -0.01, 0.02, 0.0])
-    found = intervals_below(STAMPS, clearance, 0.02)
-    assert [(i.first_ns, i.last_ns, i.state, i.least) for i in found] == [
-        (0, 0, 0, 0.01),
-        (20, 30, 3, -0.01),
-        (50, 50, 5, 0.0),
-    ]
-
-
-def test_nothing_known_is_not_below_the_margin() -> None:
-    assert intervals_below(STAMPS, np.full(6, np.nan), 0.02) == ()
-    assert intervals_below(STAMPS, np.full(6, 0.02), 0.02) == ()
 
 
 def test_agreement_takes_near_and_seen_states_only() -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from splatctrl_cli.evaluate.free_space import free_mass, in_front
+from splatctrl_cli.evaluate.score import free_mass, in_front
 from splatctrl_cli.records import Label, OccupancyGrid, SplatSet
 
 FREE, FULL = -2.0, 2.0

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from benchmarks.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.evaluate.surface_samples import SurfaceSamples, inscribed_radii, sample_mesh, thin
 from splatctrl_cli.mesh_distance import MeshDistance
 from tests.test_mesh_distance import box_distance, box_mesh
 

@@ -23,7 +23,7 @@ from splatctrl_cli.planner.comparison import Motion, MotionFigures, Yardstick
 from splatctrl_cli.planner.planned import PlannedPath, planned_detours, planned_path
 from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.records import Float64
-from splatctrl_cli.report.methods_picture import methods_picture
+from splatctrl_cli.report.replay_pictures import methods_picture
 
 BIRRT, BIRRT_IK = "birrt", "birrt-ik"
 ALWAYS = ("closed_loop", "log")  # what stands in every comparison

@@ -1,10 +1,10 @@
-from pathlib import Path
+"""How often points of a predicted probability do collide."""
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.report.reliability import reliability, reliability_picture
+from splatctrl_cli.report.reliability import reliability
 
 
 def test_a_probability_that_is_drawn_by_itself_is_reliable() -> None:
@@ -32,9 +32,3 @@ def test_what_is_no_probability_is_refused() -> None:
         reliability(np.array([0.5, np.nan]), np.ones(2, bool))
     with pytest.raises(UsageError, match=r"point 0: .* got 1.5"):
         reliability(np.array([1.5]), np.ones(1, bool))
-
-
-def test_the_picture_is_drawn_with_empty_bins_too(tmp_path: Path) -> None:
-    curve = reliability(np.array([0.0, 0.95]), np.array([False, True]))
-    reliability_picture(tmp_path / "reliability.png", {"calibrated": curve, "paper": curve})
-    assert (tmp_path / "reliability.png").read_bytes().startswith(b"\x89PNG")

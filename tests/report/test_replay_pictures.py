@@ -1,10 +1,22 @@
-"""Long series as the columns of a picture."""
+"""Plots of replays: what came up is shown, and long series keep their extremes as the columns of a picture."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.report import time_axis
-from splatctrl_cli.report.time_axis import SHORTEST, column, envelope, spans
+from splatctrl_cli.report import replay_pictures
+from splatctrl_cli.report.replay_pictures import SHORTEST, column, envelope, spans
+from tests.report.test_pictures import draw_clearance
+
+
+def test_each_kind_of_event_that_came_up_has_a_row(tmp_path: Path) -> None:
+    draw_clearance(tmp_path / "two.png")
+    image = np.asarray(cv2.imread(str(tmp_path / "two.png")), dtype=np.int64)
+    orange, purple, brown = ((0, 159, 230), (167, 121, 204), (59, 109, 138))
+    widths = [int(np.all(np.abs(image - color) < 3, axis=2).sum(axis=1).max()) for color in (orange, purple, brown)]
+    assert widths[1] > 3 * widths[0] > 0 and widths[2] == 0
 
 
 def test_a_short_series_is_drawn_as_it_is() -> None:
@@ -16,7 +28,7 @@ def test_a_short_series_is_drawn_as_it_is() -> None:
 
 @pytest.mark.parametrize("block", [1, 3, 7, 50])
 def test_a_column_is_read_by_blocks(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
-    monkeypatch.setattr(time_axis, "BLOCK", block)
+    monkeypatch.setattr(replay_pictures, "BLOCK", block)
     rows = np.arange(14.0).reshape(7, 2)
     np.testing.assert_array_equal(column(rows, 1), rows[:, 1])
 

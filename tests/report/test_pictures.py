@@ -1,0 +1,201 @@
+"""Pictures are written at the promised width, the same each time, and say what they cannot draw."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.records import DistanceGrid, UInt8
+from splatctrl_cli.report.field_pictures import gradient_picture, probability_picture, slices_picture
+from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
+from splatctrl_cli.report.reliability import reliability, reliability_picture
+from splatctrl_cli.report.replay_pictures import (
+    clearance_picture,
+    commands_picture,
+    methods_picture,
+    open_loop_picture,
+)
+
+
+def row(depth_error: float) -> ComparisonRow:
+    depth = np.full((30, 40), 1.0, np.float32)
+    return ComparisonRow(
+        title="cam0-0000",
+        figures="20.0 dB",
+        photo=np.full((30, 40, 3), 90, np.uint8),
+        render=np.full((30, 40, 3), 0.5, np.float32),
+        photo_depth=depth,
+        render_depth=depth + np.float32(depth_error),
+    )
+
+
+def grid(*, observed: int = 1, distance: float = 0.0, header: str = "from the grid") -> DistanceGrid:
+    """A ball of 0.2 m about (0.5, 0.5, 0.5); `distance` is added to what a cell has."""
+    offset = 0.05 * np.stack(np.meshgrid(*[np.arange(20)] * 3, indexing="ij"), axis=-1) - 0.5
+    from_center = np.linalg.norm(offset, axis=3)
+    sdf = (from_center - 0.2 + distance).astype(np.float32)
+    channels = {
+        "sdf": sdf,
+        "observed": np.full(sdf.shape, observed, np.uint8),
+        "gradient": (offset / np.maximum(from_center, 1e-9)[..., None] + distance).astype(np.float32),
+        "probability": np.clip(1 - from_center, 0, 1).astype(np.float32),
+    }
+    return DistanceGrid(origin=np.zeros(3), voxel=0.05, channels=channels, header={"observed": header})
+
+
+def draw_comparison(path: Path) -> None:
+    comparison_picture(path, [row(0.0), row(0.1)])
+
+
+def draw_slice(path: Path) -> None:
+    spheres = np.array([[0.2, 0.2, 0.5], [0.8, 0.8, 0.9]]), np.array([0.1, 0.1])
+    field_slice_picture(path, grid(), 2, 0.5, spheres, "A ball")
+
+
+def draw_slices(path: Path) -> None:
+    slices_picture(path, grid(), (0.5, 0.5, 0.5))
+
+
+def draw_slices_of_nothing(path: Path) -> None:
+    slices_picture(path, grid(distance=np.nan), (0.5, 0.5, 0.5))
+
+
+def draw_gradient(path: Path) -> None:
+    gradient_picture(path, grid(), [0, 3, 100, 1], 0.5, (0.5, 0.5, 0.5))
+
+
+def draw_gradient_of_nothing_outside(path: Path) -> None:
+    gradient_picture(path, grid(distance=np.nan), [0, 0], 0.5, (-9.0, 99.0, 0.0))
+
+
+def draw_probability(path: Path) -> None:
+    probability_picture(path, grid(), (-9.0, 99.0, 0.0))
+
+
+def draw_large_slice(path: Path) -> None:
+    sdf = np.broadcast_to(np.linspace(-1, 1, 1300, dtype=np.float32)[:, None, None], (1300, 2, 2))
+    large = DistanceGrid(origin=np.zeros(3), voxel=0.001, channels={"sdf": sdf}, header={})
+    slices_picture(path, large, (0.5, 0.0, 0.0))
+
+
+def draw_reliability(path: Path) -> None:
+    curve = reliability(np.array([0.0, 0.95]), np.array([False, True]))  # with empty bins
+    reliability_picture(path, {"calibrated": curve, "paper": curve})
+
+
+def draw_methods(path: Path) -> None:
+    gap = np.linspace(0.1, 0.02, 50)
+    gap[10:20] = np.nan
+    curves = {"one": np.linspace(0.05, 0.08, 80), "two": gap, "three": np.full(30, 0.06), "none": np.full(30, np.nan)}
+    methods_picture(path, curves, 0.01, 0.02)
+
+
+NUM = 6000  # states: more than a picture has columns
+SECONDS = np.linspace(0, 5, NUM)
+EVENTS = {"below-margin": [(1.0, 2.0), (4.0, 4.0)], "unknown-space": [(0.0, 5.0)], "stale-map": []}
+
+
+def draw_clearance(path: Path) -> None:
+    curves = {name: shift + 0.05 * np.cos(SECONDS) for name, shift in (("exact", 0.0), ("barrier", -0.01))}
+    gaps = np.where(SECONDS < 2, np.nan, 0.03)
+    clearance_picture(
+        path, SECONDS, curves | {"certified": gaps, "truth": np.full(NUM, np.nan)}, 0.02, "Clearance", EVENTS
+    )
+
+
+def draw_quiet_clearance(path: Path) -> None:
+    clearance_picture(path, np.zeros(1), {"exact": np.array([0.1])}, 0.02, "Clearance", {})
+
+
+def draw_commands(path: Path) -> None:
+    velocity = np.stack([np.sin(SECONDS), 0.001 * np.cos(SECONDS)], axis=1)
+    velocity[:100] = np.nan
+    joints, limits = ("shoulder", "elbow"), np.array([0.9, 2.0])
+    commands_picture(path, SECONDS, velocity, joints, limits, {"scene": [(1.0, 2.0)], "self": []}, velocity + 0.1)
+
+
+def draw_open_loop(path: Path) -> None:
+    difference = np.stack([np.sin(SECONDS), np.cos(SECONDS)], axis=1)
+    open_loop_picture(path, SECONDS, difference, ("shoulder", "elbow"), np.cos(SECONDS), [(1.0, 1.0)])
+
+
+DRAWN = (
+    *(draw_comparison, draw_slice, draw_slices, draw_slices_of_nothing, draw_gradient),
+    *(draw_gradient_of_nothing_outside, draw_probability, draw_large_slice, draw_reliability, draw_methods),
+    *(draw_clearance, draw_quiet_clearance, draw_commands, draw_open_loop),
+)
+
+
+@pytest.mark.parametrize("draw", DRAWN)
+def test_a_picture_is_1200_pixels_wide_and_the_same_each_time(tmp_path: Path, draw: Callable[[Path], None]) -> None:
+    before = dict(mpl.rcParams)
+    draw(tmp_path / "a.png")
+    draw(tmp_path / "b.png")
+    image = picture(tmp_path / "a.png")
+    assert image.shape[1] == 1200
+    assert image.std() > 1.0
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert dict(mpl.rcParams) == before
+
+
+def picture(path: Path) -> UInt8:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return np.asarray(image, np.uint8)
+
+
+def test_the_depth_error_saturates_in_the_colour_bar_s_top_colour(tmp_path: Path) -> None:
+    comparison_picture(tmp_path / "a.png", [row(0.0)])
+    comparison_picture(tmp_path / "b.png", [row(0.2)])
+    exact, wrong = (picture(tmp_path / name)[150, 950, ::-1] for name in ("a.png", "b.png"))
+    assert wrong.astype(int)[:2].min() > 200, "yellow: at or above 5 cm"
+    assert exact.astype(int).max() < 120, "dark blue: no error"
+
+
+def test_never_seen_space_shows_in_a_slice_where_somebody_looked(tmp_path: Path) -> None:
+    field_slice_picture(tmp_path / "seen.png", grid(), 2, 0.5)
+    field_slice_picture(tmp_path / "never.png", grid(observed=0), 2, 0.5)
+    assert (tmp_path / "seen.png").read_bytes() != (tmp_path / "never.png").read_bytes()
+    point = (0.5, 0.5, 0.5)
+    slices_picture(tmp_path / "seen.png", grid(), point)
+    slices_picture(tmp_path / "never.png", grid(observed=0), point)
+    slices_picture(tmp_path / "unknown.png", grid(observed=0, header="no occupancy grid: all never seen"), point)
+    seen, never, unknown = (picture(tmp_path / f"{name}.png") for name in ("seen", "never", "unknown"))
+    assert np.any(seen != never) and np.any(never != unknown)
+
+
+def test_slices_show_the_point_that_they_are_asked_for(tmp_path: Path) -> None:
+    slices_picture(tmp_path / "a.png", grid(), (0.5, 0.5, 0.5))
+    slices_picture(tmp_path / "b.png", grid(), (0.0, 0.0, 0.0))
+    assert np.any(picture(tmp_path / "a.png") != picture(tmp_path / "b.png"))
+
+
+def test_a_sphere_is_drawn_as_the_circle_of_the_cut(tmp_path: Path) -> None:
+    areas = []
+    for height in (0.5, 0.58, 0.8):
+        sphere = np.array([[0.2, 0.2, height]]), np.array([0.1])
+        field_slice_picture(tmp_path / "a.png", grid(), 2, 0.5, sphere)
+        areas.append(num_orange(picture(tmp_path / "a.png")))
+        (tmp_path / "a.png").unlink()
+    whole, small = areas[0] - areas[2], areas[1] - areas[2]
+    assert whole > 1000
+    assert small / whole == pytest.approx(0.6**2, rel=0.05), "sqrt(0.1^2 - 0.08^2) = 0.06"
+
+
+def num_orange(image: UInt8) -> int:
+    blue, _, red = np.moveaxis(image.astype(int), -1, 0)
+    return int(np.count_nonzero(red - blue > 100))
+
+
+def test_a_slice_outside_the_grid_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(NotEvaluableError, match=r"slice z = 2 m: expected 0\.000 to 0\.950 m"):
+        field_slice_picture(tmp_path / "a.png", grid(), 2, 2.0)
+
+
+def test_a_comparison_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(NotEvaluableError, match="no view to draw"):
+        comparison_picture(tmp_path / "a.png", [])
