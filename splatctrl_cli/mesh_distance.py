@@ -46,8 +46,8 @@ class TriangleMesh:
 def load_mesh(path: Path) -> TriangleMesh:
     """The mesh in a file that trimesh reads (OBJ, STL, PLY, OFF, GLB), as it stands there, all parts as one.
 
-    Vertices at the same place become one, whatever their texture and normal: a seam of a texture is no hole. Raises
-    InputError where the file cannot be read, or holds no triangle or a coordinate that is not finite.
+    Vertices at the same place become one, whatever their texture and normal: a seam of a texture is not a hole.
+    Raises InputError where the file cannot be read, or holds no triangle or a coordinate that is not finite.
     """
     import trimesh
 

@@ -22,7 +22,7 @@ class FrameRows(Sequence[Mapping[str, str]]):
     """Rows of frames.csv of some cameras, in its order; each is read when it is asked for."""
 
     def __init__(self, file: Path, cameras: Collection[str]) -> None:
-        """Raises InputError for a row that is none, or that names a file outside the capture."""
+        """Raises InputError for a row that cannot be read, or that names a file outside the capture."""
         self._file = file
         self._offsets = array("q")
         try:

@@ -103,7 +103,9 @@ def read_identity(folder: Path) -> Mapping[str, Any] | None:
 def check_not_partial(folder: Path) -> None:
     """Raise InputError for what an interrupted run left."""
     if (folder / JOURNAL).is_file():
-        raise InputError(f"{folder}: an ingest that was interrupted", remedy="go on with its command and --resume")
+        raise InputError(
+            f"{folder}: an ingest that was interrupted", remedy="continue it with the same command and --resume"
+        )
 
 
 def check_same_frame(folder: Path, before: Mapping[str, str], now: Mapping[str, str]) -> None:

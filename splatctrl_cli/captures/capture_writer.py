@@ -141,7 +141,7 @@ def _row(stored: StoredFrame, cameras: dict[str, dict[str, Any]]) -> dict[str, s
     """The frame's row of frames.csv, but for the suffixes of its files; its camera is counted."""
     if stored.camera in {"", ".", ".."} or not {"/", "\0"}.isdisjoint(stored.camera):
         raise InputError(
-            f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="name it otherwise"
+            f"{stored.origin}: camera {stored.camera!r}: cannot name a folder", remedy="rename the camera"
         )
     unit = FLOAT_DEPTH_UNIT if stored.depth_unit is None else stored.depth_unit
     intrinsics = vars(stored.intrinsics)

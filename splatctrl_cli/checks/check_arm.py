@@ -161,7 +161,7 @@ def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture)
 
 
 def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
-    """Two joints that, exchanged, put the arm where the depth images show it; None where there are no such."""
+    """Two joints that, exchanged, put the arm where the depth images show it; None where no such pair exists."""
     few = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), NUM_SWAPPED)).astype(int))]
     plain = arm_agreement(model, few, posture)
     best: tuple[float, tuple[int, int]] | None = None

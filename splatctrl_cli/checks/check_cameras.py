@@ -101,7 +101,7 @@ def _distortion(name: str, calibration: Calibration) -> list[Finding]:
         make = warning if len(d) in NUM_COEFFICIENTS else error
         return [make("distortion", name, text, "calibrate again", value=len(d))]
     figures = ", ".join(f"{v:.4g}" for v in d[:5])
-    return [note("distortion", name, f"{model} ({figures}): ingest undistorts, images do not pass through unchanged")]
+    return [note("distortion", name, f"{model} ({figures}): ingest undistorts the images")]
 
 
 def _sizes(found: Survey, camera: CameraTopics) -> list[Finding]:
@@ -153,7 +153,7 @@ def tf_findings(found: Survey, cameras: Sequence[CameraTopics], options: SourceO
         text = f"{len(roots)} separate trees, with roots {', '.join(roots[:6])}"
         if len(trees) > 1 and not options.camera_poses:
             remedy = "record the transform that joins them (hand-eye calibration), or choose with --cameras"
-            findings.append(error("tf-roots", "tf", f"{text}; the cameras hang in more than one", remedy))
+            findings.append(error("tf-roots", "tf", f"{text}; the cameras are in more than one", remedy))
         else:
             findings.append(note("tf-roots", "tf", text, "give --world-frame if the wrong one is taken"))
     return findings

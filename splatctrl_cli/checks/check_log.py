@@ -83,7 +83,7 @@ def check_log(
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:
-    """The cameras that the options leave. Raises InputError for one that the log has not."""
+    """The cameras that the options leave. Raises InputError for one that the log does not have."""
     cameras = camera_topics(log, found, options)
     names = tuple(camera.name for camera in cameras)
     if not names:

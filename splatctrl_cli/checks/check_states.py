@@ -104,8 +104,8 @@ class PoseAgreement:
 
 
 def check_states(states: StateColumns, joints: Sequence[str]) -> None:
-    """Raise InputError where there are no states (model order), a stamp goes back, or leaps as no pause does, or a
-    position is not finite.
+    """Raise InputError where there are no states (model order), a stamp goes back, or leaps farther than a pause can,
+    or a position is not finite.
     """
     stamps = states.stamp_ns
     if not len(stamps):

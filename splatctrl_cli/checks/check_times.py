@@ -230,7 +230,7 @@ def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
     first = min(ended, key=lambda edge: edge.last_ns)
     early = (last_ns - first.last_ns) * _NS
     more = f" and {len(ended) - 1} more" if len(ended) > 1 else ""
-    text = f"ends {early:.3g} s before the last image: what hangs below has no pose from then on"
+    text = f"ends {early:.3g} s before the last image: frames below it have no pose from then on"
     remedy = "record /tf to the end; if it stands still, publish it on /tf_static or give --camera-pose"
     return [warning("tf-ends", f"{first.topic}{more}", text, remedy, value=early, unit="s", stamp_ns=first.last_ns)]
 

@@ -132,9 +132,9 @@ class RobotPoints:
 class ClockOffset:
     """What two clocks differ by, and how sure that is.
 
-    offset_s: a frame's stamp minus the stamp of the joint state at that instant [s], None where it cannot be told;
+    offset_s: a frame's stamp minus the stamp of the joint state at that instant [s], None where it is not known;
     uncertainty_s: the larger of how the cameras disagree and what the method was found to err by; correlation,
-    runner_up: of image and joint motion at the best offset and at the next best peak; reason: why it cannot be told.
+    runner_up: of image and joint motion at the best offset and at the next best peak; reason: why it is not known.
     """
 
     offset_s: float | None
@@ -162,7 +162,7 @@ def estimate_clock_offset(
 
     states: by stamp. With `robot` and cameras that stand still, the change of every pixel between two frames is
     compared with that of the silhouette of the robot's spheres; else the change of whole images with the distance the
-    joints move, which is coarser. The mean over cameras has its peak, by a parabola, at the offset. It cannot be told
+    joints move, which is coarser. The mean over cameras has its peak, by a parabola, at the offset. It is not known
     where nothing moves, where the correlation is low, where another peak is as good, or at the end of the search.
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]

@@ -60,7 +60,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return _fail(error, line, 4, verbose)
     except UnicodeEncodeError as error:  # names of files are bytes to Linux
         name = error.object[max(error.start - 40, 0) : error.end + 40]
-        line = f"input: the name in {name!a} is no UTF-8 text; give the file another name"
+        line = f"input: the name in {name!a} is not UTF-8 text; give the file another name"
         return _fail(error, line, 4, verbose)
     except RecursionError as error:
         return _fail(error, "input: nested too deeply to be read; is it damaged", 4, verbose)

@@ -147,7 +147,7 @@ def source_options(args: argparse.Namespace) -> SourceOptions:
 
 
 def locked_joints(args: argparse.Namespace) -> dict[str, float]:
-    """Values by joint of ``--lock JOINT=VALUE``. Raises UsageError for a value that is no number."""
+    """Values by joint of ``--lock JOINT=VALUE``. Raises UsageError for a value that is not a number."""
     locked = {}
     for assignment in args.lock:
         name, _, text = assignment.partition("=")
@@ -159,7 +159,7 @@ def locked_joints(args: argparse.Namespace) -> dict[str, float]:
 
 
 def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: str) -> tuple[str, ...]:
-    """The names in a list with commas. Raises UsageError for one that is no choice, or none at all."""
+    """The names in a list with commas. Raises UsageError for a name that is not a choice, or no name at all."""
     names = tuple(dict.fromkeys(_names(text) or ()))
     unknown = [name for name in names if name not in choices]
     if unknown or not names:

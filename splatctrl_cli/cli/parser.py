@@ -221,7 +221,7 @@ def words(section: type[Section], key: str) -> tuple[str, ...]:
 
 
 def several(text: str) -> tuple[float, ...]:
-    """Numbers joined by commas; none where one of them is no number, or not within `MAX_LENGTH`."""
+    """Numbers joined by commas; none where one of them is not a number, or not within `MAX_LENGTH`."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:

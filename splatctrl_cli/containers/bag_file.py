@@ -45,7 +45,7 @@ class BagFile:
         """Yield chunks, connections, messages and the bag's header in order; what is lost goes to `damage`."""
         with self.path.open("rb") as stream:
             if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
-                damage.add(f"{self.path.name}: is no bag of format 2.0")
+                damage.add(f"{self.path.name}: is not a bag of format 2.0")
                 return
             while stream.tell() < self.size:
                 offset = stream.tell()
@@ -153,20 +153,20 @@ def number(fields: Fields, name: str) -> int:
 def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
     """Yield kind, fields and body of the records of an unpacked chunk, up to the first that does not fit.
 
-    Raises ValueError where bytes are left that are no record.
+    Raises ValueError where bytes are left that are not a record.
     """
     at = 0
     while at < len(content):
         if at + 4 > len(content):
-            raise ValueError(f"{len(content) - at} bytes are no record")
+            raise ValueError(f"{len(content) - at} bytes are not a record")
         start = at + 4
         end = start + _U32.unpack_from(content, at)[0]
         fields = fields_of(content[start:end]) if end + 4 <= len(content) else None
         if fields is None:
-            raise ValueError(f"{len(content) - at} bytes are no record")
+            raise ValueError(f"{len(content) - at} bytes are not a record")
         body = end + 4
         at = body + _U32.unpack_from(content, end)[0]
         kind = fields.get("op", b"")
         if at > len(content) or len(kind) != 1:
-            raise ValueError(f"{len(content) - body} bytes are no record")
+            raise ValueError(f"{len(content) - body} bytes are not a record")
         yield kind[0], fields, content[body:at]

@@ -180,7 +180,7 @@ def _metadata(path: Path) -> tuple[dict[str, Any], str]:
     try:
         told = dict(yaml.safe_load(file.read_text(encoding="utf-8"))["rosbag2_bagfile_information"])
         if not all(isinstance(name, str) for name in told.get("relative_file_paths") or ()):
-            raise ValueError("a file's name is no text")
+            raise ValueError("a file's name is not text")
     except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):  # an undecodable text is a ValueError
         return {}, f"{file.name}: is not the metadata of a ROS 2 bag; read without it, files by their numbers"
     return told, ""

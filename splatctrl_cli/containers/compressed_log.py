@@ -60,7 +60,7 @@ def _unpacked_message(data: bytes, budget: Budget) -> bytes:
     try:
         size = zstandard.frame_content_size(data)
     except zstandard.ZstdError:
-        raise BadBlockError("is no zstd frame") from None
+        raise BadBlockError("is not a zstd frame") from None
     if size >= 0:
         return budget.unpacked(data, "zstd", size)
     content = unpacked_start(data, "zstd", MAX_BLOCK)

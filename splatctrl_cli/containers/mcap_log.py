@@ -118,7 +118,7 @@ class McapLog:
             start, at = at + _HEAD.size, at + _HEAD.size + length
             if at > end or opcode < FIRST_OPCODE:
                 if not is_cut:
-                    damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are no record")
+                    damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are not a record")
                 return
             if opcode == MESSAGE:
                 message = self._message(records, start, at, offset, damage, names)

@@ -44,8 +44,8 @@ class Reach:
 @dataclass(frozen=True, kw_only=True)
 class Between:
     """Of T - 1 intervals: lower (T - 1,) [m], a bound that the clearance within, ends included, is not below. Where
-    is_met (T - 1,) it is no bound but a witness: the clearance of a posture in between that is below the margin, so
-    that the least clearance is at most that. is_bounded (T - 1,): False where the states say too little of what the
+    is_met (T - 1,) it is a witness instead: the clearance of a posture in between that is below the margin, so that
+    the least clearance is at most that. is_bounded (T - 1,): False where the states say too little of what the
     arm did in between.
     """
 

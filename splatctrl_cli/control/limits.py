@@ -49,9 +49,9 @@ class VelocityLimits:
 
 
 def fr3_limits(joint_names: Sequence[str]) -> VelocityLimits:
-    """The limits of the FR3's joints, which are told by what their names end in.
+    """The limits of the FR3's joints, which are known by the ends of their names.
 
-    Raises UsageError for a joint that is none of the arm's, or named twice.
+    Raises UsageError for a joint of another name, or one named twice.
     """
     found = [re.search(r"(?:^|_)joint([1-7])$", name) for name in joint_names]
     numbers = [0 if match is None else int(match.group(1)) for match in found]

@@ -167,7 +167,7 @@ def check_lengths(where: str, views: Sequence[DtuView]) -> None:
         raise InputError(
             f"{where}: depth: expected {MILLIMETRES * low:g} to {MILLIMETRES * high:g} mm, got a median of"
             f" {MILLIMETRES * median:.3g}",
-            remedy="lengths have to be millimetres; metres times 1000 are",
+            remedy="give lengths in millimetres",
         )
     centers = np.array([view.T_world_camera[:3, 3] for view in views])
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
@@ -175,7 +175,7 @@ def check_lengths(where: str, views: Sequence[DtuView]) -> None:
         raise InputError(
             f"{where}: cameras: expected millimetres, as the depth's median of {MILLIMETRES * median:.0f} mm, got"
             f" cameras within {MILLIMETRES * spread:.3g} mm of their middle",
-            remedy="translations have to be millimetres; metres times 1000 are",
+            remedy="give translations in millimetres",
         )
 
 

@@ -142,7 +142,7 @@ def shrunk(view: DtuView, factor: int) -> DtuView:
 
 
 def _factor(view: DtuView, protocol: ScoreProtocol | None) -> int:
-    """By how much to shrink for the protocol's published size; 1 where that is none or no whole factor away."""
+    """By how much to shrink for the protocol's published size; 1 where no whole factor leads to one."""
     if protocol is None or protocol.size is None:
         return 1
     width, height = protocol.size

@@ -169,7 +169,7 @@ def read_table(kind: type[T], path: Path, name: str, *, beside: Collection[str] 
 
 
 def has_table(path: Path, name: str) -> bool:
-    """Whether a TOML file has a table [name]. Raises InputError where it is no TOML."""
+    """Whether a TOML file has a table [name]. Raises InputError where it is not TOML."""
     return name in _content(path)
 
 

@@ -79,7 +79,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
         file = "" if description.poses is None else description.poses.file
         if file and "*" not in file and not (description.root / file).is_file():
             raise InputError(
-                f"{description.root / file}: no such file, and no other says where the camera was",
+                f"{description.root / file}: no such file, and no other file has its poses",
                 remedy="copy it too, or give --camera-pose NAME=identity for a camera that stands still",
             )
         remedy = "check the clock or the numbers that images and poses share, or give --camera-pose"

@@ -175,7 +175,7 @@ def _projections(path: Path) -> list[Float64]:
         radius = float(np.asarray(arrays["scale_mat_0"], np.float64)[0, 0]) / MILLIMETRES
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]}; expected world_mat_0 and so on, and scale_mat_0") from None
-    except Exception as error:  # numpy raises many kinds for a file that is no archive
+    except Exception as error:  # numpy raises many kinds for a file that is not an archive
         raise InputError(f"{path}: not the cameras of a scan: {error}") from None
     low, high = PLAUSIBLE_RADIUS
     if not low <= radius <= high:

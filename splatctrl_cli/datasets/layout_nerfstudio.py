@@ -65,7 +65,7 @@ def with_transforms(description: Description) -> Description:
     if description.frames is not None:
         if len(lenses) > 1:
             raise InputError(
-                f"{path}: {len(lenses)} different lenses beside [frames]",
+                f"{path}: {len(lenses)} different sets of intrinsics beside [frames]",
                 remedy="leave [frames] out, or give [camera]",
             )
         return replace(description, camera=views[0].camera)
@@ -147,7 +147,7 @@ def _camera(said: dict[str, Any], image: Path, path: Path) -> CameraTable:
         )
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         remedy = "give [camera] and [frames] in a description"
-        raise InputError(f"{path}: no usable {error} of the lens", remedy=remedy) from None
+        raise InputError(f"{path}: no usable {error} in the intrinsics", remedy=remedy) from None
 
 
 def _short(views: list[ListedView]) -> list[ListedView]:

@@ -11,7 +11,7 @@ from splatctrl_cli.files.registry import entries_of
 from splatctrl_cli.logs.options import SourceOptions
 
 _LOGS = (".mcap", ".bag", ".db3")
-_MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is none itself
+_MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is not itself one
 
 LAYOUTS = entries_of(__package__, Layout)
 

@@ -21,7 +21,7 @@ OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 _MOST_NS = 1 << 62
 MAX_ENTRY = 1e6  # [m] of a pose
 POSE_TOLERANCE_NS = 20_000_000  # before the first and after the last pose of a trajectory
-_MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes what is no number (12-Scenes)
+_MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes NaN and infinity (12-Scenes)
 MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
 _CORRECT = "correct the file, or [poses] where a .toml names it"
 
@@ -29,7 +29,7 @@ _CORRECT = "correct the file, or [poses] where a .toml names it"
 def world_camera(matrix: Float64, convention: str, axes: str, where: str) -> Float64:
     """T_world_camera (4, 4), optical, of a matrix as written in a file.
 
-    Raises InputError where it is no rigid transform.
+    Raises InputError where it is not a rigid transform.
     """
     T = rigid(matrix, where)
     if convention == "world_to_camera":
@@ -160,7 +160,7 @@ class Trajectory:
 
 
 def stamp_of_text(text: str) -> int | None:
-    """Nanoseconds of seconds as written, without the rounding of floats; None where the text is no time."""
+    """Nanoseconds of seconds as written, without the rounding of floats; None where the text is not a time."""
     try:
         stamp_ns = round(Decimal(text) * 1_000_000_000)
         return stamp_ns if abs(stamp_ns) < _MOST_NS else None

@@ -1,7 +1,7 @@
 """A bound on how far a map misses surface, from depth that did not train it: split conformal prediction over time.
 
 Each held-out frame set has one number, its largest miss. Neighbouring sets see the same surface at nearly the same
-moment and are no two pieces of evidence, so they are joined to stretches of the misses' autocorrelation time that
+moment and are not independent, so they are joined to stretches of the misses' autocorrelation time that
 begin that long after the one before has ended. A stretch's score is the largest miss in it. Of n scores that are
 exchangeable with a new one, the k-th smallest, ``k = ceil((n + 1) * confidence)``, is not exceeded by the new one
 with a probability of at least `confidence`, whatever their distribution (Vovk, Gammerman and Shafer 2005; Lei et al.

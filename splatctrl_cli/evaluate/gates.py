@@ -82,7 +82,7 @@ def _holding(comparison: str, bound: float) -> Callable[[float], bool]:
 
 
 def gate(text: str) -> str:
-    """`text` itself, for argparse. Raises UsageError where it is no requirement."""
+    """`text` itself, for argparse. Raises UsageError where it is not a requirement."""
     parse_gate(text)
     return text
 

@@ -85,7 +85,7 @@ def _read(path: Path) -> dict[str, Float32]:
             return {name: np.asarray(archive[name], np.float32) for name in archive.files}
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except Exception as error:  # numpy raises many kinds for a file that is no archive
+    except Exception as error:  # numpy raises many kinds for a file that is not an archive
         raise InputError(
             f"{path}: expected LPIPS weights as .npz, got: {error}", remedy="docs/score.md says how to make them"
         ) from None

@@ -279,5 +279,5 @@ def _variable(path: Path, name: str) -> Any:
         return loadmat(path, variable_names=[name])[name]
     except KeyError:
         raise InputError(f"{path}: expected a variable {name}, got none") from None
-    except Exception as error:  # scipy raises many kinds for a file that is no .mat
+    except Exception as error:  # scipy raises many kinds for a file that is not a .mat
         raise InputError(f"{path}: not a MATLAB file that can be read: {error}") from None

@@ -24,7 +24,7 @@ NAMES_WITH_CHANGES = (*NAMES, *(PREFIX + name for name in NAMES))  # since a bas
 
 
 def read_baseline(path: Path) -> dict[str, Any]:
-    """The report of an earlier score. Raises InputError where that is no score."""
+    """The report of an earlier score. Raises InputError where the file is not a score."""
     try:
         earlier = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(earlier["metrics"], dict) and isinstance(earlier["protocol"], dict):

@@ -53,7 +53,7 @@ class Sight:
 
 def worst_moments(stamp_ns: NDArray[np.int64], clearance: Float64, num: int, apart_s: float = APART) -> list[int]:
     """Indices of at most `num` states with least clearance (T,), the least first: each the least within `apart_s` on
-    either side, so that the flank of an event is not another one. NaN is no clearance.
+    either side, so that the flank of an event is not another one. NaN does not count.
     """
     values = np.where(np.isnan(clearance), np.inf, clearance)
     beside = np.concatenate([[np.inf], values, [np.inf]])

@@ -13,7 +13,7 @@ class GridField:
     """Trilinear interpolation between cell centres, and the gradient of that very interpolant.
 
     Outside the box of the cell centres it reads the value at the nearest point of the box less the distance to it:
-    a lower bound of a distance, so that a robot that leaves the grid is told of less clearance, never of more.
+    a lower bound of a distance, so that a robot that leaves the grid reads less clearance, never more.
     Beside a cell that is NaN (never-seen space under the policy ``nan``) it is NaN, and so is the certified distance.
     """
 

@@ -45,7 +45,7 @@ class GridStatistics:
     """num_blank: cells whose sdf is NaN; num_inside: whose sdf is 0 or less; lowest, highest of sdf [m].
 
     observed: cells by state. hard_share: of cells where sdf is the exact distance. excess: by kernel field, of cells
-    where it has a value of its own or stands in. Each None or empty where the grid has not the channels for it.
+    where it has a value of its own or stands in. Each None or empty where the grid lacks the channels for it.
     """
 
     num_cells: int

@@ -13,7 +13,7 @@ DEFAULT_LABELS = frozenset({Label.OBJECT, Label.HUMAN})
 def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:
     """The splats with one of `labels`, in order: the robot is left out unless asked for.
 
-    Raises NotEvaluableError where none is left, InputError for a label that is none of ours.
+    Raises NotEvaluableError where none is left, InputError for an unknown label.
     """
     check_labels(splats)
     kept = splats.select(np.isin(splats.labels, [int(label) for label in labels]))
@@ -27,7 +27,7 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
 
 
 def check_labels(splats: SplatSet) -> None:
-    """Raise InputError for a label that is none of ours."""
+    """Raise InputError for an unknown label."""
     unknown = ~np.isin(splats.labels, [int(label) for label in Label])
     if unknown.any():
         i = int(np.argmax(unknown))

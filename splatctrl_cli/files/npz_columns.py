@@ -25,7 +25,7 @@ class NpzFile:
     """An NPZ file of columns: arrays (T, ...), of which each row is flattened."""
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError for a file that is none."""
+        """Raises InputError for a file of another kind."""
         self._path = path
         try:
             with zipfile.ZipFile(path) as archive:

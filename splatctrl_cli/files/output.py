@@ -149,7 +149,7 @@ def _check_replaceable(path: Path, *, is_folder: bool) -> None:
         raise UsageError(f"{path}: was not written by splatctrl (no run.json)", remedy="give another --out")
 
     if path.is_dir() and os.path.ismount(path):
-        raise UsageError(f"{path}: is where a disk is mounted", remedy="give a folder in it")
+        raise UsageError(f"{path}: is a mount point", remedy="give a folder in it")
     if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
         raise UsageError(f"{path}: cannot be replaced: it is read-only", remedy="give another --out")
 

@@ -29,7 +29,7 @@ def held(partial: Path, *, is_folder: bool) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a link, or a folder with all that is in it; what is not there is no error."""
+    """Remove a file, a link, or a folder with all that is in it; a missing one is no error."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

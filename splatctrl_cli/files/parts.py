@@ -21,7 +21,7 @@ class Parts:
 
     @classmethod
     def of_run(cls, folder: Path, run: Mapping[str, object]) -> "Parts":
-        """Of what ``run.json`` holds. Raises InputError for digests that are none."""
+        """Of what ``run.json`` holds. Raises InputError for values that are not digests."""
         digests = run.get("parts")
         if digests is not None and not (
             isinstance(digests, dict) and all(isinstance(value, str) for value in digests.values())

@@ -20,7 +20,7 @@ Index = NDArray[np.int64]
 
 
 def scratch_folder() -> Path:
-    """Where files without a name lie: TMPDIR, else /var/tmp, which unlike /tmp is no memory, else what there is."""
+    """Where files without a name lie: TMPDIR, else /var/tmp (on disk, unlike some /tmp), else what there is."""
     given, on_disk = os.environ.get("TMPDIR"), Path("/var/tmp")
     return Path(tempfile.gettempdir()) if given or not os.access(on_disk, os.W_OK) else on_disk
 

@@ -78,7 +78,7 @@ def header_text(grid: DistanceGrid) -> str:
 
 
 def parse_header(name: str, text: str) -> dict[str, object]:
-    """The header that `text` is. Raises InputError naming `name` for text that is none, or of another version."""
+    """The header that `text` is. Raises InputError naming `name` for other text, or another version."""
     try:
         parsed = json.loads(text)
     except json.JSONDecodeError as error:
@@ -167,7 +167,7 @@ class GridFormat:
     `name` is what --formats takes; `write` writes the grid as a path that ends in `suffix`, or with `is_per_channel`
     a file a channel beside it; `describe` takes a path and the file's first bytes and returns None for a file of
     another kind; `read` gives back a grid that was written.
-    `needs` are channels of which the grid must have one; `holds_unknown` is whether cells that are NaN can be told;
+    `needs` are channels of which the grid must have one; `holds_unknown`: it can mark cells without a distance;
     `bytes_per_cell` is its size on the disk, None for that of all channels; `check` raises UsageError where what
     writes it is not installed. `docs` is its row in docs/artefacts.md, cells between bars: name, file, who opens it,
     checked, cost.

@@ -2,7 +2,7 @@
 
 A folder holds one ``NAME.npy`` a channel, at its full size from the start, and ``progress.json``: what is being baked
 and how many layers of x are on disk. A slab of layers is one run of bytes in each file. What an interrupted bake left
-is gone on with; what is finished is written into every format from memory maps.
+is continued; what is finished is written into every format from memory maps.
 """
 
 import json
@@ -81,7 +81,7 @@ class GridSlabs:
         if not self.is_whole():
             raise InputError(
                 f"{self.folder}: expected {self.plan.shape[0]} layers, got {self.num_layers}",
-                remedy="go on with the bake",
+                remedy="continue the bake",
             )
         channels: dict[str, NDArray[np.generic]] = {
             name: np.lib.format.open_memmap(self._path(name), mode="r") for name in self.plan.channels

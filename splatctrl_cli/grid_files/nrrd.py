@@ -63,7 +63,7 @@ def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
 def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
     """The fields and the key/value pairs of any NRRD file, as text.
 
-    Raises InputError for a file that is none, or whose header does not end.
+    Raises InputError for a file of another kind, or whose header does not end.
     """
     with path.open("rb") as stream:
         text = stream.read(_HEAD_LIMIT)

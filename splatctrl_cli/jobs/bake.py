@@ -125,7 +125,7 @@ def check_request(request: BakeRequest) -> None:
 def _tell_of_partial(request: BakeRequest, checkpoint: Path, progress: Progress) -> None:
     partial = checkpoint.parent.parent
     if request.resume and not checkpoint.is_file():
-        progress.log(f"{partial}: nothing to go on from; starts at the beginning")
+        progress.log(f"{partial}: nothing to continue from; starts at the beginning")
     elif checkpoint.is_file() and not request.resume:
         progress.log(f"warning: {partial}: an interrupted bake is replaced; --resume would have continued it")
 
@@ -182,12 +182,15 @@ def _channels(request: BakeRequest, previous: Previous | None) -> tuple[str, ...
     for option in ("truth", "reference_mesh", "held_out"):
         if getattr(request, option) is not None and not EXACT & names:
             raise UsageError(
-                f"--{option.replace('_', '-')}: compares with the exact distance, too",
+                f"--{option.replace('_', '-')}: needs the exact distance",
                 remedy="bake the channel bound or hard as well",
             )
     unknown = request.config.field.unknown
     if unknown != "free" and "observed" not in names:
-        raise UsageError(f"field.unknown = {unknown}: needs to be told", remedy="bake the channel observed as well")
+        raise UsageError(
+            f"field.unknown = {unknown}: needs to know which cells were seen",
+            remedy="bake the channel observed as well",
+        )
     return chosen
 
 
@@ -369,7 +372,7 @@ def _verdict(
 
 
 def _draw(folder: Path, report: FieldReport, accuracy: Accuracy, point: Sequence[float]) -> None:
-    """Slices through `point` [m], the gradient, and what else the grid has."""
+    """Slices through `point` [m], the gradient, and the grid's other channels."""
     folder.mkdir()
     grid, lengths = report.grid, report.statistics.gradient
     slices_picture(folder / "slices.png", grid, point)

@@ -182,8 +182,8 @@ def check_same(
     if differing:
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise UsageError(
-            f"--update {previous.path}: that field was baked otherwise: {', '.join(differing[:3])}{more}",
-            remedy="give the options it was baked with, or bake without --update",
+            f"--update {previous.path}: that field was baked with other settings: {', '.join(differing[:3])}{more}",
+            remedy="give the same settings, or bake without --update",
         )
 
 

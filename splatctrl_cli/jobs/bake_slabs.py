@@ -56,7 +56,7 @@ def bake_to_disk(task: BakeTask, partial: Path, progress: Progress, *, resume: b
         check_vdb(layout, baker.channels, task.formats)
     store = resume_slabs(folder, plan) if resume else start_slabs(folder, plan)
     if store.num_layers:
-        progress.log(f"{partial}: goes on after {store.num_layers} of {layout.shape[0]} planes")
+        progress.log(f"{partial}: continues after {store.num_layers} of {layout.shape[0]} planes")
         _set_counts(task, store.counts)
     hidden = True if progress.is_quiet else None
     with tqdm(total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=hidden) as bar:

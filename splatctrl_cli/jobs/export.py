@@ -154,7 +154,7 @@ def _splat_file(scene: Path) -> Path:
 def _format(out: Path, layout: str | None) -> SplatFormat:
     kind = format_of(out)
     if layout is not None and kind is not FORMATS[".ply"]:
-        raise UsageError(f"--layout {layout}: {out} is no PLY", remedy="leave it out")
+        raise UsageError(f"--layout {layout}: {out} is not a PLY", remedy="leave it out")
     return REFERENCE_PLY if layout == "full" else kind
 
 
@@ -181,11 +181,11 @@ def _gaussians(splats: Splats) -> GaussianSet:
 
 def _checked_differences(out: Path, held: GaussianSet, back: GaussianSet, bound: Differences) -> Differences:
     if len(held) != len(back) or not np.array_equal(held.labels, back.labels):
-        raise WriteError(f"{out}: is not its source: {len(back)} of {len(held)} splats, or other labels")
+        raise WriteError(f"{out}: differs from its source: {len(back)} of {len(held)} splats, or other labels")
     found = differences(held, back)
     beyond = found.beyond(bound)
     if beyond:
-        raise WriteError(f"{out}: is not its source: {'; '.join(beyond)}")
+        raise WriteError(f"{out}: differs from its source: {'; '.join(beyond)}")
     return found
 
 
@@ -208,7 +208,7 @@ def _not_kept(source: Splats, back: Splats, held: GaussianSet) -> list[str]:
     if isinstance(source, SplatSet) and isinstance(back, SplatSet) and (source.density != back.density).any():
         lost.append("density")
     if isinstance(source, GaussianSet) and held.harmonics.shape[1] < source.harmonics.shape[1]:
-        lost.append("colour by side")
+        lost.append("view-dependent colour")
     return lost
 
 

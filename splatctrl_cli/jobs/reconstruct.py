@@ -51,7 +51,7 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         inputs = request.source.digests()
         fitted = _begun(request, robot, declared, partial, inputs, goes_on=goes_on)
         if goes_on:
-            progress.log(f"{partial}: goes on after {fitted.num_read} time steps")
+            progress.log(f"{partial}: continues after {fitted.num_read} time steps")
         with stopwatch.stage("fit_since_resume" if goes_on else "fit"):
             fitted.run(progress)
         with stopwatch.stage("write"):
@@ -115,7 +115,7 @@ def declarations_of(path: Path | None, robot: RobotModel | None) -> Declarations
     if path is None:
         return Declarations()
     if robot is None:
-        raise UsageError(f"--declare {path}: belongs to a robot", remedy="give its --urdf as well")
+        raise UsageError(f"--declare {path}: needs the robot", remedy="give --urdf as well")
     return read_declarations(path, robot.frame_names)
 
 
@@ -123,7 +123,7 @@ def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progr
     """Whether there is a checkpoint to go on from, and that was asked for."""
     partial = partial_path(request.out)
     if request.resume and not checkpoint_file.is_file():
-        progress.log(f"{partial}: has no checkpoint to go on from; starts at the beginning")
+        progress.log(f"{partial}: has no checkpoint to continue from; starts at the beginning")
     elif checkpoint_file.is_file() and not request.resume:
         progress.log(f"warning: {partial}: an interrupted run is replaced; --resume would have continued it")
     return request.resume and checkpoint_file.is_file()
@@ -133,7 +133,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
     """The request's robot, with what a person should know of it said."""
     if request.urdf is None:
         if request.spheres is not None:
-            raise UsageError(f"--spheres {request.spheres}: belongs to a robot", remedy="give its --urdf as well")
+            raise UsageError(f"--spheres {request.spheres}: needs the robot", remedy="give --urdf as well")
         return None
     model = RobotModel.from_urdf(request.urdf, request.spheres)
     if request.source.joint_names:

@@ -75,7 +75,8 @@ def _refuse_what_needs_time(request: ReconstructRequest) -> None:
     training_cameras(request.source)
     if request.source.has_clock:
         raise UsageError(
-            f"--method 3dgs: {request.source.name} has a clock, and this method's scene stands still", remedy=ROUTES
+            f"--method 3dgs: {request.source.name} has a clock; this method takes scenes that do not change",
+            remedy=ROUTES,
         )
     for name in ("urdf", "spheres", "points", "resume"):
         if getattr(request, name):

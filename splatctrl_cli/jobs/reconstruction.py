@@ -164,7 +164,9 @@ class Reconstruction:
             if self.cloud is not None:
                 self.fitter.plant(self.cloud)
         elif not self.source.has_clock and self.fitter.num_steps == 1:
-            console.log("warning: more views than fit in one time step; the last ones are refined on, the rest seed")
+            console.log(
+                "warning: more views than fit in one time step: the last are refined on, the others only seed splats"
+            )
         self._check_cameras(step, console)
         self._keep_first_frames(step)
         posture = self._posture(step)

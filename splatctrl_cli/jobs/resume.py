@@ -58,7 +58,9 @@ def told_how_to_go_on(checkpoint: Path, kept: Path | None = None) -> Iterator[No
         if not checkpoint.is_file():
             raise
         kept = kept or checkpoint.parent.parent
-        raise KeyboardInterrupt(f"interrupted: {kept} is kept; go on with the same command and --resume") from None
+        raise KeyboardInterrupt(
+            f"interrupted: {kept} is kept; continue it with the same command and --resume"
+        ) from None
 
 
 def checkpoint_to_go_on_from(folder: Path, now: Mapping[str, Any]) -> Checkpoint:
@@ -76,8 +78,8 @@ def check_same_run(folder: Path, run: Mapping[str, Any], now: Mapping[str, Any])
         said = ", ".join(f"{n} was {_shown(before.get(n))}, is {_shown(after.get(n))}" for n in differing[:3])
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise UsageError(
-            f"{folder}: --resume: the run that was interrupted differs: {said}{more}",
-            remedy="give what it was given, or start over without --resume",
+            f"{folder}: --resume: the interrupted run differs: {said}{more}",
+            remedy="give the same options, or start over without --resume",
         )
 
 

@@ -145,7 +145,7 @@ def _checked(request: FitRequest) -> FitRequest:
     """The request with its defaults. Raises for what is better refused now than after the fits."""
     recording, holdout = request.recording, request.recording.options.holdout
     if recording.is_dtu and holdout:
-        raise UsageError("--fit: goes by a protocol", remedy=f"give --protocol holdout:{','.join(holdout)}")
+        raise UsageError("--fit: needs a protocol", remedy=f"give --protocol holdout:{','.join(holdout)}")
     if not recording.is_dtu and not is_folder_of_views(recording.path):
         raise UsageError(
             f"--fit: expected scans (--dtu) or an image folder, got {recording.path}",
@@ -205,7 +205,7 @@ def _reconstruct(
         config, seed, threads = _config(request), request.seed, request.threads
         made = run(ReconstructRequest(source=source, out=out, config=config, seed=seed, threads=threads))
     except KeyboardInterrupt:
-        raise KeyboardInterrupt from None  # it would say to go on with --resume, which scoring has not
+        raise KeyboardInterrupt from None  # its message would name --resume, which score does not have
     except SplatCtrlError as error:
         raise InputError(f"{scan}: reconstruct ended with {error.exit_code}: {error}") from error
     if made.verdict.exit_code:

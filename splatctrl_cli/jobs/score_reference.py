@@ -127,7 +127,7 @@ def cameras_to_score(
         if cameras or (allow_training and recorded):
             return cameras or recorded
         raise UsageError(
-            f"{reference.where}: each camera is called like one that trained the scene ({', '.join(recorded)})",
+            f"{reference.where}: each camera has the name of one that trained the scene ({', '.join(recorded)})",
             remedy="give the views that reconstruct left out as --holdout or --protocol, or --allow-training",
         )
     cameras = tuple(dict.fromkeys(wanted))

@@ -16,7 +16,7 @@ class DepthImage:
     """A depth image as the kernels take it.
 
     intrinsics (6,) float64: fx, fy, cx, cy, width, height; T_world_camera (4, 4) float64; depth (H, W) float32 [m];
-    depth nearer than min_range is none, depth beyond max_range is no hit.
+    depth nearer than min_range does not count, depth beyond max_range is no hit.
     """
 
     intrinsics: Float64

@@ -26,7 +26,7 @@ _KNOWN = frozenset(  # what is read by its fields
     }
 )
 _MOST_TEXT = 1 << 20  # characters of a definition
-_MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is no number
+_MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is not a number
 _MOST_STORES = 32  # of definitions that were compiled and are kept
 _ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
 
@@ -134,7 +134,7 @@ def _check_fields(store: Any) -> None:
         there = {field.lower(): _kind(description) for field, description in store.fielddefs[name][1]}
         for field, description in standard[name][1]:
             if there.get(field) != _kind(description):
-                raise ValueError(f"{name} has not the field {field} of the standard")
+                raise ValueError(f"{name} lacks the field {field} of the standard")
 
 
 @lru_cache(maxsize=1)

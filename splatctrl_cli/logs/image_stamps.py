@@ -41,7 +41,7 @@ def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.
 
 STEADY = 0.25  # largest departure from the period, in periods, of an interval that counts as steady
 GAP = 1.5  # [periods] from which on an interval is a gap
-BACK_NS = 1_000_000_000  # behind an earlier stamp, that is no mere disorder
+BACK_NS = 1_000_000_000  # so far behind an earlier stamp the clock went back
 FEWEST_BACK = 3
 FEWEST = 5  # intervals that a rate is judged by
 
@@ -90,7 +90,7 @@ def first_of_each(stamps_ns: Stamps) -> NDArray[np.int64]:
 
 
 def dropped(stamps_ns: Stamps) -> Drops:
-    """What is missing between different stamps; nothing where there are few, or most intervals are no steady rate.
+    """What is missing between different stamps; nothing where there are few, or most intervals differ.
 
     The period is the median interval, and steady within a quarter of it must be three intervals of four.
     """

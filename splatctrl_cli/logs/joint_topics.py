@@ -56,7 +56,7 @@ def without_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
 
 
 def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
-    """Write the streams of all topics into a capture; `wrote` is told each file. Returns what capture.json says."""
+    """Write the streams of all topics into a capture; `wrote` gets each file. Returns what capture.json says."""
     described, number = [], 0
     for topic in kept.topics:
         streams = []

@@ -132,7 +132,7 @@ def _plain(form: str, data: bytes) -> tuple[str, tuple[int, int], bytes, bool] |
 def _decoded(form: str, data: bytes, *, color: bool) -> NDArray[Any]:
     pixels = decode_file(data, color=color)
     if pixels is None:
-        raise UndecodableMessageError(f"compressed image ({form}): {len(data)} bytes that are no image file")
+        raise UndecodableMessageError(f"compressed image ({form}): {len(data)} bytes that are not an image file")
     return pixels
 
 
@@ -212,7 +212,7 @@ def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes
     pixels = _decoded(form, data, color=False)
     recorded = form.partition(";")[0].strip()
     if pixels.ndim == 2 and recorded in _MOSAICS and pixels.dtype == (np.uint8 if recorded in BAYER else np.uint16):
-        return pixels, recorded, None  # a mosaic in a file: its bytes are no colour image
+        return pixels, recorded, None  # a mosaic in a file: its bytes are not a colour image
     if pixels.ndim == 2 and pixels.dtype == np.uint16:
         return pixels, "16UC1", data
     if pixels.ndim == 2 and pixels.dtype == np.float32:  # TIFF, as compressed_image_transport stores 32FC1

@@ -108,8 +108,8 @@ def _odometries(log: RawLog, survey: Survey, options: SourceOptions, frames: set
             found[topic.topic.name] = first.child
         elif first.child in known and any(survey.tf.root_of(frame) == first.child for frame in frames & known):
             survey.tf.note(
-                f"{topic.topic.name} says where {first.child!r} is in {first.parent!r}, and is not used;"
-                f" --world-frame {first.parent} takes it"
+                f"{topic.topic.name} says where {first.child!r} is in {first.parent!r}; to use it give"
+                f" --world-frame {first.parent}"
             )
     for child in sorted(set(found.values())):
         topics = sorted(name for name, posed in found.items() if posed == child)

@@ -81,7 +81,7 @@ class Undistortion:
         is_seen &= _radii(intrinsics) < _largest_radius(model, coefficients)
         if is_seen.mean() < LEAST_SEEN:
             raise InputError(
-                f"distortion {model} {np.round(coefficients, 6).tolist()}: the lens saw {is_seen.mean():.0%} of the"
+                f"distortion {model} {np.round(coefficients, 6).tolist()}: the camera saw {is_seen.mean():.0%} of the"
                 f" pinhole's image, expected at least {LEAST_SEEN:.0%}",
                 remedy="correct the calibration, or undistort the images first",
             )

@@ -66,7 +66,7 @@ def build_cameras(log: RawLog, survey: Survey, options: SourceOptions) -> tuple[
     worlds = {camera.world_frame for camera in cameras if camera.fixed_pose is None}
     if len(worlds) > 1:
         raise InputError(
-            f"{log.path}: the cameras hang in separate tf trees, with roots {', '.join(sorted(worlds))}",
+            f"{log.path}: the cameras are in separate tf trees, with roots {', '.join(sorted(worlds))}",
             remedy="record the transform that joins them, or choose with --cameras",
         )
     return cameras

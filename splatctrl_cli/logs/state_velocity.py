@@ -86,7 +86,8 @@ class _Sums:
 def _numbers(seconds: Float64, period: float) -> Float64:
     """The number (T,) of each state since the first, lost ones counted.
 
-    A clock that ticks with the period follows the stamps slowly, so that jitter of almost half a period is no loss.
+    A clock that ticks with the period follows the stamps slowly, so that jitter of almost half a period
+    is not taken for a loss.
     """
     numbers = np.zeros(len(seconds))
     clock, number = 0.0, 0

@@ -110,7 +110,7 @@ class TfTree:
 
         The first parent of a frame stays its parent, what would close a loop is left out, the last of different
         static transforms holds; all of this is noted.
-        Raises ValueError for a rotation or position that is none (a zero quaternion, NaN).
+        Raises ValueError for a rotation or position that is not one (a zero quaternion, NaN).
         """
         parent, child = parent.strip("/"), child.strip("/")
         norm = float(np.linalg.norm(quat_xyzw))

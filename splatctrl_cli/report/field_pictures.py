@@ -189,7 +189,7 @@ def _veil(axes: Any, cut: Cut, grid: DistanceGrid) -> None:
 
 
 def _knows_seen(grid: DistanceGrid) -> bool:
-    """Whether somebody looked: without an occupancy grid every cell is never seen, which is no news."""
+    """Whether somebody looked: without an occupancy grid every cell is never seen, which tells nothing."""
     return "observed" in grid.channels and "no occupancy" not in str(grid.header.get("observed"))
 
 

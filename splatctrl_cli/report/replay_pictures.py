@@ -18,7 +18,7 @@ from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_
 Intervals = Sequence[tuple[float, float]]
 """First and last time [s] of each interval."""
 
-SMALLEST = 0.01  # [rad/s] half the height of a velocity's axis, at least: rounding is no difference
+SMALLEST = 0.01  # [rad/s] half the height of a velocity's axis, at least: rounding shows no difference
 STRIP = 0.28  # inches of height for each kind of event
 THIN = 0.05  # of a curve's range: a band is a line with something around it
 QUIET = "#9a9a9a"
@@ -329,7 +329,7 @@ class Envelope:
 
 def envelope(seconds: Float64, values: Float64, columns: int = COLUMNS) -> Envelope:
     """The range of values (T,) in each of `columns` equal parts of the time (T,); the values themselves where there
-    are no more than two states to a column. A column without a state is left out, as a gap.
+    are at most two states to a column. A column without a state is left out, as a gap.
     """
     values = np.asarray(values, dtype=np.float64)
     if len(values) <= 2 * columns:

@@ -111,7 +111,7 @@ def read_declarations(path: Path, links: Collection[str] | None = None) -> Decla
     """The declarations of a TOML file; `links`: of the robot, None where it is not known.
 
     Raises InputError for a file that cannot be read, unknown tables or keys, a link the robot does not have, a box
-    that is none, or a time that ends before it starts.
+    that is unknown, or a time that ends before it starts.
     """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -160,7 +160,7 @@ def _parse(path: Path) -> tuple[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give the robot's URDF file") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: expected a URDF, got bytes that are no text") from None
+        raise InputError(f"{path}: expected a URDF, got bytes that are not text") from None
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:  # ValueError: what defusedxml forbids

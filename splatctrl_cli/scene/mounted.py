@@ -56,7 +56,8 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
 def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tuple[float, float, float]:
     """Median colour in [0, 1] of the counted pixels (H, W) with no depth near them; black where they are too few.
 
-    What is too far, too dark or too bright for the sensor has no depth in a whole area; a hole in a surface has not.
+    What is too far, too dark or too bright for the sensor has no depth in a whole area; a hole in a surface has depth
+    around it.
     """
     parts = []
     for frame, mask in zip(frames, counted, strict=True):
@@ -71,7 +72,7 @@ def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tu
 
 
 def _entering(mask: Bool) -> Bool:
-    """The connected parts of a mask (H, W) that touch the image's border and are no specks."""
+    """The connected parts of a mask (H, W) that touch the image's border, without specks."""
     parts, _ = label(mask)
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     area = np.bincount(parts.ravel())

@@ -24,7 +24,7 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
 
     From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
     holes up to `NARROW` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none; a gap
-    beside the robot may show what is far behind it, and is no hole.
+    beside the robot may show what is far behind it, and is not a hole.
     """
     blank = _holes(frame, robot_depth)
     if not blank.any():

@@ -139,7 +139,7 @@ class SceneFolder:
 
     @property
     def has_digests(self) -> bool:
-        """False for a scene of an older version, whose files cannot be told from others."""
+        """False for a scene of an older version, whose files cannot be checked."""
         return self.parts.digests is not None
 
     @property

@@ -169,7 +169,7 @@ def _known_space(path: Path, *, has_run: bool) -> dict[str, object]:
 def _probability(value: Any) -> float:
     number = float(value)
     if not 0.0 < number < 1.0:
-        raise ValueError(f"{number}, no probability between 0 and 1")
+        raise ValueError(f"{number}, expected a probability between 0 and 1")
     return number
 
 

@@ -37,16 +37,16 @@ def open_source(path: Path, options: SourceOptions | None = None) -> FrameSource
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
     """The records of one input, or of several logs that were recorded at the same time.
 
-    Raises InputError as `open_source`, and where one of several is no log.
+    Raises InputError as `open_source`, and where one of several is not a log.
     """
     log = open_logs(paths)
     return open_source(paths[0], options) if log is None else RosLogSource(log, options or SourceOptions())
 
 
 def open_logs(paths: Sequence[Path]) -> RawLog | None:
-    """A log, or several of one session as one; None where there is one path, and it is no log.
+    """A log, or several of one session as one; None for a single path that is not a log.
 
-    Raises InputError where there is nothing, and where one of several is no log.
+    Raises InputError where there is nothing, and where one of several is not a log.
     """
     for path in paths:
         if not path.exists():

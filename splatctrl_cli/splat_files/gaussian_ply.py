@@ -3,7 +3,7 @@
 Layout: ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``, all float. ``scale_*`` is log(sigma),
 ``rot_*`` a quaternion w x y z, ``opacity`` a logit; ``f_dc_*`` and ``f_rest_*`` are the harmonics' coefficients of
 red, green and blue: f_rest has all of red first, then green, then blue. A ``label`` (uchar) follows only where some
-Gaussian is no object, so that readers of a fixed stride can read every other file.
+Gaussian is not an object, so that readers of a fixed stride can read every other file.
 """
 
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ def read_gaussian_ply(path: Path) -> tuple[GaussianSet, dict[str, str]]:
 
     Harmonics have the degree of ``f_rest_*`` (0, 9, 24 or 45 of them), less degrees that are zero throughout.
     Quaternions are scaled to length one; a missing label is 0 (object); other properties are ignored.
-    Raises InputError for a file that is not whole, lacks a property or holds a value that is no Gaussian's.
+    Raises InputError for a file that is not whole, lacks a property or holds a value that no Gaussian can have.
     """
     ply = read_table(path, "vertex", REQUIRED)
     return gaussians_of(ply), ply.pairs()
@@ -96,7 +96,7 @@ def gaussians_of(ply: PlyFile) -> GaussianSet:
 
 
 def labels_of(ply: PlyFile) -> UInt8:
-    """(N,) labels; all 0 (object) where the file has none. Raises InputError for what is no byte."""
+    """(N,) labels; all 0 (object) where the file has none. Raises InputError for other values."""
     if "label" not in ply:
         return np.zeros(len(ply), dtype=np.uint8)
     values = ply.column("label")

@@ -150,8 +150,8 @@ class Accessors:
 def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`; `comments` go in the asset's extras. Same input, same bytes.
 
-    Labels are the attribute ``_LABEL``, where some Gaussian is no object.
-    Raises InputError for a value that is no Gaussian's, naming its index.
+    Labels are the attribute ``_LABEL``, where some Gaussian is not an object.
+    Raises InputError for a value that no Gaussian can have, naming its index.
     """
     check_gaussians("Gaussians to write", gaussians)
     writer = GlbWriter()
@@ -179,7 +179,7 @@ def write_glb(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -
 def read_gltf(path: Path) -> tuple[GaussianSet, dict[str, str]]:
     """The Gaussians of a ``.glb`` file in the axes of their own mesh (a node's transform is not applied), and extras.
 
-    Raises InputError for a file that is not whole, has not exactly one primitive of Gaussians, or packs them.
+    Raises InputError for a file that is not whole, does not have exactly one primitive of Gaussians, or packs them.
     """
     document, binary = read_glb(path)
     primitive = _primitive(path, document)

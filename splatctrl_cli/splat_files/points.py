@@ -41,7 +41,7 @@ def _columns(path: Path, names: tuple[str, ...], what: str) -> Float64:
 
 
 def is_mesh(path: Path) -> bool:
-    """Whether a file holds faces: any that is no PLY, and a PLY whose header counts some."""
+    """Whether a file holds faces: any that is not a PLY, and a PLY whose header counts some."""
     if path.suffix.lower() != ".ply":
         return True
     try:

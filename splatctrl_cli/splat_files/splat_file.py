@@ -29,7 +29,7 @@ def write_splat(path: Path, gaussians: GaussianSet, comments: Mapping[str, str])
     """Write `gaussians`, what of them the format can hold; `comments` are left out. Same input, same bytes.
 
     Of the two quaternions of a rotation the one whose largest component is negative: -1 has a byte, +1 has none.
-    Raises InputError for a value that is no Gaussian's, naming its index.
+    Raises InputError for a value that no Gaussian can have, naming its index.
     """
     check_gaussians("Gaussians to write", gaussians)
     rows = np.zeros(len(gaussians), dtype=ROW)

@@ -57,7 +57,7 @@ def refuse(where: str, name: str, values: NDArray[Any], is_bad: Bool, expected: 
 
 
 def check_finite(where: str, num: int, groups: Mapping[str, NDArray[Any]]) -> None:
-    """Raise InputError at the first value that is not finite, or an array that has not `num` rows."""
+    """Raise InputError at the first value that is not finite, or an array without `num` rows."""
     for name, values in groups.items():
         if len(values) != num:
             raise InputError(f"{where}: {name}: expected {num} values, got {len(values)}")

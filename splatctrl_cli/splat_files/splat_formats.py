@@ -49,7 +49,7 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
 
 
 def describe_splats(path: Path, _head: bytes) -> Summary:
-    """Number, shape, box and ranges of the splats of a file. Raises InputError for one that is none."""
+    """Number, shape, box and ranges of the splats of a file. Raises InputError for a file of another kind."""
     found, comments = read_splats(path)
     gaussians = as_gaussians(found) if isinstance(found, SplatSet) else found
     facts: dict[str, object] = {

@@ -60,7 +60,7 @@ def as_splats(gaussians: GaussianSet, where: str) -> SplatSet:
     if num_stretched or num_coloured:
         raise InputError(
             f"{where}: expected isotropic splats, got {num_stretched} of {len(gaussians)} whose scales differ and "
-            f"{num_coloured} whose colour depends on the side",
+            f"{num_coloured} whose colour depends on the view",
             remedy="'splatctrl export --isotropic' writes the nearest isotropic set",
         )
     return _round_splats(gaussians, gaussians.scales[:, 0])

@@ -34,7 +34,7 @@ SQRT_HALF = float(np.sqrt(0.5))  # no component but the largest exceeds it
 def write_spz(path: Path, gaussians: GaussianSet, comments: Mapping[str, str]) -> None:
     """Write `gaussians`, what of them the format can hold; `comments` are left out. Same input, same bytes.
 
-    Raises InputError for a value that is no Gaussian's, naming its index.
+    Raises InputError for a value that no Gaussian can have, naming its index.
     """
     check_gaussians("Gaussians to write", gaussians)
     held, bits = held_by_spz(gaussians), _fraction_bits(gaussians.centers)
@@ -123,7 +123,7 @@ def _columns(path: Path, content: bytes) -> _Columns:
     if degree > 3 or bits > 23:
         raise InputError(f"{path}: expected degree 0 to 3 and 0 to 23 fraction bits, got {degree} and {bits}")
     if flags & HAS_EXTENSIONS:
-        raise InputError(f"{path}: has extensions of some vendor, expected none", remedy="write it without them")
+        raise InputError(f"{path}: has vendor extensions, expected none", remedy="write it without them")
     widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
     expected = HEADER.size + num * sum(widths)
     if len(content) != expected:

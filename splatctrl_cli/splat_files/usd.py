@@ -29,8 +29,8 @@ NAME = "field"  # of the file while the library has it: it goes by the suffix
 def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *, suffix: str) -> None:
     """Write `gaussians` as `suffix`, ``.usda`` (text) or ``.usdc`` (binary); `comments` become custom data.
 
-    Labels are the primvar ``label``, where some Gaussian is no object.
-    Raises InputError for a value that is no Gaussian's, naming its index; UsageError where the library is missing.
+    Labels are the primvar ``label``, where some Gaussian is not an object.
+    Raises InputError for a value that no Gaussian can have, naming its index; UsageError without the library.
     """
     check_gaussians("Gaussians to write", gaussians)
     usd, geometry, volume, arrays = _library()
@@ -65,8 +65,8 @@ def write_usd(path: Path, gaussians: GaussianSet, comments: Mapping[str, str], *
 def read_usd(path: Path, *, suffix: str) -> tuple[GaussianSet, dict[str, str]]:
     """The Gaussians of a USD file's one particle field, in its own axes (transforms are not applied), and its data.
 
-    Raises InputError for a file that cannot be opened or has not exactly one such field; UsageError where the library
-    is missing.
+    Raises InputError for a file that cannot be opened or does not have exactly one such field; UsageError without
+    the library.
     """
     usd, geometry, _, _ = _library()
     if not path.is_file():

@@ -47,7 +47,7 @@ def test_an_interrupted_ingest_goes_on_to_the_same_bytes(
     assert main(["ingest", str(log), "-o", str(tmp_path / "whole"), "-q"]) == 0
     out = tmp_path / "x.capture"
     partial = interrupted(log, out, monkeypatch, after)
-    assert "is kept; go on with the same command and --resume" in capsys.readouterr().err
+    assert "is kept; continue it with the same command and --resume" in capsys.readouterr().err
     images = sorted(partial.rglob("*.jpg"))
     assert len(images) == after
     written = images[0].stat().st_mtime_ns
@@ -109,7 +109,9 @@ def test_a_frame_is_read_by_its_number(tmp_path: Path) -> None:
 def test_what_an_interrupted_ingest_left_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = make_log(tmp_path / "log.mcap")
     partial = interrupted(log, tmp_path / "x.capture", monkeypatch, 2)
-    with pytest.raises(InputError, match="an ingest that was interrupted; go on with its command and --resume"):
+    with pytest.raises(
+        InputError, match="an ingest that was interrupted; continue it with the same command and --resume"
+    ):
         open_source(partial)
     with pytest.raises(InputError, match="an ingest that was interrupted"):
         describe(partial)

@@ -258,7 +258,7 @@ def test_a_name_that_is_no_text_is_described_and_not_written_down(
     log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=1)).rename(tmp_path / os.fsdecode(b"a\xff\nb.mcap"))
     assert main(["info", str(log), "--json"]) == 0
     assert main(["ingest", str(log), "-o", str(tmp_path / "x.capture")]) == 4
-    assert "is no UTF-8 text; give the file another name" in capsys.readouterr().err.splitlines()[-1]
+    assert "is not UTF-8 text; give the file another name" in capsys.readouterr().err.splitlines()[-1]
     assert list(tmp_path.iterdir()) == [log]
 
 

@@ -236,7 +236,7 @@ def test_open_loop_says_how_the_command_misses_a_twist(desk: Desk) -> None:
 @pytest.mark.parametrize(
     ("options", "frame", "code", "said"),
     [
-        (["--twist-topic", "/cmd"], "link0", 2, "an audit asks nobody"),
+        (["--twist-topic", "/cmd"], "link0", 2, "an audit does not ask the controller"),
         (["--twist-frame", "link0"], "link0", 2, "expected --twist-topic"),
         (["--twist-topic", "/cmd", "--mode", "open-loop"], "odom", 4, "got frame 'odom'; give --twist-frame"),
         (["--twist-topic", "/no", "--mode", "open-loop"], "link0", 4, "topics with twists: /cmd"),

@@ -226,7 +226,7 @@ print(int(peak.split()[1]) // 1024, damage.notes[0])
         ("bomb", f"announces {4 * GIB} bytes unpacked, at most {MAX_BLOCK} are read"),
         ("liar", "holds more"),
         ("window", "cannot be decompressed"),
-        ("many", "holds bytes that are no record"),
+        ("many", "holds bytes that are not a record"),
         ("flood", "unpacks to over 1000 times"),
     ],
 )

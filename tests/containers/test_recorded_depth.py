@@ -106,7 +106,7 @@ def test_a_file_that_cannot_be_kept_costs_its_frame(tmp_path: Path, wrong: str, 
     source = open_source(tmp_path / "png.mcap")
     frames = [item for item in (source.stored() if lazily else source.records()) if not isinstance(item, JointState)]
     assert len(frames) == 4 and source.loss.damaged == 1
-    words = "expected an image of 32x24, got 5x5" if wrong == "of another size" else "no image file"
+    words = "expected an image of 32x24, got 5x5" if wrong == "of another size" else "not an image file"
     assert words in source.loss.notes[-1]
 
 
@@ -118,7 +118,7 @@ def test_a_frame_that_was_left_undecoded_is_refused_where_it_does_not_decode(tmp
     with_png_depth(tmp_path / "raw.mcap", tmp_path / "png.mcap", change={2: b"\x89PNG\r\n\x1a\n" + b"".join(chunks)})
     source = open_source(tmp_path / "png.mcap")
     frames = [item for item in source.stored() if not isinstance(item, JointState)]
-    with pytest.raises(InputError, match=r"/cam0/depth/image_raw#2: compressed image .* no image file; copy"):
+    with pytest.raises(InputError, match=r"/cam0/depth/image_raw#2: compressed image .* not an image file; copy"):
         _ = frames[2].frame
     assert sum(isinstance(item, RgbdFrame) for item in source.records()) == 4  # and counted where it is decoded
     assert source.loss.damaged == 1

@@ -43,7 +43,7 @@ def test_an_interrupted_bake_goes_on_where_the_last_whole_slab_ended(tmp_path: P
         stream.write(b"\x01" * 40)
     slabs = resume_slabs(folder, PLAN)
     assert (slabs.num_layers, slabs.is_whole()) == (2, False)
-    with pytest.raises(InputError, match="expected 5 layers, got 2; go on with the bake"):
+    with pytest.raises(InputError, match="expected 5 layers, got 2; continue the bake"):
         slabs.grid({})
     fill(slabs, grid, until=SHAPE[0], step=3)
     for name in CHANNELS:

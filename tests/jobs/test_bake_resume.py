@@ -99,7 +99,7 @@ def test_an_interrupted_bake_says_how_to_go_on_and_does(
     splats: Path, whole: dict[str, Any], tmp_path: Path, after: int
 ) -> None:
     said = interrupted(splats, tmp_path / "field", after)
-    assert "field.partial is kept; go on with the same command and --resume" in said
+    assert "field.partial is kept; continue it with the same command and --resume" in said
     bake(splats, tmp_path / "field", resume=True, threads=1)
     assert contents(tmp_path / "field") == whole
 
@@ -144,7 +144,7 @@ bake(Path(sys.argv[1]), Path(sys.argv[2]), resume=True, threads=int(sys.argv[3])
     progress = json.loads((tmp_path / "field.partial" / "channels" / "progress.json").read_text())
     assert progress["num_layers"] == 32, "two slabs of each of both runs"
     bake(splats, out, resume=True, progress=said)
-    assert "goes on after 32 of" in said.lines[-1]
+    assert "continues after 32 of" in said.lines[-1]
     assert contents(out) == whole
 
 

@@ -84,7 +84,7 @@ def test_a_file_that_renders_differently_is_not_left_behind(scene: Path, monkeyp
         write_ply(path, replace(splats, colors=splats.colors * np.float32(0.999)), comments)
 
     monkeypatch.setattr(job, "write_ply", write_darker)
-    with pytest.raises(WriteError, match=r"out.ply: is not its source: color 0.000"):
+    with pytest.raises(WriteError, match=r"out.ply: differs from its source: color 0.000"):
         export(scene, "out.ply")
     assert not list(scene.parent.glob("out.ply*"))
 
@@ -152,7 +152,7 @@ def test_isotropic_splats_go_to_every_format_and_from_there_back_to_ply(scene: P
 def test_anisotropic_gaussians_go_to_every_format(gaussians: Path, suffix: str) -> None:
     result = export(gaussians, f"out{suffix}")
     assert result.covered_share > 0.1
-    assert result.not_kept == (("colour by side",) if suffix == ".splat" else ())
+    assert result.not_kept == (("view-dependent colour",) if suffix == ".splat" else ())
     if suffix in ROUNDED:
         assert result.psnr is not None and 25 < result.psnr < 60
     else:

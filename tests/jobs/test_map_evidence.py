@@ -321,7 +321,10 @@ def test_an_evidence_camera_is_left_out_of_the_training_or_refused(
     log = ["replay", str(recording / "log.mcap"), "--urdf", str(recording / "robot.urdf"), "--lockstep", "-q"]
     log += ["--spheres", str(recording / "robot_spheres.yaml"), "-o", str(tmp_path / "out"), "--evidence", "cam1"]
     assert main([*log, "--cameras", "cam0,cam1"]) == 2
-    assert "--evidence cam1: --cameras has it train the map; leave it out of --cameras" in capsys.readouterr().err
+    assert (
+        "--evidence cam1: --cameras names it as a training camera; leave it out of --cameras"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "out").exists()
 
 

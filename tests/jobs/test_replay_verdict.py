@@ -239,7 +239,7 @@ def test_a_field_that_does_not_say_of_what_time_it_is_is_no_evidence(stage: Stag
     stage.desk.source.states = stage.states
     code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR))))
     assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
-    assert "does not say of what time it is" in verdict["sentence"]
+    assert "does not say what time it shows" in verdict["sentence"]
 
 
 def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:

@@ -164,7 +164,7 @@ def test_views_of_which_no_training_camera_saw_a_pixel_cannot_be_scored(
 def test_a_recording_of_training_cameras_alone_is_refused(scored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     set_up(monkeypatch, FakeScene(cameras=("cam0", "cam3")), FakeSource(frames=FRAMES))
     with pytest.raises(
-        UsageError, match=r"each camera is called like one that trained the scene \(cam0, cam3\); giv"
+        UsageError, match=r"each camera has the name of one that trained the scene \(cam0, cam3\); giv"
     ):
         run(scored)
 
@@ -185,7 +185,7 @@ def test_a_dtu_scan_is_scored_on_the_views_held_out(scored: Path, monkeypatch: p
     assert view["seen_share"] > 0.8
     whole = RecordingRequest(path=scored / "dtu", is_dtu=True)
     with pytest.raises(
-        UsageError, match=r"each camera is called like one that trained the scene \(camera\); give the"
+        UsageError, match=r"each camera has the name of one that trained the scene \(camera\); give the"
     ):
         score(ScoreRequest(scene=scored / "scene", recording=whole))
 

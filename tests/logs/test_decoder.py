@@ -46,7 +46,7 @@ def test_a_definition_that_cannot_be_used_is_refused(name: str) -> None:
 def test_a_known_name_with_other_fields_is_refused() -> None:
     text = T_TEXT.replace("Time stamp", "Time sent")
     assert text != T_TEXT
-    with pytest.raises(UndecodableMessageError, match="std_msgs/msg/Header has not the field stamp of the standard"):
+    with pytest.raises(UndecodableMessageError, match="std_msgs/msg/Header lacks the field stamp of the standard"):
         MessageDecoder().decode(message(text, type_name="sensor_msgs/msg/JointState"))
     content = bytes(STORE.serialize_cdr(joint_state(), "sensor_msgs/msg/JointState"))
     good = MessageDecoder().decode(message(T_TEXT, content, "sensor_msgs/msg/JointState"))

@@ -107,7 +107,7 @@ def test_an_unknown_encoding_is_neither_color_nor_depth() -> None:
 
 def test_bytes_that_are_no_image_are_refused() -> None:
     broken = SimpleNamespace(header=header(5, "o"), format="jpeg", data=np.zeros(40, np.uint8))
-    with pytest.raises(UndecodableMessageError, match="no image file"):
+    with pytest.raises(UndecodableMessageError, match="not an image file"):
         read_image(broken, COMPRESSED_IMAGE)
 
 
@@ -115,7 +115,7 @@ def test_bytes_that_are_no_image_are_refused() -> None:
 def test_a_cut_image_is_refused_not_filled_with_grey(suffix: str) -> None:
     data = cv2.imencode(f".{suffix}", np.zeros((64, 64, 3), np.uint8) + RGB[0, 0])[1].ravel()
     cut = SimpleNamespace(header=header(5, "o"), format=suffix, data=data[: len(data) * 3 // 4])
-    with pytest.raises(UndecodableMessageError, match="no image file"):
+    with pytest.raises(UndecodableMessageError, match="not an image file"):
         read_image(cut, COMPRESSED_IMAGE)
 
 
@@ -209,7 +209,7 @@ def test_webp_is_read_and_a_cut_one_refused() -> None:
     whole = SimpleNamespace(header=header(5, "o"), format="webp", data=data)
     assert np.array_equal(color_of(read_image(whole, COMPRESSED_IMAGE)), RGB)
     whole.data = data[:-4]
-    with pytest.raises(UndecodableMessageError, match="no image file"):
+    with pytest.raises(UndecodableMessageError, match="not an image file"):
         read_image(whole, COMPRESSED_IMAGE)
 
 

@@ -102,7 +102,7 @@ def test_an_odometry_of_the_base_is_taken_where_its_world_is_asked_for(tmp_path:
     path = with_poses(tmp_path, ("/odom", ODOMETRY, "odom", "base"), static=("base", OPTICAL))
     still = open_source(path)
     assert positions(path) == pytest.approx(np.tile(ABOVE, (5, 1)))  # in the base, as tf says
-    assert still.loss.notes == ["/odom says where 'base' is in 'odom', and is not used; --world-frame odom takes it"]
+    assert still.loss.notes == ["/odom says where 'base' is in 'odom'; to use it give --world-frame odom"]
     moved = positions(path, SourceOptions(world_frame="odom"))
     assert moved == pytest.approx(RAIL + ABOVE)
 

@@ -116,7 +116,7 @@ def test_where_a_polynomial_turns_back_nothing_is_shown_twice(
 
 
 def test_a_lens_that_saw_hardly_anything_is_refused() -> None:
-    with pytest.raises(InputError, match=r"the lens saw 0% of the pinhole's image, expected at least 25%"):
+    with pytest.raises(InputError, match=r"the camera saw 0% of the pinhole's image, expected at least 25%"):
         Undistortion(SMALL, "plumb_bob", np.array([-500.0, 0, 0, 0, 0]))
 
 

@@ -148,7 +148,7 @@ def test_the_nearest_isotropic_set_keeps_volume_mean_colour_and_opacity() -> Non
     assert splats.radii[0] == pytest.approx(0.02, rel=1e-6)
     np.testing.assert_allclose(splats.colors, 0.5 + 0.28209479 * gaussians.harmonics[:, 0], rtol=1e-6)
     assert splats.opacities[0] == np.float32(0.3)
-    with pytest.raises(InputError, match="got 1 of 1 whose scales differ and 1 whose colour depends on the side; "):
+    with pytest.raises(InputError, match="got 1 of 1 whose scales differ and 1 whose colour depends on the view; "):
         as_splats(gaussians, "a.ply")
 
 

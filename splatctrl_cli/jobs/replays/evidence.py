@@ -102,7 +102,7 @@ def check_evidence(request: ReplayRequest) -> None:
         raise UsageError(f"{asked}: a baked field does not say which cameras made it", remedy="give --scene")
     if request.lockstep:
         if every is None and request.evidence in (request.options.cameras or ()):
-            raise UsageError(f"{asked}: --cameras has it train the map", remedy="leave it out of --cameras")
+            raise UsageError(f"{asked}: --cameras names it as a training camera", remedy="leave it out of --cameras")
         return
     assert request.scene is not None
     scene = open_scene(request.scene)

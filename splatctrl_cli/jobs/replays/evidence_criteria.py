@@ -89,19 +89,19 @@ def _unanswered(judged: Judged) -> Iterator[Reason]:
         time_s=seconds_at(judged, worst),
         place=tuple(judged.replay.near["place"][worst].tolist()),
         cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["place"][worst]),
-        remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth from it",
+        remedy="a dark, shiny or clear thing may stand there: add a camera that gets depth there",
         count=int(np.isfinite(distance).sum()),
     )
 
 
 def evidence_age(judged: Judged) -> Iterator[Reason]:
     """The depth about the arm is at most `--max-map-age` old, and none is newer than the state that it judges.
-    Frames without depth renew nothing; a baked field does not say when it was seen (a note).
+    Frames without depth do not count; a baked field does not say when it was seen (a note).
     """
     ahead = nearby(judged, "ahead")
     if ahead is not None and ahead[0] > AHEAD:
         yield lacking(
-            sentence=f"depth from about the arm was returned {ahead[0]:.2f} s after the state that it judges",
+            sentence=f"the newest depth near the arm is {ahead[0]:.2f} s later than the state that it judges",
             value=-ahead[0],
             threshold=-AHEAD,
             unit="s",
@@ -112,13 +112,13 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     near = nearby(judged, "age")
     if near is not None and near[0] > judged.request.max_map_age:
         yield lacking(
-            sentence=f"the cameras last returned depth from about the arm {near[0]:.2f} s before, allowed "
+            sentence=f"the newest depth near the arm is {near[0]:.2f} s old, allowed "
             f"{judged.request.max_map_age:g} s",
             value=near[0],
             threshold=judged.request.max_map_age,
             unit="s",
             time_s=near[1],
-            remedy="frames without depth renew nothing: check the cameras ('splatctrl check')",
+            remedy="frames without depth do not count: check the cameras ('splatctrl check')",
             count=near[2],
         )
     elif near is not None:
@@ -133,7 +133,7 @@ def map_age(judged: Judged) -> Iterator[Reason]:
     if not len(known):
         if judged.request.field is not None and judged.inputs.source.has_clock:
             yield lacking(
-                sentence="the field does not say of what time it is",
+                sentence="the field does not say what time it shows",
                 remedy="give --scene, or bake a reconstruction instead of bare splats",
                 count=judged.num_states,
             )
@@ -224,7 +224,7 @@ def _lead_in(judged: Judged) -> Iterator[Reason]:
 def map_error(judged: Judged) -> Iterator[Reason]:
     """With `--evidence`: the surface clearance less the bound on the map's error is at least 0.
 
-    A smaller clearance is no contact that was seen, but one that the map cannot exclude: not
+    With a smaller clearance no contact was seen, but the map cannot exclude one: not
     evaluable, unless another measure fails. So is evidence that is too little for a bound.
     """
     found, surface = judged.replay.map_error, least_of(judged.replay.between["surface"])
@@ -248,8 +248,8 @@ def map_error(judged: Judged) -> Iterator[Reason]:
         yield held(bound_words(found.bound), surface - value, 0.0, "m", found.num_points)
         return
     yield lacking(
-        sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), and keeps {mm(surface)}; "
-        "it missed so much",
+        sentence=f"the map may miss surface by {mm(value)} ({bound_words(found.bound)}), but the motion keeps only "
+        f"{mm(surface)}; it missed most",
         value=surface - value,
         threshold=0.0,
         unit="m",

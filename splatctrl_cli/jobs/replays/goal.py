@@ -137,7 +137,9 @@ def checked_pose(values: Sequence[float]) -> tuple[float, ...]:
 def check_twists(request: ReplayRequest) -> None:
     """Raise UsageError for twists where no controller runs, or a frame without them."""
     if request.twist_topic is not None and request.mode == "audit":
-        raise UsageError("--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit asks nobody")
+        raise UsageError(
+            "--twist-topic: expected --mode open-loop or closed-loop", remedy="an audit does not ask the controller"
+        )
     if request.twist_frame is not None and request.twist_topic is None:
         raise UsageError("--twist-frame: expected --twist-topic", remedy="leave it out")
 

@@ -33,7 +33,7 @@ def read_golden(request: ReplayRequest) -> Golden | None:
     if request.golden is None:
         return None
     if request.mode == "audit":
-        raise UsageError("--golden: an audit commands nothing", remedy="give --mode open-loop or closed-loop")
+        raise UsageError("--golden: an audit has no commands", remedy="give --mode open-loop or closed-loop")
     path: Path = request.golden
     file = path / "steps.csv" if path.is_dir() else path.with_name("steps.csv") if path.suffix == ".json" else path
     try:

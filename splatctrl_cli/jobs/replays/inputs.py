@@ -153,7 +153,7 @@ class LoggedStates:
         }
 
     def metrics(self) -> dict[str, float | None]:
-        """`LOG_FIGURES`: None where the log has no poses, or the offset cannot be told."""
+        """`LOG_FIGURES`: None where the log has no poses, or the offset is not known."""
         poses, clock = self.poses, self.clock
         values = (
             0 if poses is None else poses.num_poses,

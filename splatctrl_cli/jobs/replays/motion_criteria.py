@@ -304,8 +304,8 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
         return
     if surface < judged.threshold:
         yield lacking(
-            sentence=f"the spheres keep {mm(spheres)}, the surface {mm(surface)} for certain: they leave up to "
-            f"{mm(float(np.nanmax(deficit)))} of it uncovered",
+            sentence=f"the spheres keep {mm(spheres)}, but the surface may keep only {mm(surface)}: up to "
+            f"{mm(float(np.nanmax(deficit)))} of it lies outside them",
             value=surface,
             threshold=judged.replay.margin,
             unit="m",

@@ -1,4 +1,4 @@
-"""``--baseline``: what else stands beside the closed loop, and the distances to people of a monitored standstill."""
+"""``--baseline``: the methods beside the closed loop, and the distances to people of a monitored standstill."""
 
 import fnmatch
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ def read_baselines(request: ReplayRequest) -> tuple[str, ...]:
     """The baselines, each once. Raises UsageError for another mode, or where one does not go with the goal."""
     names = tuple(dict.fromkeys(request.baseline))
     if names and request.mode != "closed-loop":
-        raise UsageError("--baseline: expected --mode closed-loop to stand beside", remedy="give it")
+        raise UsageError("--baseline: expected --mode closed-loop to compare with", remedy="give it")
     check_comparable(request, names)
     return names
 
@@ -47,7 +47,7 @@ def read_baselines(request: ReplayRequest) -> tuple[str, ...]:
 def read_zone(request: ReplayRequest) -> StopZone | None:
     """The zone of --zone or --zone-box, None without a standstill.
 
-    Raises UsageError as `read_baselines`, or for a zone that is none.
+    Raises UsageError as `read_baselines`, or for values that do not make a zone.
     """
     if STANDSTILL not in read_baselines(request):
         return None
