@@ -10,9 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.containers.bag1_log import Bag1Log
 from splatctrl_cli.containers.bag_file import BagFile
-from splatctrl_cli.containers.bag_log import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage, RawMessage
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.unpacking import MAX_BLOCK
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
@@ -67,26 +65,6 @@ def test_a_real_bag_gives_what_rosbags_gives(real_data: Path) -> None:
         found, damage = read(bag)
         assert sorted(plain(found)) == sorted(by_rosbags(bag))
         assert damage.notes == []
-
-
-@pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_every_cut_gives_a_beginning_and_says_so(
-    tmp_path: Path, compression: Bag1Writer.CompressionFormat | None
-) -> None:
-    whole = make_bag(tmp_path / "x.bag", compression, num=12)
-    expected = plain(read(whole)[0])
-    data, most = whole.read_bytes(), 0
-    for length in range(13, len(data), 37):
-        (tmp_path / "cut.bag").write_bytes(data[:length])
-        try:
-            found, damage = read(tmp_path / "cut.bag")
-        except InputError:
-            assert length < 4200, "the bag's header ends there"
-            continue
-        assert plain(found) == expected[: len(found)]
-        assert damage.count >= 1, length
-        most = max(most, len(found))
-    assert most == 12
 
 
 def test_an_uncompressed_chunk_gives_what_precedes_the_cut_in_it(tmp_path: Path) -> None:
@@ -151,10 +129,3 @@ def test_a_chunk_that_announces_gigabytes_is_left_out(tmp_path: Path) -> None:
     found, damage = read(bag)
     assert 40 < len(found) < 60
     assert f"announces {0xFFFFFFFF} bytes unpacked, at most {MAX_BLOCK} are read" in damage.notes[0]
-
-
-def test_a_bag_is_known_by_its_first_bytes(tmp_path: Path) -> None:
-    bag = make_bag(tmp_path / "x.bag").rename(tmp_path / "x.mcap")
-    log = open_raw_log(bag)
-    assert log.container == "ROS 1 bag"
-    assert len(list(log.messages(Damage()))) == 60

@@ -15,7 +15,6 @@ from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
-from splatctrl_cli.containers.bag_log import open_raw_log
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.mcap_records import CHUNK, MAGIC
@@ -65,13 +64,6 @@ def chunk_places(path: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_a_whole_file_gives_all_its_messages(tmp_path: Path, compression: CompressionType) -> None:
-    found, damage = read(tmp_path / "x.mcap", small_log(compression))
-    assert found == list(range(1, 41))
-    assert damage.notes == []
-
-
-@pytest.mark.parametrize("compression", list(CompressionType))
 def test_a_cut_gives_the_whole_messages_of_the_chunk_it_cuts(tmp_path: Path, compression: CompressionType) -> None:
     data = small_log(compression, num=400, size=20_000)  # chunks of 200 kB: more than one block of zstd and lz4
     path = tmp_path / "x.mcap"
@@ -81,18 +73,6 @@ def test_a_cut_gives_the_whole_messages_of_the_chunk_it_cuts(tmp_path: Path, com
     assert found == list(range(1, len(found) + 1))
     assert len(found) > 30 + 3, "the three chunks before the cut hold ten each; more are in the cut one"
     assert damage.notes == [f"x.mcap: cut or damaged after byte {place}"]
-
-
-def test_every_cut_gives_a_beginning_and_says_so(tmp_path: Path) -> None:
-    data = small_log(num=3, size=24)
-    last = -1
-    for length in range(len(MAGIC), len(data)):
-        found, damage = read(tmp_path / "x.mcap", data[:length])
-        assert found == list(range(1, len(found) + 1))
-        assert len(found) >= last
-        assert damage.count >= 1, length
-        last = len(found)
-    assert last == 3
 
 
 def test_a_chunk_whose_length_is_wrong_costs_itself_alone(tmp_path: Path) -> None:
@@ -241,23 +221,6 @@ def test_a_small_file_that_asks_for_much_gets_little(tmp_path: Path, name: str, 
     megabytes, note = done.stdout.split(" ", 1)
     assert told in note
     assert int(megabytes) < 700
-
-
-@pytest.mark.parametrize("name", ["x.bag", "x.db3", "x"])
-def test_an_mcap_is_known_by_its_first_bytes(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(small_log())
-    log = open_raw_log(tmp_path / name)
-    assert log.container == "MCAP"
-    assert len(list(log.messages(Damage()))) == 40
-
-
-def test_what_is_no_log_is_refused_by_its_bytes(tmp_path: Path) -> None:
-    (tmp_path / "x.mcap").write_bytes(b"hello, this is text")
-    with pytest.raises(InputError, match=r"does not begin like a .mcap file \(first bytes b'hello, t'\)"):
-        open_raw_log(tmp_path / "x.mcap")
-    (tmp_path / "x.mcap").write_bytes(b"")
-    with pytest.raises(InputError, match=r"the file is empty \(0 bytes\)"):
-        open_raw_log(tmp_path / "x.mcap")
 
 
 def test_checksums_are_compared_once_and_again_where_the_file_has_changed(

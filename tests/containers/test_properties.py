@@ -1,7 +1,5 @@
 """Properties that hold for any recording: what was written is read, and a cut leaves a beginning."""
 
-import sqlite3
-from contextlib import closing
 from io import BytesIO
 from typing import Any
 
@@ -9,14 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, Writer
-from rosbags.rosbag1 import Writer as BagWriter
 
-from splatctrl_cli.containers.bag1_log import Bag1Log
-from splatctrl_cli.containers.db3_log import Db3Log
-from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.mcap_records import BadRecordError, parse_record
-from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.datasets.poses import read_tum
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_of, read_arrays, savez
@@ -27,52 +19,6 @@ from splatctrl_cli.logs.tf_tree import MAX_GAP_NS, TfTree
 from tests.logs.test_rvl import encoded_rvl
 from tests.properties import few
 
-TOPICS = ("/a", "/b/c", "/d e")
-STAMPS = st.integers(0, 2**63 - 1)
-MESSAGES = st.lists(st.tuples(st.sampled_from(TOPICS), STAMPS, st.binary(max_size=60)), max_size=20)
-Found = list[tuple[str, int, bytes]]
-
-
-def found_in(log: McapLog | Bag1Log | Db3Log) -> tuple[Found, int]:
-    """Topic, time and bytes of each message; how much was damaged."""
-    damage = Damage()
-    return [(m.topic.name, m.log_time_ns, bytes(m.data)) for m in log.messages(damage)], damage.count
-
-
-def mcap_of(messages: Found, compression: CompressionType, chunk_size: int, is_chunked: bool) -> bytes:
-    stream = BytesIO()
-    writer = Writer(
-        stream, chunk_size=chunk_size, compression=compression, use_chunking=is_chunked, enable_data_crcs=True
-    )
-    writer.start(profile="", library="tests")
-    channels: dict[str, int] = {}
-    for topic, stamp, data in messages:
-        if topic not in channels:
-            channels[topic] = writer.register_channel(topic, "x", 0)
-        writer.add_message(channels[topic], log_time=stamp, publish_time=stamp, data=data)
-    writer.finish()
-    return stream.getvalue()
-
-
-@few(40)
-@given(MESSAGES, st.sampled_from(list(CompressionType)), st.integers(1, 300), st.booleans(), st.floats(0, 1))
-def test_an_mcap_gives_what_was_written_and_cut_anywhere_a_beginning_of_it(
-    tmp_path_factory: pytest.TempPathFactory,
-    messages: Found,
-    compression: CompressionType,
-    chunk_size: int,
-    is_chunked: bool,
-    share: float,
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "x.mcap"
-    data = mcap_of(messages, compression, chunk_size, is_chunked)
-    path.write_bytes(data)
-    assert found_in(McapLog(path)) == (messages, 0)
-    path.write_bytes(data[: int(share * (len(data) - 1))])
-    found, damaged = found_in(McapLog(path))
-    assert found == messages[: len(found)]
-    assert damaged > 0
-
 
 @few(150)
 @given(st.integers(0, 255), st.binary(max_size=80))
@@ -81,59 +27,6 @@ def test_bytes_that_are_no_record_of_an_mcap_are_refused_as_such(opcode: int, co
         parse_record(opcode, content)
     except BadRecordError as error:
         assert "record" in str(error)
-
-
-@few(15)
-@given(MESSAGES.filter(bool), st.booleans(), st.floats(0, 1))
-def test_a_bag_gives_what_was_written_and_cut_anywhere_a_beginning_of_it(
-    tmp_path_factory: pytest.TempPathFactory, messages: Found, is_packed: bool, share: float
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "x.bag"
-    path.unlink(missing_ok=True)
-    in_seconds = [(topic, stamp % 2**32 * 10**9, data) for topic, stamp, data in messages]
-    writer = BagWriter(path)
-    if is_packed:
-        writer.set_compression(BagWriter.CompressionFormat.BZ2)
-    with writer:
-        connections: dict[str, Any] = {}
-        for topic, stamp, data in in_seconds:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(
-                    topic, "std_msgs/msg/String", msgdef="string data", md5sum="0"
-                )
-            writer.write(connections[topic], stamp, data)
-    assert found_in(Bag1Log(path)) == (in_seconds, 0)
-    data = path.read_bytes()
-    path.write_bytes(data[: 13 + int(share * (len(data) - 14))])
-    try:
-        found, _ = found_in(Bag1Log(path))
-    except InputError:  # not one whole record
-        found = []
-    assert found == in_seconds[: len(found)]
-
-
-@few(15)
-@given(MESSAGES, st.floats(0, 1))
-def test_a_sqlite_bag_gives_what_was_written_and_cut_anywhere_no_other(
-    tmp_path_factory: pytest.TempPathFactory, messages: Found, share: float
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "x.db3"
-    path.unlink(missing_ok=True)
-    with closing(sqlite3.connect(path)) as database, database:
-        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
-        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data BLOB)")
-        rows = [(i, name, "std_msgs/msg/String", "cdr") for i, name in enumerate(TOPICS)]
-        database.executemany("INSERT INTO topics VALUES (?, ?, ?, ?)", rows)
-        written = [(TOPICS.index(topic), stamp, data) for topic, stamp, data in messages]
-        database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", written)
-    assert found_in(Db3Log(path)) == (messages, 0)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(share * (len(data) - 1))])
-    try:
-        found, _ = found_in(Db3Log(path))
-    except InputError:
-        return
-    assert all(message in messages for message in found)
 
 
 @few(60)
