@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.captures.capture_header import check_header
-from splatctrl_cli.captures.capture_index import FileSums, FrameRows
-from splatctrl_cli.captures.capture_joints import read_joints
-from splatctrl_cli.captures.capture_writer import COLUMNS, FORMAT, VERSION, write_capture
+from splatctrl_cli.captures.capture_header import AGAIN, read_capture_header
+from splatctrl_cli.captures.capture_index import COLUMNS, FileSums, FrameRows
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
+from splatctrl_cli.files.npz_columns import NpzFile
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.logs.joint_topics import (
@@ -26,6 +24,7 @@ from splatctrl_cli.logs.joint_topics import (
 )
 from splatctrl_cli.logs.messages import decode_file, metres
 from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask, merged
 from splatctrl_cli.records import (
     Bool,
@@ -39,14 +38,12 @@ from splatctrl_cli.records import (
     UInt8,
 )
 
-__all__ = ["CaptureSource", "is_capture", "read_capture_header", "write_capture"]
-
-INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
+NEEDED = ("stamp_ns", "position", "velocity")
+OPTIONAL = ("commanded_velocity", "T_base_ee", "T_world_ee")  # NaN where a state has none, absent where none has one
 _NOT_FOR_CAPTURES = (
     *("world_frame", "camera_topics", "camera_poses", "human_topics", "intrinsics"),
     *("camera_pose_topics", "depth_scale", "root", "holdout", "stamps"),
 )
-_AGAIN = "run `splatctrl ingest` again"
 
 
 class CaptureSource:
@@ -79,7 +76,7 @@ class CaptureSource:
         self._joints: Sequence[JointState] = []
         if joints is None or self.joint_topics is None:
             options.refuse(("joint_topic",), "the states of one topic in a capture", path)
-            self._joints = read_joints(path) if self.joint_names else []
+            self._joints = _read_joints(path) if self.joint_names else []
         else:
             kept = self.joint_topics
             self.joint_names, self._joints, loss = joints_again(kept, options, joints)
@@ -195,50 +192,15 @@ class CaptureSource:
         """The path of a file that is as it was written. Raises InputError for another."""
         file = self._path / name
         if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise InputError(f"{file}: lies outside the capture", remedy=_AGAIN)
+            raise InputError(f"{file}: lies outside the capture", remedy=AGAIN)
         if not file.is_file() or self._sums.get(name) != sha256(file):
-            raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=_AGAIN)
+            raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=AGAIN)
         return file
 
 
 def _pose(row: Mapping[str, str]) -> Float64:
     values = [float(row[key]) for key in COLUMNS[4:11]]
     return transform_from(values[:3], values[3:])
-
-
-def is_capture(path: Path) -> bool:
-    """Whether a folder holds a capture."""
-    return (path / "capture.json").is_file()
-
-
-def read_capture_header(path: Path) -> dict[str, Any]:
-    """capture.json. Raises InputError where it is not one of ours, or of a newer kind."""
-    file = path / "capture.json"
-    try:
-        header = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise InputError(f"{file}: cannot be read: {error}", remedy="run `splatctrl ingest` again") from None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise InputError(f"{file}: not a splatctrl capture", remedy="expected what `splatctrl ingest` writes")
-    if header.get("version") != VERSION:
-        raise InputError(
-            f"{file}: expected version {VERSION}, got {header.get('version')}", remedy="use a newer splatctrl"
-        )
-    check_header(file, header)
-    _check_index(path)
-    return header
-
-
-def _check_index(path: Path) -> None:
-    """Raises InputError where an index file is not as it was written: nothing in it can be trusted then."""
-    sums = FileSums(path)
-    for name in INDEX_FILES:
-        if not (path / name).is_file():
-            raise InputError(f"{path / name}: missing", remedy="run `splatctrl ingest` again")
-        if sums.get(name) != sha256(path / name):
-            raise InputError(
-                f"{path / name}: its checksum differs from SHA256SUMS", remedy="run `splatctrl ingest` again"
-            )
 
 
 def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | None:
@@ -249,3 +211,21 @@ def _decode_depth(name: str, data: bytes, camera: dict[str, Any]) -> Float32 | N
             return None
     counts, scale = decode_file(data, color=False), camera.get("depth_scale")
     return None if counts is None or scale is None else metres(counts, scale)
+
+
+def _read_joints(path: Path) -> StateColumns:
+    """The states of a capture folder's joints.npz, read a block at a time. Raises InputError."""
+    file = path / "joints.npz"
+    try:
+        content = NpzFile(file)
+        stamps = content.stamps("stamp_ns", 1, 0, least=0)
+        rows = {name: content.rows(name) for name in (*NEEDED[1:], *OPTIONAL) if name in (*NEEDED, *content.names)}
+    except InputError as error:
+        raise InputError(error.message, remedy=AGAIN) from None
+    if any(len(values) != len(stamps) for values in rows.values()):
+        raise InputError(
+            f"{file}: expected {len(stamps)} states in every array, got "
+            + ", ".join(f"{name} {len(values)}" for name, values in rows.items()),
+            remedy=AGAIN,
+        )
+    return StateColumns(stamp_ns=stamps, **rows)

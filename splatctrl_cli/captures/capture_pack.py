@@ -7,34 +7,79 @@ All other files are attachments, by their path.
 """
 
 import csv
+import hashlib
 import io
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.captures.capture_header import AGAIN
+from splatctrl_cli.captures.capture_index import SUMS
 from splatctrl_cli.captures.capture_writer import VERSION
 from splatctrl_cli.containers.bag_log import open_raw_log
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_records import ATTACHMENT, BadRecordError, Metadata, parse_record
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.unpacked_folder import NewFolder, attachment_at
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.mcap_writer import MILLIMETRES, McapLog, mcap_log
 from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
 
+MOST_FILES = 1 << 20  # an empty file takes a disk's block, its name in an archive thirty bytes
+_LONGEST = 255  # bytes of a name
+_PIECE = 1 << 20
 MARK = "splatctrl-capture"  # name of the metadata record
-SUMS = "SHA256SUMS"
 DEPTH_HEAD = bytes(12)  # of compressed_depth_image_transport: its parameters, which 16UC1 does not use
 _TYPES = {".json": "application/json", ".csv": "text/csv", ".npz": "application/zip"}
 METADATA = 0x0C
-_AGAIN = "copy the file again"
+_COPY = "copy the file again"
 _IMAGES = ("color", "depth", "human")  # columns of frames.csv
+
+
+class NewFolder:
+    """An empty folder that files are written into. `digests`: sha256 of what was written, by name."""
+
+    def __init__(self, path: Path) -> None:
+        self.digests: dict[str, str] = {}
+        self._path = path
+        self._taken: set[str] = set()
+        self._folders: set[str] = set()
+
+    def write(self, name: str, pieces: Iterable[bytes]) -> None:
+        """Write a file.
+
+        Raises InputError for a name that leads elsewhere, that a file system may not hold or not tell from another
+        (case), or that is taken.
+        """
+        parts = PurePosixPath(name).parts
+        is_odd = not name.isprintable() or any(len(part.encode(errors="replace")) > _LONGEST for part in parts)
+        if not parts or name.startswith("/") or ".." in parts or "\\" in name or is_odd:
+            raise InputError(
+                f"{name[:_LONGEST]!r}: not the name of a file of a capture", remedy="do not trust this file"
+            )
+        self._take(parts)
+        path = self._path.joinpath(*parts)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        digest = hashlib.sha256()
+        with path.open("xb") as stream:
+            for piece in pieces:
+                digest.update(piece)
+                stream.write(piece)
+        self.digests["/".join(parts)] = digest.hexdigest()
+
+    def _take(self, parts: tuple[str, ...]) -> None:
+        names = ["/".join(parts[: i + 1]).casefold() for i in range(len(parts))]
+        if names[-1] in self._taken or names[-1] in self._folders or not self._taken.isdisjoint(names[:-1]):
+            raise InputError(f"{'/'.join(parts)!r}: two files of that name", remedy="do not trust this file")
+        if len(self._taken) >= MOST_FILES:
+            raise InputError(f"over {MOST_FILES} files, expected fewer", remedy="do not trust this file")
+        self._taken.add(names[-1])
+        self._folders.update(names[:-1])
 
 
 def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | None = None) -> int:
@@ -47,7 +92,7 @@ def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | Non
         for number in range(len(source)):
             row, stored = source.row(number), source.stored_at(number)
             if stored is None:
-                raise InputError(f"{capture}: {source.loss.notes[-1]}", remedy="run `splatctrl ingest` again")
+                raise InputError(f"{capture}: {source.loss.notes[-1]}", remedy=AGAIN)
             while state is not None and state.stamp_ns <= stored.frame.stamp_ns:
                 state = _add_state(log, state, source, states)
             _add_frame(
@@ -149,10 +194,10 @@ def _unpack_images(folder: Path, packed: Path, target: NewFolder) -> int:
         try:
             data = bytes(decoder.decode(message).data)
         except (UndecodableMessageError, AttributeError, TypeError, ValueError) as error:
-            raise InputError(f"{packed}: cannot be unpacked: {error}", remedy=_AGAIN) from None
+            raise InputError(f"{packed}: cannot be unpacked: {error}", remedy=_COPY) from None
         name = next(names[topic], None)
         if name is None:
-            raise InputError(f"{packed}: {topic} has more images than frames.csv has rows", remedy=_AGAIN)
+            raise InputError(f"{packed}: {topic} has more images than frames.csv has rows", remedy=_COPY)
         target.write(name, [data[len(DEPTH_HEAD) :] if topic.endswith("/compressedDepth") else data])
     _check_whole(packed, damage)
     return len(rows)
@@ -171,24 +216,42 @@ def _rows(packed: Path, file: Path) -> list[dict[str, str]]:
         with file.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
     except (FileNotFoundError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{packed}: its frames.csv cannot be read: {error}", remedy=_AGAIN) from None
+        raise InputError(f"{packed}: its frames.csv cannot be read: {error}", remedy=_COPY) from None
     if any(row.get(name) is None for row in rows for name in ("camera", "color", "depth")):
-        raise InputError(f"{packed}: its frames.csv lacks a camera or an image", remedy=_AGAIN)
+        raise InputError(f"{packed}: its frames.csv lacks a camera or an image", remedy=_COPY)
     return rows
 
 
 def _check_whole(packed: Path, damage: Damage) -> None:
     if damage.count:
-        raise InputError(f"{packed}: cannot be unpacked: {damage.notes[0]}", remedy=_AGAIN)
+        raise InputError(f"{packed}: cannot be unpacked: {damage.notes[0]}", remedy=_COPY)
 
 
 def _check_sums(packed: Path, folder: Path, written: Mapping[str, str]) -> None:
     """Raise InputError where a file that SHA256SUMS names is missing or another."""
     file = folder / SUMS
     if not file.is_file():
-        raise InputError(f"{packed}: {SUMS} is missing", remedy=_AGAIN)
+        raise InputError(f"{packed}: {SUMS} is missing", remedy=_COPY)
     for line in io.StringIO(file.read_text(encoding="utf-8", errors="replace")):
         digest, name = line[:64], line[66:].rstrip("\n")
         if written.get(name) != digest:
             what = "is missing" if name not in written else "differs from what was packed"
-            raise InputError(f"{packed}: {name} {what}", remedy=_AGAIN)
+            raise InputError(f"{packed}: {name} {what}", remedy=_COPY)
+
+
+def attachment_at(stream: BinaryIO, offset: int) -> tuple[str, Iterator[bytes]]:
+    """Name and content of the attachment whose record begins at `offset`, of a file whose records are whole."""
+    stream.seek(offset + 9 + 16)  # behind opcode, length and two times
+    name = stream.read(_u32(stream)).decode("utf-8", "replace")
+    stream.seek(_u32(stream), 1)  # the media type
+    return name, _pieces(stream, int.from_bytes(stream.read(8), "little"))
+
+
+def _u32(stream: BinaryIO) -> int:
+    return int.from_bytes(stream.read(4), "little")
+
+
+def _pieces(stream: BinaryIO, size: int) -> Iterator[bytes]:
+    while size > 0 and (piece := stream.read(min(size, _PIECE))):
+        size -= len(piece)
+        yield piece

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.lib import format as npy
 
+from splatctrl_cli.captures.capture_index import COLUMNS, MASKS, Checksums
 from splatctrl_cli.captures.capture_journal import Entry, Journal, check_same_frame
 from splatctrl_cli.errors import InputError, WriteError
-from splatctrl_cli.files.checksums import Checksums
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.files.rows import Table, blocks_of
 from splatctrl_cli.geometry import quat_from_rotation
@@ -27,8 +27,6 @@ from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import Float32, JointState, LossReport
 
 FORMAT, VERSION = "splatctrl-capture", 1
-COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
-MASKS = ("human", "valid")  # further columns, where the recording has such masks
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))

@@ -4,9 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.captures.capture import is_capture
+from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.checks.check_cameras import lens_findings, pose_findings
-from splatctrl_cli.checks.check_images import ImageWatch, depth_findings, sample_findings, strided_lens
+from splatctrl_cli.checks.check_images import (
+    ImageWatch,
+    depth_findings,
+    sample_findings,
+    strided_lens,
+)
 from splatctrl_cli.checks.check_recording import Evidence, judged
 from splatctrl_cli.checks.check_states import robot_states
 from splatctrl_cli.checks.check_times import TimesWatch, time_findings

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatctrl_cli.captures.capture import is_capture
+from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.containers.bag_log import is_bag_folder
 from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
 from splatctrl_cli.errors import InputError, UsageError

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.captures.capture import is_capture, read_capture_header
+from splatctrl_cli.captures.capture_header import is_capture, read_capture_header
 from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.containers.bag_log import CONTAINERS, SUFFIXES, is_bag_folder, open_raw_log

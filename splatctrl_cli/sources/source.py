@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatctrl_cli.captures.capture import CaptureSource, is_capture
+from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.containers.bag_log import SessionLog, is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import open_image_folder

@@ -4,7 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from splatctrl_cli.captures.capture import CaptureSource, is_capture
+from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.folder_description import has_table

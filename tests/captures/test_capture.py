@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.captures.capture import write_capture
+from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.containers.mcap_records import CHUNK
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame

@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from splatctrl_cli.captures.capture import write_capture
 from splatctrl_cli.captures.capture_pack import MARK, pack_capture, unpack_capture
+from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.captures.capture import write_capture
+from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.commands import COMMANDS, Command, build_parser, function_of
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.sources.source import open_source

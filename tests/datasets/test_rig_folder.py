@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.captures.capture import CaptureSource, write_capture
+from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.options import SourceOptions

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.captures.capture import write_capture
+from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.records import SWEPT, Label, OccupancyGrid, SplatSet
