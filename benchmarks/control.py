@@ -13,10 +13,10 @@ from benchmarks.scenes import sample_fitter, sample_robot, sample_states
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import audit
 from splatctrl_cli.control.step import QpIkController
-from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.grid import GridField
-from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.field.obstacles import field_splats
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceField, Float64, SplatSet
 
 NUM_STEPS = 200

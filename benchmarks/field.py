@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 from benchmarks.measure import Limit, Options, Result, medians
 from benchmarks.scenes import surface_splats
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.distance import GpdfField, SphereField, make_field
 from splatctrl_cli.field.grid import GridField
 from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, Float64, SplatSet
 
 NUM_SPLATS, MANY_SPLATS, NUM_POINTS, MANY_POINTS, VOXEL = 5000, 50_000, 60, 1_000_000, 0.01

@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks.measure import SAMPLE, Limit, Options, Result
 from benchmarks.scenes import sample_fitter, sample_robot
 from splatctrl_cli.config import Config
-from splatctrl_cli.field.bake import bake
-from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.field.obstacles import field_splats
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.grid_files.grid import write_npz
 from splatctrl_cli.records import Box, Float64
 

@@ -18,8 +18,7 @@ import numpy as np
 from benchmarks.measure import machine
 from benchmarks.surfaces import points_around, shapes, splats_on
 from splatctrl_cli.cli.common import table
-from splatctrl_cli.field.distance import GpdfField, SphereField
-from splatctrl_cli.field.marching import march
+from splatctrl_cli.field.distance import GpdfField, SphereField, march
 from splatctrl_cli.records import Float64
 
 STEPS = (1, 3, 5, 10)

@@ -25,7 +25,7 @@ from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.field.distance import SphereField, make_field
-from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.field.obstacles import field_splats
 from splatctrl_cli.planner.comparison import Motion, MotionFigures, Yardstick
 from splatctrl_cli.planner.planned import planned_detours, planned_path
 from splatctrl_cli.records import DistanceField, Float64

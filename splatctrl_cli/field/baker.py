@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
-from splatctrl_cli.field.layout import HALF_DIAGONAL, GridLayout
-from splatctrl_cli.field.observed import observed_planes
+from splatctrl_cli.field.layout import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.kernels import field as native
@@ -30,7 +29,6 @@ CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
 }
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
 KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
-RESOLUTION = np.float32(2e-6)  # [m] distances nearer than this are the same
 _TEMPORARY_BYTES = 64 << 20  # of the arrays beside the channels
 
 Planes = dict[str, NDArray[np.generic]]

@@ -9,10 +9,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.field.kernel import REACH
 from splatctrl_cli.field.layout import available_memory
 from splatctrl_cli.records import Float64
 
-REACH = 8  # l, beyond which the kernel counts as zero
 MAX_ITERATIONS = 5000
 TOLERANCE = 1e-6  # largest residual of a row, of the smallest value asked for
 FLOOR = 1e-13  # of the largest value asked for: what float64 can do

@@ -6,7 +6,7 @@ import numpy as np
 
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.health import field_health
-from splatctrl_cli.field.selection import label_counts
+from splatctrl_cli.field.obstacles import label_counts
 from splatctrl_cli.records import Label, SplatSet
 
 FORMAT_VERSION = 2

@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 
 ROUGH_LENGTH = 10.0  # [m] from which on float32 costs the Gaussian kernel's distance 0.2 mm; at 100 m 5 cm
 MAX_SPREAD = 30.0  # of the radii: the largest over the smallest above zero
-RESOLUTION = 2e-6  # [m] float32 distances nearer than this are the same
 
 
 @dataclass(frozen=True, kw_only=True)

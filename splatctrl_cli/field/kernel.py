@@ -9,6 +9,7 @@ from splatctrl_cli.field.clusters import ClusteredPoints
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float64
 
+REACH = 8  # l, beyond which a kernel counts as zero: 0.3 % of the sum on a plane
 MAX_SHARE = 1e-2  # of a kernel sum that is ever left out
 
 

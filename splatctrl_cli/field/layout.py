@@ -1,4 +1,4 @@
-"""Where the cells of a distance grid stand, and whether there is room for them."""
+"""Where the cells of a distance grid stand, whether there is room for them, and what cameras saw there."""
 
 import math
 from dataclasses import dataclass
@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Box, Float64, SplatSet
+from splatctrl_cli.records import Box, Float64, OccupancyGrid, SplatSet, UInt8, VoxelState
 
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
 
+RESOLUTION = 2e-6  # [m] float32 distances nearer than this are the same
 HALF_DIAGONAL = 0.5 * 3.0**0.5  # of a cell, in voxels
 LOSS = 2.0 * HALF_DIAGONAL  # the most that the certified distance may read too little, in voxels
 
@@ -113,3 +115,24 @@ def _group_room() -> list[int]:
     except OSError:
         return []
     return [] if limit == "max" else [max(int(limit) - used, 0)]
+
+
+def observed_planes(
+    occupancy: OccupancyGrid | None, layout: GridLayout, thresholds: OccupancyConfig, first: int, last: int
+) -> UInt8:
+    """What the occupancy voxel that holds each cell centre says (last - first, Y, Z), a `VoxelState`; x in
+    [first, last). Never seen outside the occupancy grid, or without one.
+    """
+    observed = np.full((last - first, *layout.shape[1:]), VoxelState.NEVER_SEEN, dtype=np.uint8)
+    if occupancy is None:
+        return observed
+    states = occupancy.states(thresholds.free_below, thresholds.occupied_above)
+    nodes, inside = [], []
+    for axis, cells in enumerate((np.arange(first, last), np.arange(layout.shape[1]), np.arange(layout.shape[2]))):
+        centers = layout.origin[axis] + layout.voxel * cells
+        node = np.floor((centers - occupancy.origin[axis]) / occupancy.voxel + 0.5).astype(np.int64)
+        is_inside = (node >= 0) & (node < states.shape[axis])
+        nodes.append(node[is_inside])
+        inside.append(np.flatnonzero(is_inside))
+    observed[np.ix_(*inside)] = states[np.ix_(*nodes)]
+    return observed

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.grid import exact_channel
+from splatctrl_cli.field.layout import RESOLUTION
 from splatctrl_cli.records import DistanceGrid, Float32, VoxelState
 
 CHUNK_CELLS = 1 << 20  # that are looked at together
 BIN = 0.05  # of the histogram of the gradient's length: bin k is about k times this
 NUM_BINS = 41  # about 0 to 2; the last one holds what is longer, too
 NEAR_ONE = 0.05
-RESOLUTION = 2e-6  # [m] float32 distances nearer than this are the same
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""A grid cut into slabs of x-planes, so that memory need not hold it: which ones, and one at a time."""
+"""A grid baked whole, or cut into slabs of x-planes, one at a time, so that memory need not hold it."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -7,12 +7,13 @@ import numpy as np
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.field.baker import CHANNELS, Baker, Planes
-from splatctrl_cli.field.layout import GridLayout, check_room
-from splatctrl_cli.field.observed import observed_planes
-from splatctrl_cli.field.unknown import BOUND, Cubes, blank
+from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, Baker, Planes
+from splatctrl_cli.field.header import field_header
+from splatctrl_cli.field.layout import GridLayout, check_memory, check_room, observed_planes
+from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
+from splatctrl_cli.field.unknown import BOUND, Cubes, apply_unknown, blank
 from splatctrl_cli.kernels.field import BLOCK
-from splatctrl_cli.records import Bool, DistanceGrid, OccupancyGrid, UInt8, VoxelState
+from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, OccupancyGrid, SplatSet, UInt8, VoxelState
 
 SLAB_BYTES = 48 << 20  # of the channels of a slab, or what a block's planes take
 _CUBES = 64  # bytes of a cell that finding the nearest never-seen one takes, of the whole grid
@@ -117,3 +118,34 @@ def baked_planes(baker: Baker, first: int, last: int, kept: Kept | None = None) 
     if "observed" in planes:
         planes["observed"] = observed_planes(kept.occupancy, baker.layout, kept.thresholds, first, last)
     return planes
+
+
+def bake(
+    splats: SplatSet,
+    box: Box,
+    config: FieldConfig,
+    *,
+    channels: Collection[str] = DEFAULT_CHANNELS,
+    occupancy: OccupancyGrid | None = None,
+    thresholds: OccupancyConfig | None = None,
+    labels: Collection[Label] = DEFAULT_LABELS,
+    threads: int = 0,
+) -> DistanceGrid:
+    """Distances to the splats with one of `labels` at cells of size ``config.voxel`` that cover `box`.
+
+    `channels` are some of `CHANNELS`, sdf among them. Culling is exact for hard; a kernel field with row sums is too
+    large by at most ``config.truncation``. The same input gives the same bytes at any thread count. Raises UsageError
+    for a bad box or one that does not fit the memory, NotEvaluableError where no splat is left, InputError for splats
+    that are not finite.
+    """
+    chosen = field_splats(splats, labels)
+    layout = GridLayout.over(box, config.voxel)
+    check_memory(layout, bytes_per_cell(channels))
+    baker = Baker(
+        chosen, layout, config, channels=channels, occupancy=occupancy, thresholds=thresholds, threads=threads
+    )
+    arrays = baker.allocate(layout.shape[0])
+    baker.bake(0, layout.shape[0], arrays)
+    header = field_header(splats, chosen, labels, baker, has_occupancy=occupancy is not None)
+    grid = DistanceGrid(origin=layout.origin, voxel=layout.voxel, channels=arrays, header=header)
+    return apply_unknown(grid, config.unknown)

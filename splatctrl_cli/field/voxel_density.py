@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from scipy.fft import irfftn, rfftn
 
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.kernel import REACH
 from splatctrl_cli.records import Float64
 
 VOXELS_PER_LENGTH = 2  # h = l / 2
-REACH = 8  # l, beyond which the kernel counts as zero: 0.3 % of the sum on a plane
 NODES = 96  # of a block along each axis: a size that transforms fast, 7 MiB
 MAX_BLOCKS = 2000
 

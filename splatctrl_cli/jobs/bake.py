@@ -17,9 +17,8 @@ from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, KERNEL_OF, Bak
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
 from splatctrl_cli.field.layout import LOSS, GridLayout, bounding_box, check_loss
-from splatctrl_cli.field.obstacles import ObstacleSpheres, obstacle_spheres
+from splatctrl_cli.field.obstacles import ObstacleSpheres, field_splats, obstacle_spheres
 from splatctrl_cli.field.report import GridStatistics, grid_statistics
-from splatctrl_cli.field.selection import field_splats
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, slabs
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_json, write_run
 from splatctrl_cli.grid_files.grid_formats import check_formats, write_grid

@@ -12,7 +12,7 @@ from splatctrl_cli import __version__
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.layout import GridLayout, check_room
-from splatctrl_cli.field.selection import DEFAULT_LABELS
+from splatctrl_cli.field.obstacles import DEFAULT_LABELS
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.files.parts import Parts
 from splatctrl_cli.grid_files.grid import read_npz

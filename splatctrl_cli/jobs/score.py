@@ -23,8 +23,7 @@ from splatctrl_cli.evaluate.score_report import (
     score_verdict,
 )
 from splatctrl_cli.evaluate.verdict import Verdict
-from splatctrl_cli.field.obstacles import obstacle_spheres
-from splatctrl_cli.field.selection import field_splats
+from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.recording import RecordingRequest

@@ -14,7 +14,7 @@ from mcap.writer import Writer as McapWriter
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.bake import bake
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.grid_files.grid import write_npz
 from splatctrl_cli.logs.options import SourceOptions

@@ -6,8 +6,8 @@ import pytest
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError
 from splatctrl_cli.field import voxel_density
-from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.distance import DISTANCES, make_field
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.unknown import apply_unknown
 from splatctrl_cli.field.weights import METHODS
 from splatctrl_cli.records import Box, Float64

@@ -3,9 +3,9 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid import GridField
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.records import Box, DistanceGrid
 from tests.field.scenes import cloud, queries, splat_set
 

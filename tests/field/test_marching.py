@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.distance import GpdfField, SphereField
+from splatctrl_cli.field.distance import GpdfField, SphereField, march
 from splatctrl_cli.field.health import planar_zero_level
-from splatctrl_cli.field.marching import march
 from tests.field.scenes import cloud, queries
 from tests.reference import field as reference
 

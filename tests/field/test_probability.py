@@ -3,7 +3,6 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.bake import bake
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.probability import (
     CalibratedProbability,
@@ -11,6 +10,7 @@ from splatctrl_cli.field.probability import (
     make_probability,
     probability_of_occupancy,
 )
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries, splat_set
