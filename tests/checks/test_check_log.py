@@ -277,7 +277,7 @@ def test_a_fault_is_found_by_its_name_place_and_figure(tmp_path: Path, fault: Fa
 
 
 def test_every_code_that_is_made_is_in_the_table_and_every_entry_is_made() -> None:
-    sources = [*(ROOT / "splatctrl_cli/checks").glob("check_*.py"), ROOT / "splatctrl_cli/cli/check.py"]
+    sources = [*(ROOT / "splatctrl_cli/checks").glob("check_*.py"), ROOT / "splatctrl_cli/jobs/check.py"]
     text = "\n".join(path.read_text() for path in sources)
     made = set(re.findall(r'(?:error|warning|note|severity|make)\(\s*"([a-z-]+)"', text))
     assert made | {"quick", "tf-gap", "pairing", "pose-missing", "damaged"} == set(CHECKS)

@@ -181,7 +181,7 @@ def test_light_three_is_taken_where_there_are_several(scan: Path) -> None:
 @pytest.mark.parametrize(
     ("depth", "cameras", "message"),
     [
-        (1000, 1, r"depth: expected 20 to 20000 mm, got a median of \d\.\d+; lengths have to be"),
+        (1000, 1, r"depth: expected 20 to 20000 mm, got a median of \d\.\d+; give lengths in millimetres"),
         (1000, 1000, "depth: expected 20 to 20000 mm"),
         (1, 1000, r"cameras: expected millimetres, .* of \d+ mm, got cameras within 0.\d+ mm"),
     ],

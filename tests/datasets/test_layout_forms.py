@@ -305,7 +305,7 @@ def test_lens_models_of_nerfstudio_are_those_of_opencv(tmp_path: Path, changed: 
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model: expected one of SIMPLE_PINHOLE.*got 'EQUIRECTANGULAR'"),
         ({"k4": 0.1}, "expected no k4, got 0.1"),
-        ({"fl_x": None}, "no usable 'camera_angle_x' of the lens"),
+        ({"fl_x": None}, "no usable 'camera_angle_x' in the intrinsics"),
         ({"applied_scale": 0.0}, "expected numbers, got float division by zero"),
     ],
 )

@@ -128,6 +128,7 @@ import os, signal, sys
 from pathlib import Path
 from splatctrl_cli.field import layout, slabs
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
+from tests.jobs.test_bake_resume import bake
 slabs.SLAB_BYTES, real, calls = 1, GridSlabs.write, []
 def write(self, *slab):
     real(self, *slab)

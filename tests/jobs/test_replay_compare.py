@@ -15,8 +15,7 @@ from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, grid_seen, splats_of, write_scene
-from tests.cli.test_replay_modes import ball_ahead, with_person
-from tests.cli.test_replay_states import moving
+from tests.cli.test_replay_modes import ball_ahead, moving, with_person
 from tests.jobs.stage import MOVE
 
 pytestmark = pytest.mark.usefixtures("unpainted")
