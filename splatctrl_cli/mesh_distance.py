@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Bool, Float64
 
 Int64 = NDArray[np.int64]
@@ -49,8 +50,6 @@ def load_mesh(path: Path) -> TriangleMesh:
     Vertices at the same place become one, whatever their texture and normal: a seam of a texture is not a hole.
     Raises InputError where the file cannot be read, or holds no triangle or a coordinate that is not finite.
     """
-    import trimesh
-
     if not path.is_file():
         raise InputError(f"{path}: expected a mesh, got no such file")
     try:

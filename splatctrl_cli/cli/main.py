@@ -13,6 +13,7 @@ from pathlib import Path
 
 from splatctrl_cli.cli.commands import build_parser, function_of
 from splatctrl_cli.errors import SplatCtrlError, UsageError
+from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
 
 MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 
@@ -96,8 +97,6 @@ def _stand_in_for_closed_streams() -> _Lost:
 
 
 def _fail_to_read_or_write(error: OSError, verbose: int) -> int:
-    from splatctrl_cli.files.output import is_write_failure
-
     reason = error.strerror or error
     if is_write_failure(error):
         return _fail(error, f"{error.filename or 'output'}: writing failed: {reason}; make room", 6, verbose)
@@ -110,8 +109,6 @@ def _check_output(args: argparse.Namespace) -> None:
     out = getattr(args, "out", None)
     if out is None:
         return
-    from splatctrl_cli.files.output import PARTIAL, check_can_be_written
-
     check_can_be_written(out)
     target = Path(os.path.realpath(out))  # resolve() raises RuntimeError for a link to itself
     targets = {target, target.with_name(target.name + PARTIAL)} if target.name else {target}

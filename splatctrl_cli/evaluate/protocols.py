@@ -32,7 +32,6 @@ MVSNERF_SCORED = (32, 24, 23, 44)
 MVSNERF_SCANS = (1, 8, 21, 103, 114)
 SURFACE_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)  # those IDR has masks for
 DTU_VIEWS = 49
-NAMES = ("dtu-train", "dtu-holdout8", "regnerf-3", "regnerf-6", "regnerf-9", "mvsnerf", "holdout:RULE")
 RULES = "expected holdout:everyN, holdout:everyN+FIRST or holdout:2,5"
 MARGIN = 10  # [mm] of the masks that are used, the number in their names
 BEFORE, BEYOND = 0.060, 0.120  # [m] outside the box within which points are kept (eval.py: patch_size, twice that)
@@ -109,63 +108,62 @@ class ScoreProtocol:
         return Split(training=training, scored=scored, left_out=tuple(n for n in numbers if n not in used))
 
 
-def score_protocol(name: str) -> ScoreProtocol:
-    """The protocol of that name. Raises UsageError with the choices.
+def _regnerf(num_training: int) -> ScoreProtocol:
+    """The first N of nine input views train, 25 are scored, 15 left out.
 
-    dtu-train: every view trains and is scored, as surface methods print it (2D Gaussian splatting, repository
-    hbb1/2d-gaussian-splatting, thread 13: DTU has no test views; its scans by scripts/dtu_eval.py). dtu-holdout8:
-    every 8th view from the first on is scored (graphdeco-inria/gaussian-splatting, scene/dataset_readers.py,
-    ``llffhold = 8``). regnerf-N: the first N of nine input views, 25 scored, 15 left out (google-research/
-    google-research, regnerf/internal/datasets.py, class DTU, split 'pixelnerf'; figures over the object,
-    regnerf/eval.py, 400x300 by ``factor = 4`` of regnerf/configs). mvsnerf: 16 views train, four are scored, pixels
-    without reference depth left out (apchenstu/mvsnerf, data/dtu_ft.py and renderer.ipynb; the numbers of its
-    configs/pairs.th as autonomousvision/murf, datasets/dtu.py, writes them out).
+    google-research/google-research, regnerf/internal/datasets.py, class DTU, split 'pixelnerf'; figures over the
+    object (regnerf/eval.py), 400x300 by ``factor = 4`` of regnerf/configs.
     """
-    if name == "dtu-train":
-        return ScoreProtocol(
-            name=name,
-            scans=SURFACE_SCANS,
-            is_zero_padded=True,
-            source="every view trains and is scored: DTU has no test views (hbb1/2d-gaussian-splatting, thread 13)",
-        )
-    if name == "dtu-holdout8":
-        return ScoreProtocol(
-            name=name,
-            every=EVERY,
-            is_zero_padded=True,
-            source="every 8th view from view 0 on (graphdeco-inria/gaussian-splatting, scene/dataset_readers.py)",
-        )
-    if name == "mvsnerf":
-        return ScoreProtocol(
-            name=name,
-            mask="depth",
-            size=(640, 512),
-            scans=MVSNERF_SCANS,
-            training=MVSNERF_TRAINING,
-            scored=MVSNERF_SCORED,
-            source="apchenstu/mvsnerf, data/dtu_ft.py, renderer.ipynb, configs/pairs.th",
-        )
-    if name in ("regnerf-3", "regnerf-6", "regnerf-9"):
-        return _regnerf(name)
-    if name.startswith("holdout:"):
-        return _holdout(name)
-    near = difflib.get_close_matches(name, NAMES, n=1)
-    choice = f"did you mean {near[0]}?" if near else "use one of: " + ", ".join(NAMES)
-    raise UsageError(f"--protocol {name}: unknown", remedy=choice)
-
-
-def _regnerf(name: str) -> ScoreProtocol:
     unused = {*REGNERF_INPUTS, *REGNERF_EXCLUDED}
     return ScoreProtocol(
-        name=name,
+        name=f"regnerf-{num_training}",
         mask="object",
         fill=1.0,
         size=(400, 300),
         scans=REGNERF_SCANS,
-        training=REGNERF_INPUTS[: int(name[-1])],
+        training=REGNERF_INPUTS[:num_training],
         scored=tuple(n for n in range(DTU_VIEWS) if n not in unused),
         source="google-research/google-research, regnerf/internal/datasets.py, regnerf/eval.py",
     )
+
+
+_FIXED = (
+    ScoreProtocol(  # as surface methods print it (scripts/dtu_eval.py)
+        name="dtu-train",
+        scans=SURFACE_SCANS,
+        is_zero_padded=True,
+        source="every view trains and is scored: DTU has no test views (hbb1/2d-gaussian-splatting, thread 13)",
+    ),
+    ScoreProtocol(  # ``llffhold = 8``
+        name="dtu-holdout8",
+        every=EVERY,
+        is_zero_padded=True,
+        source="every 8th view from view 0 on (graphdeco-inria/gaussian-splatting, scene/dataset_readers.py)",
+    ),
+    *(_regnerf(num_training) for num_training in (3, 6, 9)),
+    ScoreProtocol(  # the views of its configs/pairs.th as autonomousvision/murf, datasets/dtu.py, writes them out
+        name="mvsnerf",
+        mask="depth",
+        size=(640, 512),
+        scans=MVSNERF_SCANS,
+        training=MVSNERF_TRAINING,
+        scored=MVSNERF_SCORED,
+        source="apchenstu/mvsnerf, data/dtu_ft.py, renderer.ipynb, configs/pairs.th",
+    ),
+)
+PROTOCOLS = {protocol.name: protocol for protocol in _FIXED}
+
+
+def score_protocol(name: str) -> ScoreProtocol:
+    """The protocol of that name, or of a ``holdout:`` rule. Raises UsageError with the choices."""
+    if name.startswith("holdout:"):
+        return _holdout(name)
+    if name in PROTOCOLS:
+        return PROTOCOLS[name]
+    choices = (*PROTOCOLS, "holdout:RULE")
+    near = difflib.get_close_matches(name, choices, n=1)
+    choice = f"did you mean {near[0]}?" if near else "use one of: " + ", ".join(choices)
+    raise UsageError(f"--protocol {name}: unknown", remedy=choice)
 
 
 def _holdout(name: str) -> ScoreProtocol:

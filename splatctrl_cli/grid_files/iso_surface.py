@@ -14,6 +14,7 @@ from skimage.measure import marching_cubes
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.grid_files.grid_format import CHUNK, GridFormat, check_grid
+from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import DistanceGrid, Float32, Float64
 
 SUFFIXES = (".ply", ".obj", ".stl")
@@ -71,8 +72,6 @@ def write_surface(path: Path, surface: Surface) -> None:
 
     Raises UsageError for another suffix.
     """
-    import trimesh
-
     if path.suffix not in SUFFIXES:
         raise UsageError(f"{path}: expected a suffix of {', '.join(SUFFIXES)}, got {path.suffix}")
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
@@ -121,8 +120,6 @@ def _joined(grid: DistanceGrid, vertices: Float64, faces: NDArray[np.int64]) -> 
 
 def describe_mesh(path: Path, _head: bytes) -> Summary | None:
     """A ``.obj`` or ``.stl`` that trimesh reads, such as a surface of the field; read whole."""
-    import trimesh
-
     if path.suffix.lower() not in {".obj", ".stl"}:
         return None
     try:

@@ -45,7 +45,11 @@ INPUTS = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
 CAPTURE, USING, TRUTH = "{out}/tabletop.capture", "--threads {threads}", "--truth {data}/truth.json"
 ROBOT = "--urdf {data}/robot.urdf --spheres {data}/robot_spheres.yaml"
+RECONSTRUCT = f"reconstruct {CAPTURE} --cameras {','.join(TRAINING)} {ROBOT} -o {{out}}/scene {USING}"
+BAKE = f"sdf-bake {{out}}/scene {ROBOT} {TRUTH} --seen-by {CAPTURE} -o {{out}}/field {USING}"
+SCORE = f"score {{out}}/scene --reference {CAPTURE} --cameras {','.join(SCORING)} -o {{out}}/score {USING}"
 AGAINST = f"replay {CAPTURE} --scene {{out}}/scene {ROBOT} {TRUTH}"
+DRIVE = f"{AGAINST} --mode closed-loop --start-time {CLOSED_LOOP_START} -o {{out}}/closed_loop {USING}"
 PICTURES = {
     "renders.png": "photo, render and depth error of each camera",
     "field_slice.png": "a slice of the distance field with the arm's spheres",
@@ -85,7 +89,7 @@ class Step:
 
     words: Sequence[str]
     run: Callable[[], StepResult]
-    expected: str = "done"
+    expected: str
 
     @property
     def name(self) -> str:
@@ -133,6 +137,8 @@ def _steps(request: DemoRequest, out: Path, progress: Progress) -> list[Step]:
     capture, scene = out / "tabletop.capture", out / "scene"
     training = RecordingRequest(path=capture, options=SourceOptions(cameras=TRAINING))
     scoring = RecordingRequest(path=capture, options=SourceOptions(cameras=SCORING))
+    ingested = IngestRequest(paths=(log,), out=capture)
+    exported = ExportRequest(scene=scene, out=out / "tabletop.ply")
     measured = BakeRequest(
         scene=scene, out=out / "field", urdf=urdf, spheres=spheres, truth=truth, seen_by=capture, threads=threads
     )
@@ -150,51 +156,29 @@ def _steps(request: DemoRequest, out: Path, progress: Progress) -> list[Step]:
     driven = replace(audited, out=out / "closed_loop", mode="closed-loop", start_time=CLOSED_LOOP_START)
 
     def reconstructed() -> ReconstructResult:
+        source, options = open_to_train(training), {**DECIDING_OPTIONS, "cameras": ",".join(TRAINING)}
         asked = ReconstructRequest(
-            source=open_to_train(training),
-            out=scene,
-            urdf=urdf,
-            spheres=spheres,
-            options={**DECIDING_OPTIONS, "cameras": ",".join(TRAINING)},
-            threads=threads,
+            source=source, out=scene, urdf=urdf, spheres=spheres, options=options, threads=threads
         )
         return reconstruct(asked, progress)
 
-    def step(text: str, run: Callable[[], StepResult], expected: str = "done") -> Step:
-        words = [word.format(data=data, out=out, threads=threads) for word in text.split()]
-        return Step(words=words, run=run, expected=expected)
-
+    steps: tuple[tuple[str, Callable[[], StepResult], str], ...] = (
+        ("info {data}/log.mcap", lambda: describe(log, SourceOptions()), "done"),
+        (f"ingest {{data}}/log.mcap -o {CAPTURE}", lambda: ingest(ingested, progress), "done"),
+        (RECONSTRUCT, reconstructed, "passed"),
+        ("export {out}/scene -o {out}/tabletop.ply", lambda: export(exported, progress), "done"),
+        (BAKE, lambda: bake(measured, progress), "passed"),
+        (SCORE, lambda: score(scored, progress), "passed"),
+        (f"{AGAINST} -o {{out}}/audit {USING}", lambda: replay(audited, progress), "safe"),
+        (DRIVE, lambda: replay(driven, progress), "margin broken"),  # the map errs by mm, and the truth shows it
+    )
     return [
-        step("info {data}/log.mcap", lambda: describe(log, SourceOptions())),
-        step(
-            f"ingest {{data}}/log.mcap -o {CAPTURE}",
-            lambda: ingest(IngestRequest(paths=(log,), out=capture), progress),
-        ),
-        step(
-            f"reconstruct {CAPTURE} --cameras {','.join(TRAINING)} {ROBOT} -o {{out}}/scene {USING}",
-            reconstructed,
-            "passed",
-        ),
-        step(
-            "export {out}/scene -o {out}/tabletop.ply",
-            lambda: export(ExportRequest(scene=scene, out=out / "tabletop.ply"), progress),
-        ),
-        step(
-            f"sdf-bake {{out}}/scene {ROBOT} {TRUTH} --seen-by {CAPTURE} -o {{out}}/field {USING}",
-            lambda: bake(measured, progress),
-            "passed",
-        ),
-        step(
-            f"score {{out}}/scene --reference {CAPTURE} --cameras {','.join(SCORING)} -o {{out}}/score {USING}",
-            lambda: score(scored, progress),
-            "passed",
-        ),
-        step(f"{AGAINST} -o {{out}}/audit {USING}", lambda: replay(audited, progress), "safe"),
-        step(
-            f"{AGAINST} --mode closed-loop --start-time {CLOSED_LOOP_START} -o {{out}}/closed_loop {USING}",
-            lambda: replay(driven, progress),
-            "margin broken",  # the map errs by millimetres, and the truth shows it
-        ),
+        Step(
+            words=[word.format(data=data, out=out, threads=threads) for word in text.split()],
+            run=run,
+            expected=expected,
+        )
+        for text, run, expected in steps
     ]
 
 

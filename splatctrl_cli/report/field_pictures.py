@@ -4,11 +4,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import DistanceGrid, Float64, VoxelState
 from splatctrl_cli.report.pictures import (
     CONTOURS,
@@ -20,9 +21,6 @@ from splatctrl_cli.report.pictures import (
     extent_of,
     save_figure,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 LONGEST_SIDE = 600  # cells of a slice that are drawn along a side: a larger one is thinned out
 MAX_LENGTH = 1.5  # of a gradient, top of its colour bar
@@ -145,7 +143,9 @@ def _draw_histogram(axes: Any, histogram: Sequence[int], bin_width: float) -> No
 
 
 @contextmanager
-def _panels(grid: DistanceGrid, point: Sequence[float]) -> Iterator[tuple["Figure", list[tuple[Any, Cut]]]]:
+def _panels(
+    grid: DistanceGrid, point: Sequence[float]
+) -> Iterator[tuple["mpl.figure.Figure", list[tuple[Any, Cut]]]]:
     """Axes for the slices across z, y and x, side by side at one scale."""
     cuts = _cuts(grid, point, axes=(2, 1, 0))
     sides = np.array([[float(np.ptp(c)) + cut.voxel for c in cut.coordinates] for cut in cuts])

@@ -1,23 +1,21 @@
 """Pictures a person can look at: renders beside photos, slices of a distance field, clearance over time.
 
-Matplotlib is imported when a picture is drawn, and drawn through its Figure (Agg): nothing global is touched. Colours
-are those of Okabe and Ito or maps that stay readable without red and green.
+Drawn through Matplotlib's Figure: nothing global is touched. Colours are those of Okabe and Ito or maps that stay
+readable without red and green.
 """
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import DistanceGrid, Float32, Float64, UInt8
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WIDTH = 12.0  # inches; at DPI 100 the width is 1200 pixels
 DPI = 100
@@ -122,20 +120,15 @@ def span_of(seconds: Float64) -> tuple[float, float]:
 
 
 @contextmanager
-def drawn_figure(height: float) -> Iterator["Figure"]:
+def drawn_figure(height: float) -> Iterator["mpl.figure.Figure"]:
     """A figure of the house style, 1200 pixels wide."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08))
-        FigureCanvasAgg(figure)
+        layout = mpl.layout_engine.ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
+        figure = mpl.figure.Figure(figsize=(WIDTH, height), dpi=DPI, layout=layout)
         yield figure
 
 
-def save_figure(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "mpl.figure.Figure", path: Path) -> None:
     """Write the figure without the clock in it."""
     engine = figure.get_layout_engine()
     if engine is not None:
@@ -144,7 +137,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
     figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": "splatctrl"})
 
 
-def _draw_comparison(figure: "Figure", axes: Sequence[Any], row: ComparisonRow) -> None:
+def _draw_comparison(figure: "mpl.figure.Figure", axes: Sequence[Any], row: ComparisonRow) -> None:
     photo, render, error, bar = axes
     photo.imshow(row.photo, interpolation="nearest")
     render.imshow(np.clip(row.render, 0.0, 1.0), interpolation="nearest")
@@ -193,10 +186,9 @@ def draw_distance(
 
 def pale_red_to_blue() -> Any:
     """Red inside, blue outside, white on the surface, pale enough for lines and circles on top."""
-    from matplotlib import colormaps
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("pale_red_blue", colormaps["RdBu"](np.linspace(0.18, 0.80, 63)))
+    return mpl.colors.LinearSegmentedColormap.from_list(
+        "pale_red_blue", mpl.colormaps["RdBu"](np.linspace(0.18, 0.80, 63))
+    )
 
 
 def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArray[np.bool_], voxel: float) -> None:
@@ -212,27 +204,27 @@ def draw_never_seen(axes: Any, coordinates: Sequence[Float64], never_seen: NDArr
 
 def _explain(axes: Any, *, has_spheres: bool, has_observed: bool) -> None:
     """A legend under the picture for what has no axis of its own."""
-    from matplotlib.patches import Patch
-
     entries = []
     if has_spheres:
-        entries.append(Patch(facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, label="robot spheres, cut by the plane"))
+        entries.append(
+            mpl.patches.Patch(facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, label="robot spheres, cut by the plane")
+        )
     if has_observed:
-        entries.append(Patch(facecolor="#eeeeee", edgecolor="#a8a8a8", hatch="////", label="never seen"))
+        entries.append(mpl.patches.Patch(facecolor="#eeeeee", edgecolor="#a8a8a8", hatch="////", label="never seen"))
     if entries:
         axes.legend(handles=entries, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2)
 
 
 def _draw_cut_spheres(axes: Any, spheres: tuple[Float64, Float64], axis: int, plane: float) -> None:
     """The circles in which the plane cuts the spheres."""
-    from matplotlib.patches import Circle
-
     centers, radii = spheres
     first, second = (other for other in range(3) if other != axis)
     squared = np.square(radii) - np.square(centers[:, axis] - plane)
     for center, cut in zip(centers[squared > 0], np.sqrt(squared[squared > 0]), strict=True):
         axes.add_patch(
-            Circle((center[first], center[second]), cut, facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, linewidth=1.2)
+            mpl.patches.Circle(
+                (center[first], center[second]), cut, facecolor=SPHERE_FILL, edgecolor=SPHERE_EDGE, linewidth=1.2
+            )
         )
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Bool, Float64
 from splatctrl_cli.report.pictures import INK, SPHERE_EDGE, drawn_figure, save_figure
 from splatctrl_cli.robot.coverage import areas, refined
@@ -49,23 +50,21 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
 
 def _draw_shapes(view: Any, triangles: Float64, is_bare: Bool, plane: tuple[int, int], viewer: Float64) -> None:
     """Triangles painted from far to near, lit from the viewer."""
-    from matplotlib.collections import PolyCollection
-
     order = np.argsort(triangles.mean(axis=1) @ viewer, kind="stable")
     seen = triangles[order]
     normal = np.cross(seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0])
     light = 0.55 + 0.45 * np.abs(normal @ viewer) / np.linalg.norm(normal, axis=1)
     colors = np.where(is_bare[order, None], UNCOVERED, BODY) * light[:, None]
     view.add_collection(
-        PolyCollection(list(seen[:, :, list(plane)]), facecolors=colors, edgecolors=colors, linewidths=0.2)
+        mpl.collections.PolyCollection(
+            list(seen[:, :, list(plane)]), facecolors=colors, edgecolors=colors, linewidths=0.2
+        )
     )
 
 
 def _draw_spheres(view: Any, centers: Float64, radii: Float64) -> None:
-    from matplotlib.collections import EllipseCollection
-
     size = 2 * radii
-    discs = EllipseCollection(
+    discs = mpl.collections.EllipseCollection(
         size,
         size,
         np.zeros(len(radii)),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import Float64, UInt8
 from splatctrl_cli.report.pictures import MAX_DEPTH_ERROR, WIDTH, ComparisonRow, drawn_figure, save_figure
 
@@ -90,9 +91,7 @@ def _outline(panels: Any, mask: NDArray[np.bool_]) -> None:
 
 
 def _rgba(color: str) -> Float64:
-    from matplotlib.colors import to_rgba
-
-    return np.asarray(to_rgba(color))
+    return np.asarray(mpl.colors.to_rgba(color))
 
 
 def _finish(panel: Any, text: str) -> None:
