@@ -34,7 +34,7 @@ def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Boo
         return np.zeros_like(chosen)
     shown, reach = mask.robot_depth, pixels_of(CONTACT, frame, mask.robot_depth)
     chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT  # few, and all that may be
-    chosen &= frame.depth < farthest_within(shown, is_robot, reach) + CONTACT + THICKNESS
+    chosen &= frame.depth < farthest_within(shown, reach) + CONTACT + THICKNESS
     chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
     return chosen
 

@@ -74,7 +74,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     tolerance = tolerance_at(depth, config)
     nearest = nearest_within(rendered, is_robot, reach) - tolerance
     is_explained = has_depth & (depth >= nearest)
-    is_explained &= depth <= farthest_within(rendered, is_robot, reach) + tolerance
+    is_explained &= depth <= farthest_within(rendered, reach) + tolerance
     if surface.vague:
         is_explained |= np.isin(inside, surface.vague)
     kinds[is_explained] = PixelKind.ROBOT
@@ -215,21 +215,21 @@ def _mixed(depth: Float32, candidate: Bool, front: Float32, core: Bool, toleranc
     at_edge = candidate & ~core & np.isfinite(front) & (depth > front)
     beside = candidate & ~np.isfinite(front)
     nearest_beside = nearest_within(depth, beside, 2 * reach + 2)
-    is_open = np.isinf(nearest_beside)
     num_near = cv2.boxFilter(candidate.view(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    is_mixed = np.where(is_open, num_near == 1, depth < nearest_beside - tolerance)
-    return np.asarray(at_edge & is_mixed)
+    is_alone = np.isfinite(nearest_beside) | (num_near == 1)
+    return np.asarray(at_edge & is_alone & (depth < nearest_beside - tolerance))
 
 
 def nearest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
     """Least depth (H, W) of the chosen pixels within `reach` pixels; inf where there are none."""
-    kept = np.where(chosen, depth, np.float32(np.inf))
+    kept = np.full(depth.shape, np.inf, np.float32)
+    cv2.copyTo(depth, chosen.view(np.uint8), kept)
     return np.asarray(cv2.erode(kept, _window(reach)), np.float32)
 
 
-def farthest_within(depth: Float32, chosen: Bool, reach: int) -> Float32:
-    """Greatest depth (H, W) of the chosen pixels within `reach` pixels; -inf where there are none."""
-    return -nearest_within(-depth, chosen, reach)
+def farthest_within(depth: Float32, reach: int) -> Float32:
+    """Greatest depth (H, W) within `reach` pixels; 0 where there is none."""
+    return np.asarray(cv2.dilate(depth, _window(reach)), np.float32)
 
 
 def _window(reach: int) -> UInt8:
