@@ -167,7 +167,7 @@ def _run(arguments: list[str], box: Path) -> None:
 
 def _states(path: Path) -> int:
     """What `replay` reads of a log."""
-    from splatctrl_cli.logs.options import SourceOptions
+    from splatctrl_cli.logs.source_options import SourceOptions
     from splatctrl_cli.states.state_source import open_states
 
     try:

@@ -19,7 +19,7 @@ from benchmarks.measure import SAMPLE, Limit, Options, Result, medians
 from benchmarks.scenes import enlarged
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import write_capture
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 

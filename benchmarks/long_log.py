@@ -19,7 +19,7 @@ from benchmarks.scenes import sample_fitter, sample_robot
 from splatctrl_cli.config import Config
 from splatctrl_cli.field.obstacles import field_splats
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.grid_files.grid import write_npz
+from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.records import Box, Float64
 
 RATE = 1000  # states per second

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.planning_problems import Problem
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.planner.path import joint_length, resampled
 from splatctrl_cli.records import Float64

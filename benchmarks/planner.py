@@ -15,7 +15,7 @@ from benchmarks.planning_problems import Problem, panda, read_problems
 from splatctrl_cli.config import ControlConfig, PlannerConfig
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.planner.birrt import Plan, plan
-from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.planner.path import effector_length, joint_length, least_clearance, resampled, timed
 from splatctrl_cli.planner.tracking import TrackingRun, follow_joints, follow_with_controller

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.planner.solids import Ball, Cuboid, Rod, Solid, Solids
+from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 

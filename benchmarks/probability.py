@@ -21,9 +21,9 @@ from benchmarks.measure import machine
 from benchmarks.surfaces import points_around, shapes, splats_on
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.probability import CalibratedProbability, PaperProbability
-from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.records import Float64
 from splatctrl_cli.report.reliability import Reliability, reliability, reliability_picture
 

@@ -26,19 +26,19 @@ from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of, read_arrays, savez
 from splatctrl_cli.files.image_file import image_head
 from splatctrl_cli.files.pfm import read_pfm, write_pfm
-from splatctrl_cli.grid_files.grid import read_npz
 from splatctrl_cli.grid_files.grid_formats import write_grid
+from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.grid_files.nrrd import read_nrrd_head
 from splatctrl_cli.grid_files.vti import read_vti
 from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError
 from splatctrl_cli.logs.encodings import decode_rvl
 from splatctrl_cli.logs.messages import read_image
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.splat_files.splat_formats import FORMATS
-from tests.containers.test_bag_log import as_ros1_bag, as_ros2_folder
 from tests.containers.test_foxglove import descriptor_set
+from tests.containers.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.datasets.make_layout import make_nerfstudio, make_redwood, make_tum
 from tests.grid_files.make_grid import random_grid
 from tests.logs.make_log import LogRecipe, make_log

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from splatctrl_cli.cli.common import table
-from splatctrl_cli.control.ladder import assemble
+from splatctrl_cli.control.fallbacks import assemble
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QpSolver, QuadraticProgram
 from splatctrl_cli.control.terms import Barrier, reach_cost, stray_cost
 from splatctrl_cli.records import Float64

@@ -21,7 +21,7 @@ from benchmarks.scenes import sample_robot
 from benchmarks.tabletop_scenes import FRAME, STAMP_NS, TableScene, reconstructed, table_scene
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.field.distance import SphereField, make_field

@@ -17,14 +17,14 @@ from splatctrl_cli import config
 from splatctrl_cli.checks.finding import CHECKS, Check
 from splatctrl_cli.cli.commands import COMMANDS, EXIT_CODES, build_parser
 from splatctrl_cli.cli.parser import Parser, invocation
-from splatctrl_cli.config.declared import OneOf, Section
 from splatctrl_cli.config.load import type_name
+from splatctrl_cli.config.ranges import OneOf, Section
 from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.datasets.layouts import LAYOUTS
 from splatctrl_cli.evaluate.verdict import Criterion
 from splatctrl_cli.grid_files.grid_format import GridFormat
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
-from splatctrl_cli.jobs.replays.judged import Judged
+from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.splat_files.splat_format import SplatFormat
 from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS

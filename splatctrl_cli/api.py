@@ -9,14 +9,14 @@ from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
 from splatctrl_cli.jobs.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake_request import BakeRequest
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
+from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 
 __all__ = [

@@ -16,7 +16,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import load_config
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.jobs.replays.metrics import metric_names
-from splatctrl_cli.jobs.replays.people import read_baselines
+from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("sample_data/*.md")])

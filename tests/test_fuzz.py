@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.fuzz import fault_of
 from benchmarks.fuzz_mutate import mutated
-from benchmarks.killed import contents, exact, judge
+from benchmarks.kill_test import contents, exact, judge
 
 ROOT = Path(__file__).parent.parent
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.cli.main import main as splatctrl
 from splatctrl_cli.config import Config
-from splatctrl_cli.config.declared import Section, Within
+from splatctrl_cli.config.ranges import Section, Within
 
 NUMBERS = ("nan", "inf", "-inf", "0", "0.0", "-0.0", "1e308", "-1e308", "1e-320", "9" * 400, "'word'", "true", "[]")
 WORDS = ("bogus", "''", "nan", "0", "true", "[]")

@@ -23,7 +23,7 @@ from splatctrl_cli.logs.joint_topics import (
     without_joints,
 )
 from splatctrl_cli.logs.messages import decode_file, metres
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask, merged
 from splatctrl_cli.records import (

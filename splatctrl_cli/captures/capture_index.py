@@ -12,7 +12,7 @@ from typing import IO, BinaryIO
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.rows import scratch_folder
+from splatctrl_cli.files.spilled_rows import scratch_folder
 
 SUMS = "SHA256SUMS"
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")

@@ -20,14 +20,14 @@ from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_header import AGAIN
 from splatctrl_cli.captures.capture_index import SUMS
 from splatctrl_cli.captures.capture_writer import VERSION
-from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_records import ATTACHMENT, BadRecordError, Metadata, parse_record
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.mcap_writer import MILLIMETRES, McapLog, mcap_log
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
 
 MOST_FILES = 1 << 20  # an empty file takes a disk's block, its name in an archive thirty bytes

@@ -18,7 +18,7 @@ from splatctrl_cli.captures.capture_index import COLUMNS, MASKS, Checksums
 from splatctrl_cli.captures.capture_journal import Entry, Journal, check_same_frame
 from splatctrl_cli.errors import InputError, WriteError
 from splatctrl_cli.files.output import sha256, write_json
-from splatctrl_cli.files.rows import Table, blocks_of
+from splatctrl_cli.files.spilled_rows import Table, blocks_of
 from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.logs.joint_topics import FOLDER, JointTopics, write_topics
 from splatctrl_cli.logs.messages import metres

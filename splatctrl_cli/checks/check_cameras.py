@@ -9,9 +9,9 @@ import numpy as np
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.logs.decoder import CAMERA_INFO
 from splatctrl_cli.logs.image_stamps import pair_by_stamp
-from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, NUM_COEFFICIENTS, SAME_MODELS
 from splatctrl_cli.logs.rig import Camera, intrinsics_of, nearest_gap_ns
+from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
 from splatctrl_cli.logs.tf_tree import MAX_GAP_NS
 from splatctrl_cli.records import Float64, Intrinsics

@@ -17,14 +17,14 @@ from splatctrl_cli.checks.check_times import (
     peer_findings,
     time_findings,
 )
-from splatctrl_cli.checks.check_watch import LogWatch, checked_camera, image_motion, ready
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, warning
+from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TRANSFORMS
 from splatctrl_cli.logs.messages import COLOR_CONVERSIONS, DEPTH_ENCODINGS
-from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.rig import camera_topics, check_mask_topics, missing
+from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.survey import Survey, survey
 from splatctrl_cli.robot.model import RobotModel

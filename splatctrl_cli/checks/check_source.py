@@ -18,7 +18,7 @@ from splatctrl_cli.checks.check_times import TimesWatch, time_findings
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, error, needs, note, warning
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateCollector
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
 from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.checks.finding import Finding, error, note, warning
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.rows import blocks_of, ranges
+from splatctrl_cli.files.spilled_rows import blocks_of, ranges
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.logs.joint_log import JointStream
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.state_topics import joint_records

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatctrl_cli.cli.parser import MAX_LENGTH, MAX_SEED, Options, Parser, real, several, whole
-from splatctrl_cli.config.declared import shown
+from splatctrl_cli.config.ranges import shown
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.gates import gate
-from splatctrl_cli.logs.options import CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.logs.source_options import CameraTopics, PoseTopic, SourceOptions
 
 T = TypeVar("T")
 

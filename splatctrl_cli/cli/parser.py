@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn, TypeVar
 
-from splatctrl_cli.config.declared import OneOf, Section, Within, shown
+from splatctrl_cli.config.ranges import OneOf, Section, Within, shown
 from splatctrl_cli.errors import UsageError
 
 T = TypeVar("T", int, float)

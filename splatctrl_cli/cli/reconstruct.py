@@ -10,10 +10,10 @@ from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
 from splatctrl_cli.records import Box
 

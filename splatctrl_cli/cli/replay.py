@@ -7,13 +7,13 @@ from pathlib import Path
 from splatctrl_cli.cli.common import Console, long_table, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import load_config
-from splatctrl_cli.control.presets import with_preset
+from splatctrl_cli.control.printed_program import with_preset
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.compare import MOTION, PLAN, figures_of
 from splatctrl_cli.jobs.replays.files import chunks_of, when_and_why
-from splatctrl_cli.jobs.replays.people import FIGURES
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.replays.result import Comparison, Replay
+from splatctrl_cli.jobs.replays.standstill_baseline import FIGURES
 
 HEADLINE = (
     *("min_clearance", "min_clearance_certified", "min_clearance_true", "min_self_clearance", "min_limit_margin"),

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.config.declared import Section, Within, check, cut, shown
 from splatctrl_cli.config.map import FieldConfig, GaussianConfig, HumanConfig, OccupancyConfig, SceneConfig
 from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
+from splatctrl_cli.config.ranges import Section, Within, check, cut, shown
 from splatctrl_cli.errors import InputError, UsageError
 
 

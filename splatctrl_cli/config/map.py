@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from splatctrl_cli.config.declared import OneOf, Section, Within, check
+from splatctrl_cli.config.ranges import OneOf, Section, Within, check
 
 MOST_ITERATIONS = 1_000_000  # of an optimiser: hours
 

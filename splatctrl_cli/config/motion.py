@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from splatctrl_cli.config.declared import OneOf, Section, Within, check
+from splatctrl_cli.config.ranges import OneOf, Section, Within, check
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,9 @@ import numpy as np
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import scene_margin
-from splatctrl_cli.control.checks import (
+from splatctrl_cli.control.fallbacks import Rung
+from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
+from splatctrl_cli.control.preconditions import (
     StaticViolation,
     check_free,
     check_goal,
@@ -19,8 +21,6 @@ from splatctrl_cli.control.checks import (
     sphere_clearance,
     static_violations,
 )
-from splatctrl_cli.control.goals import Detour, Guide, LoggedMotion, PlanDetour, TwistTrack, pose_error
-from splatctrl_cli.control.ladder import Rung
 from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController

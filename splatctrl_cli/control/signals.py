@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.control.audit import AuditTrace
 from splatctrl_cli.control.events import EventKind, OneEach, Signal
-from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.motion_limits import Strain
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind

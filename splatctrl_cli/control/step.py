@@ -7,13 +7,13 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.checks import check_coverage, check_model, checked_posture
+from splatctrl_cli.control.fallbacks import Choice, Rung, descend
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
-from splatctrl_cli.control.ladder import Choice, Rung, descend
 from splatctrl_cli.control.limits import JointLimits
-from splatctrl_cli.control.presets import PAPER, solve_printed
+from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
+from splatctrl_cli.control.printed_program import PAPER, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named
-from splatctrl_cli.control.rows import RowBuilder, Rows
+from splatctrl_cli.control.qp_rows import RowBuilder, Rows
 from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
 from splatctrl_cli.records import Bool, DistanceField, Float64
 

@@ -18,7 +18,7 @@ from splatctrl_cli.datasets.poses import (
 )
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.options import SourceOptions, still_note
+from splatctrl_cli.logs.source_options import SourceOptions, still_note
 from splatctrl_cli.records import Float64, LossReport
 
 HOLDOUT = "holdout"

@@ -18,8 +18,8 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.logs.messages import decode_file, metres, num_invalid
-from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
 

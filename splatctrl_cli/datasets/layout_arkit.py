@@ -17,7 +17,7 @@ from splatctrl_cli.datasets.layout import Layout, Lenses, described, images_of, 
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_rows, stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 TRAJECTORY = "lowres_wide.traj"

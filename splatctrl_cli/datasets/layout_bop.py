@@ -23,7 +23,7 @@ from splatctrl_cli.datasets.layout import (
     read_json,
 )
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 FILE = "scene_camera.json"

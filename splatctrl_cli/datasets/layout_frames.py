@@ -31,7 +31,7 @@ from splatctrl_cli.datasets.layout import (
 from splatctrl_cli.datasets.layout_scannet import find_info, read_info
 from splatctrl_cli.datasets.poses import rigid
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 DEPTH_LENS = (585.0, 585.0, 320.0, 240.0)

@@ -24,7 +24,7 @@ from splatctrl_cli.datasets.folder_description import (
 from splatctrl_cli.datasets.layout import Layout, Lenses, image_size
 from splatctrl_cli.datasets.poses import read_nerfstudio
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 FILE = "transforms.json"

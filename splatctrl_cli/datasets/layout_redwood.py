@@ -15,7 +15,7 @@ from splatctrl_cli.datasets.folder_description import CameraTable, Description, 
 from splatctrl_cli.datasets.layout import Layout, Pairs, described, images_of, read_json
 from splatctrl_cli.datasets.poses import read_trajectory_log
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 
 COLOR_FOLDERS = ("color", "colors", "image", "rgb")
 TRAJECTORIES = (

@@ -29,7 +29,7 @@ from splatctrl_cli.datasets.layout import (
 from splatctrl_cli.datasets.poses import read_matrix_file, rigid
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 INFO_NAMES = ("_info.txt", "info.txt")

@@ -14,7 +14,7 @@ from splatctrl_cli.datasets.folder_description import DepthTable, Description, P
 from splatctrl_cli.datasets.layout import Layout, described, images_of, paired_by_stamp, pinhole, pose_or_none, read_K
 from splatctrl_cli.datasets.poses import read_numbers, stamp_of_text
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 

@@ -32,7 +32,7 @@ from splatctrl_cli.datasets.layout import (
 )
 from splatctrl_cli.datasets.poses import Trajectory, read_numbers, read_tum, rigid, stamp_of_text
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 SCALE = 1.0 / 5000.0  # [m] per count

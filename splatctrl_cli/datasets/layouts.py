@@ -8,7 +8,7 @@ from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import names_in
 from splatctrl_cli.files.registry import entries_of
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 
 _LOGS = (".mcap", ".bag", ".db3")
 _MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is not itself one

@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from splatctrl_cli.evaluate.clearance import least
+from splatctrl_cli.evaluate.clearance_agreement import least
 from splatctrl_cli.records import Bool, Float64
 
 R = TypeVar("R")  # the result that has the metric

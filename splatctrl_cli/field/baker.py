@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
-from splatctrl_cli.field.layout import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
+from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout, observed_planes
 from splatctrl_cli.field.probability import make_probability
-from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
 from splatctrl_cli.records import Bool, Float32, OccupancyGrid, SplatSet, UInt8

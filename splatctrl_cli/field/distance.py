@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.clustered_splats import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.kernel import Matern12, SquaredExponential
-from splatctrl_cli.field.spheres import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.weights import weights_named
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.field.baker import Baker, Planes
-from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
 from splatctrl_cli.records import Float64, SplatSet, UInt8

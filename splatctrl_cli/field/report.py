@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.field.grid import exact_channel
-from splatctrl_cli.field.layout import RESOLUTION
+from splatctrl_cli.field.grid_cells import RESOLUTION
+from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.records import DistanceGrid, Float32, VoxelState
 
 CHUNK_CELLS = 1 << 20  # that are looked at together

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.config.declared import check
+from splatctrl_cli.config.ranges import check
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.field.layout import HALF_DIAGONAL
+from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
 from splatctrl_cli.records import Bool, DistanceGrid, Float32, VoxelState
 
 BLANKED = ("sdf", "gradient", "probability")  # by nan

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.field.conjugate import solve_process
+from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.full_gp import solve_process
 from splatctrl_cli.field.kernel import Kernel, Matern12
-from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.field.voxel_density import voxel_row_sums
 from splatctrl_cli.records import Float32, Float64
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_head
-from splatctrl_cli.files.rows import BLOCK, RowFile, Rows
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows
 
 Stamps = NDArray[np.int64]
 FREE_BYTES = 1 << 30  # of an array, unpacked, and beside it:

@@ -14,9 +14,9 @@ from splatctrl_cli.evaluate.field_truth import FIELDS
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, KERNEL_OF, Baker
+from splatctrl_cli.field.grid_cells import LOSS, GridLayout, bounding_box, check_loss
 from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.incremental import Changes, changed_blocks, counts_after
-from splatctrl_cli.field.layout import LOSS, GridLayout, bounding_box, check_loss
 from splatctrl_cli.field.obstacles import ObstacleSpheres, field_splats, obstacle_spheres
 from splatctrl_cli.field.report import GridStatistics, grid_statistics
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, slabs

@@ -18,9 +18,9 @@ from splatctrl_cli.evaluate.field_truth import (
     compare_with_truth,
 )
 from splatctrl_cli.evaluate.held_out_depth import HeldOutComparison, compare_with_held_out_depth, counted_pixels
-from splatctrl_cli.field.grid import exact_channel
+from splatctrl_cli.field.clustered_splats import Spheres
+from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.field.probability import probabilities
-from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.jobs.bake_request import BakeRequest, BakeSource
 from splatctrl_cli.records import DistanceGrid, Float64, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel

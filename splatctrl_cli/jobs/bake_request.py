@@ -11,11 +11,11 @@ import numpy as np
 from splatctrl_cli import __version__
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field.layout import GridLayout, check_room
+from splatctrl_cli.field.grid_cells import GridLayout, check_room
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS
+from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.files.parts import Parts
-from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.records import Balls, Box, DistanceGrid, Label, OccupancyGrid, SplatSet
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
 from splatctrl_cli.splat_files.splats import read_world_splats

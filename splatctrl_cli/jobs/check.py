@@ -11,9 +11,9 @@ from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, error, 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene.consistency import CAUSES, agreements
+from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 from splatctrl_cli.sources.source import open_logs
 
 RANGE = (0.2, 6.0)  # [m] of depth that is compared between views

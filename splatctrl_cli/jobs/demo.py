@@ -11,26 +11,26 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.presets import with_preset
+from splatctrl_cli.control.printed_program import with_preset
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_run
 from splatctrl_cli.files.summary import Summary
-from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake_request import BakeRequest
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, ingest
+from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
 from splatctrl_cli.robot.model import RobotModel

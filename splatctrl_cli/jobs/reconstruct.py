@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest, training_cameras
 from splatctrl_cli.jobs.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
-from splatctrl_cli.robot.declared import Declarations, read_declarations
+from splatctrl_cli.robot.declared_contact import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
-from splatctrl_cli.evaluate.recording import first_frame
+from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path
 from splatctrl_cli.jobs.progress import SILENT, Progress

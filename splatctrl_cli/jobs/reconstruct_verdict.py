@@ -9,8 +9,8 @@ from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.records import LossReport
-from splatctrl_cli.robot.declared import carried_words
-from splatctrl_cli.scene.audit import AuditRow
+from splatctrl_cli.robot.declared_contact import carried_words
+from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.self_mask import MIN_PIXELS
 
 GATED = (

@@ -11,17 +11,17 @@ from tqdm import tqdm
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.recording import first_frame
+from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Box, JointState, RecordSource
-from splatctrl_cli.robot.declared import Declarations
+from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene.audit import AuditRow
+from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspace_of
-from splatctrl_cli.scene.consistency import CAUSES, agreements
 from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
+from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 from splatctrl_cli.scene_files.scene_folder import FORMAT

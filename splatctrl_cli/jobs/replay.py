@@ -9,20 +9,20 @@ from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import declarations_of
-from splatctrl_cli.jobs.replays.belonging import Mismatch, scene_mismatches, truth_mismatch
+from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.evidence import Evidence, check_evidence, map_error, open_evidence
 from splatctrl_cli.jobs.replays.files import write_replay
 from splatctrl_cli.jobs.replays.goal import check_goal, check_twists
 from splatctrl_cli.jobs.replays.golden import read_golden
 from splatctrl_cli.jobs.replays.inputs import LoggedStates, coverage_words, doubts_of, read_robot, read_states
-from splatctrl_cli.jobs.replays.judged import Judged
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene
 from splatctrl_cli.jobs.replays.metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replays.modes import replayed
-from splatctrl_cli.jobs.replays.people import read_baselines, read_zone
 from splatctrl_cli.jobs.replays.pictures import draw_worst_frames
+from splatctrl_cli.jobs.replays.provenance import Mismatch, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replays.request import MODES, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
+from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone
 from splatctrl_cli.jobs.replays.truth import with_truth
 from splatctrl_cli.jobs.replays.verdict import ASKED, replay_verdict
 from splatctrl_cli.robot.model import RobotModel

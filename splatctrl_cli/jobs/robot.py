@@ -17,9 +17,9 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.report.robot_picture import robot_picture
 from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_of_solids
+from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import SelfCollisionPairs, self_collision_pairs
-from splatctrl_cli.robot.solids import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.sphere_files import SphereFile, read_sphere_file, read_spheres, spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.spheres import are_links_renamed, matched_links

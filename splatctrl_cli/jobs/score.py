@@ -25,8 +25,8 @@ from splatctrl_cli.evaluate.score_report import (
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.field.obstacles import field_splats, obstacle_spheres
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
+from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.recording import RecordingRequest
 from splatctrl_cli.jobs.score_cloud import CloudSettings, cloud_figures
 from splatctrl_cli.jobs.score_reference import (
     Reference,

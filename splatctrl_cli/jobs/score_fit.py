@@ -17,13 +17,13 @@ from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.evaluate.score_report import AVERAGING, judged, mean_of
+from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views, open_to_train
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
-from splatctrl_cli.jobs.recording import RecordingRequest, is_folder_of_views, open_to_train
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, Scoring, chosen, folder_of, score_scene, write_result
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.report.view_picture import renders_picture
 
 NUM_SPLATS = 10_000  # IV-A: what both methods begin with, and the budget of ours

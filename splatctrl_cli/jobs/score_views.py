@@ -8,8 +8,8 @@ from math import isnan
 from operator import itemgetter
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.evaluate.doubts import Doubts
 from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
+from splatctrl_cli.evaluate.score_doubts import Doubts
 from splatctrl_cli.evaluate.views import View, seen_pixels, views_to_score
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.progress import Progress

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatctrl_cli.containers.bag_log import told_formats
+from splatctrl_cli.containers.log_formats import told_formats
 from splatctrl_cli.containers.raw_log import RawLog, Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, is_ros
 from splatctrl_cli.logs.messages import ImageMessage
-from splatctrl_cli.logs.options import CameraTopics
 from splatctrl_cli.logs.realsense import device_of
+from splatctrl_cli.logs.source_options import CameraTopics
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
 
 _TRANSPORTS = {"compressed", "compressedDepth"}

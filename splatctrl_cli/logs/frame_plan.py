@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage
-from splatctrl_cli.files.rows import BLOCK, RowFile, scratch_folder
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, scratch_folder
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.messages import ImageMessage, read_image
 from splatctrl_cli.logs.rig import Camera

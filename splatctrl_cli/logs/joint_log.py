@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.files.rows import Rows
+from splatctrl_cli.files.spilled_rows import Rows
 from splatctrl_cli.logs.state_columns import ColumnWriter
 from splatctrl_cli.logs.state_messages import RawJoints
 from splatctrl_cli.records import Float64

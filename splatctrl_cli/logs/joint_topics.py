@@ -15,9 +15,9 @@ import numpy as np
 from splatctrl_cli.containers.raw_log import Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_head, npy_of
-from splatctrl_cli.files.rows import Rows, blocks_of, ranges
+from splatctrl_cli.files.spilled_rows import Rows, blocks_of, ranges
 from splatctrl_cli.logs.joint_log import JointLog, JointStream
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey, TopicSurvey

@@ -13,7 +13,7 @@ import numpy as np
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError, stamp_ns
-from splatctrl_cli.logs.options import CameraTopics, PoseTopic, SourceOptions
+from splatctrl_cli.logs.source_options import CameraTopics, PoseTopic, SourceOptions
 from splatctrl_cli.logs.survey import Survey
 from splatctrl_cli.records import Float64
 

@@ -11,9 +11,9 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.logs.cameras import find_cameras, find_info, is_registered, listed, no_camera
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.pose_topics import join_pose_topics, pose_topics
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
+from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey
 from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.records import Float64, Intrinsics

@@ -18,8 +18,8 @@ from splatctrl_cli.logs.frame_plan import FramePlan, Index, Planned, PlannedImag
 from splatctrl_cli.logs.image_stamps import dropped, first_of_each, pair_by_stamp, paired
 from splatctrl_cli.logs.joint_topics import topics_of, with_joints
 from splatctrl_cli.logs.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid
-from splatctrl_cli.logs.options import SourceOptions, still_note
 from splatctrl_cli.logs.rig import Camera, build_cameras, nearest_gap_ns
+from splatctrl_cli.logs.source_options import SourceOptions, still_note
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.stored_frame import (
     Place,

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.rows import ranges
+from splatctrl_cli.files.spilled_rows import ranges
 from splatctrl_cli.records import Float64, LossReport
 
 Stamps = NDArray[np.int64]

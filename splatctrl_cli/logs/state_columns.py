@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.rows import BLOCK, RowFile, Rows, Table, of_columns, ranges, selected
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, of_columns, ranges, selected
 from splatctrl_cli.records import Float64, JointState
 
 Stamps = NDArray[np.int64]

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.rows import RowFile, Rows, Table, absent, ranges
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.logs.decoder import JOINT_STATE
 from splatctrl_cli.logs.joint_log import JointStream
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_clock import checked_stamps
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY

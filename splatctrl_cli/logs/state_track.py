@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatctrl_cli.files.rows import RowFile, Rows, Table, ranges
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, ranges
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_velocity import differentiated, gaps_of, slopes_by_block
 from splatctrl_cli.records import Bool, Float64, LossReport

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from splatctrl_cli.files.rows import Table, ranges
+from splatctrl_cli.files.spilled_rows import Table, ranges
 from splatctrl_cli.records import Float64
 
 Stamps = NDArray[np.int64]

@@ -5,7 +5,7 @@ from bisect import bisect_left
 
 import numpy as np
 
-from splatctrl_cli.files.rows import BLOCK, RowFile
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile
 from splatctrl_cli.geometry import interpolate_transform, invert_transform, transform_from
 from splatctrl_cli.records import Float64
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import PlannerConfig
-from splatctrl_cli.control.checks import checked_posture
+from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.records import Float64
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.planner.clearance import Clearance
-from splatctrl_cli.planner.solids import Solids
+from splatctrl_cli.planner.configuration_clearance import Clearance
+from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Bool, Float64
 
 ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances

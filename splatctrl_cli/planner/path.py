@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import rotation_vector
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import ROUNDING, STILL
 from splatctrl_cli.records import Float64
 

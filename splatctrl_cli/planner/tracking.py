@@ -10,7 +10,7 @@ from splatctrl_cli.control.goals import Guide, guided_goal, pose_error
 from splatctrl_cli.control.replay import FieldAt, is_at_goal
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
 from splatctrl_cli.control.step import ControlStep, QpIkController
-from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.path import TimedPath, effector_length, joint_length
 from splatctrl_cli.records import Float64
 

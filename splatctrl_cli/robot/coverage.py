@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Bool, Float64, SphereSet
-from splatctrl_cli.robot.solids import Solid, SolidDistance, read_solids
+from splatctrl_cli.robot.link_meshes import Solid, SolidDistance, read_solids
 from splatctrl_cli.robot.urdf import UrdfFile
 
 TOLERANCE = 1e-5  # [m] between the proven and the found deficit

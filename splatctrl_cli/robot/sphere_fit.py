@@ -22,7 +22,7 @@ from scipy.spatial.distance import cdist
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Bool, Float64, SphereSet
 from splatctrl_cli.robot.coverage import TOLERANCE, areas, largest_deficit, refined
-from splatctrl_cli.robot.solids import Solid, SolidDistance
+from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 
 Int64 = NDArray[np.int64]
 

@@ -12,7 +12,7 @@ from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.kernels.surface import BALL, BOX, CAPSULE, CYLINDER, SurfaceImage, SurfaceScene, render_surface
 from splatctrl_cli.mesh_distance import TriangleMesh, load_mesh
 from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, SphereSet
-from splatctrl_cli.robot.solids import mesh_path, mesh_pieces
+from splatctrl_cli.robot.link_meshes import mesh_path, mesh_pieces
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
 
 Int16 = NDArray[np.int16]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Bool, Label, RgbdFrame, SplatSet
-from splatctrl_cli.robot.declared import Declarations
+from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.labels import Seen, shown_kinds

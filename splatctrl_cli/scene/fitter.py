@@ -21,11 +21,13 @@ from splatctrl_cli.records import (
     RgbdFrame,
     SplatSet,
 )
-from splatctrl_cli.scene.audit import AuditRow, Refined
+from splatctrl_cli.scene.audit_row import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
+from splatctrl_cli.scene.depth_holes import unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.eviction import room_for
+from splatctrl_cli.scene.keyframes import View, Window, halved, make_view
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
@@ -53,9 +55,7 @@ from splatctrl_cli.scene.self_mask import (
     self_mask,
     without_mixed,
 )
-from splatctrl_cli.scene.unanswered import unanswered_points
 from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
-from splatctrl_cli.scene.window import View, Window, halved, make_view
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NOT_COVERED = 0.05  # accumulated opacity below which the background shows

@@ -17,11 +17,11 @@ from splatctrl_cli.records import Box, Float32, GaussianSet, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.densify import Densified, densify, fresh, reset_opacity
 from splatctrl_cli.scene.gaussians import gaussians_of, seeded
+from splatctrl_cli.scene.keyframes import View, make_view
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.removal import seen_through
 from splatctrl_cli.scene.render import loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import candidates, density_for, inside_workspace, seeds_at, world_points
-from splatctrl_cli.scene.window import View, make_view
 
 NOTHING_DONE = Densified(cloned=0, split=0, unmet=0, pruned=dict.fromkeys(("broken", "opacity", "screen", "size"), 0))
 

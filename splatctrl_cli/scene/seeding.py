@@ -11,8 +11,8 @@ from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.geometry import back_project, back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
-from splatctrl_cli.scene.cubes import CubeLevel, cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.render import Rendering
+from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
 
 NUM_LEVELS = 3  # cubes of one edge, half and a quarter of it
 NO_SEEDS = Seeds(

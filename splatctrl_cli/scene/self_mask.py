@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
-from splatctrl_cli.scene.audit import AuditRow
+from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.posture import RobotPosture
 
 SIGMAS = 2.0  # of the sensor's error that the robot's surface may explain

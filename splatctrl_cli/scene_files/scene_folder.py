@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import PARTIAL
-from splatctrl_cli.files.parts import Parts
 from splatctrl_cli.records import Balls, GaussianSet, KnownVoxels, OccupancyGrid, SeenVoxels, SplatSet
 from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,

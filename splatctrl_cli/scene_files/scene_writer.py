@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
+from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import flush, sha256, write_durably
-from splatctrl_cli.files.parts import Parts
 from splatctrl_cli.records import KnownVoxels, SplatSet, UInt8
 from splatctrl_cli.scene_files.scene_folder import Snapshot
 from splatctrl_cli.scene_files.voxel_file import write_occupancy, write_states

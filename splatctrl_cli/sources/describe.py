@@ -8,7 +8,7 @@ from typing import Any
 from splatctrl_cli.captures.capture_header import is_capture, read_capture_header
 from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.containers.bag_log import CONTAINERS, SUFFIXES, is_bag_folder, open_raw_log
+from splatctrl_cli.containers.log_formats import CONTAINERS, SUFFIXES, is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
 from splatctrl_cli.datasets.layouts import layout_of, open_layout, readable_in
@@ -16,8 +16,8 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import files_below, names_in
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
-from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.rig import camera_topics, missing
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.logs.survey import Survey, TopicSurvey, survey_to_describe
 from splatctrl_cli.scene_files.scene_folder import run_value

@@ -13,7 +13,7 @@ import yaml
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
-from splatctrl_cli.containers.bag_log import SUFFIXES
+from splatctrl_cli.containers.log_formats import SUFFIXES
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_head, read_arrays
 from splatctrl_cli.files.summary import Grid, Summary

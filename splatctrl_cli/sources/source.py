@@ -5,13 +5,13 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.bag_log import SessionLog, is_bag_folder, open_raw_log
+from splatctrl_cli.containers.log_formats import SessionLog, is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.datasets.layouts import open_layout
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource
 
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.rows import BLOCK, RowFile, Rows, Table, absent, blocks_of
+from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, absent, blocks_of
 from splatctrl_cli.logs.state_messages import NAMELESS, pose_of_columns
 from splatctrl_cli.logs.state_track import RawTrack
 from splatctrl_cli.logs.state_velocity import Stamps

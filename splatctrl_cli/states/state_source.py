@@ -6,13 +6,13 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.containers.log_formats import is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.folder_description import has_table
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_topics import joint_records, with_prefix
 from splatctrl_cli.logs.state_track import RawTrack, cleaned

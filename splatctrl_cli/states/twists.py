@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.containers.bag_log import is_bag_folder, open_raw_log
+from splatctrl_cli.containers.log_formats import is_bag_folder, open_raw_log
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.datasets.folder_description import has_table, read_table
 from splatctrl_cli.errors import InputError

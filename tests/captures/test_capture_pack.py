@@ -15,7 +15,7 @@ from splatctrl_cli.captures.capture_pack import MARK, pack_capture, unpack_captu
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import LogRecipe, camera_x, make_log

@@ -11,7 +11,7 @@ from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.logs import ros_log
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source

@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.sources.source import open_source
-from tests.containers.test_bag_log import as_ros2_folder
+from tests.containers.test_log_formats import as_ros2_folder
 from tests.logs.make_log import LogRecipe, make_log
 
 RECIPE = LogRecipe(num_frames=30, color_format="rgb8", has_joints=False)

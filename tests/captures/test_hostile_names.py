@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import LogRecipe, make_log
 

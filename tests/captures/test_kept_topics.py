@@ -9,8 +9,8 @@ import pytest
 
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
 from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.state_source import open_states
 from tests.logs.make_log import LogRecipe, make_log

@@ -13,9 +13,9 @@ from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_states import robot_findings
 from splatctrl_cli.checks.check_times import file_findings
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity
-from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_logs

@@ -16,7 +16,7 @@ from splatctrl_cli.checks.clock_offset import (
     silhouettes,
     states_asked,
 )
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.states.state_source import open_states

@@ -20,7 +20,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_of
-from splatctrl_cli.robot.solids import mesh_path
+from splatctrl_cli.robot.link_meshes import mesh_path
 from splatctrl_cli.robot.urdf import MeshShape
 from splatctrl_cli.splat_files.splat_formats import FORMATS
 from tests.datasets.make_layout import make_tum

@@ -12,7 +12,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.grid_files.grid import write_npz
+from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.records import Box, LossReport, Record
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import (

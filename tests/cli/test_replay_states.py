@@ -16,8 +16,8 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.grid_files.grid import write_npz
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.grid_files.npz_grid import write_npz
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Box, Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_source

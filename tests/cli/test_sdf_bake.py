@@ -16,9 +16,9 @@ from splatctrl_cli.evaluate.field_accuracy import metric_names
 from splatctrl_cli.evaluate.field_truth import FIELDS
 from splatctrl_cli.field import baker, distance, probability, weights
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.grid import exact_channel
+from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.grid_files import grid_formats
-from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bake import SUMMARY_METRICS
 from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.scene_files.scene_writer import SceneWriter

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.containers.raw_log import RawMessage
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import make_log

@@ -14,7 +14,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as BagWriter
 
-from splatctrl_cli.containers.bag_log import CONTAINERS, open_raw_log
+from splatctrl_cli.containers.log_formats import CONTAINERS, open_raw_log
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError

@@ -25,7 +25,7 @@ from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOI
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
-from tests.containers.test_bag_log import assert_same
+from tests.containers.test_log_formats import assert_same
 from tests.logs.make_log import LogRecipe, make_log
 from tests.logs.write_log import encoded as ros_message
 from tests.logs.write_log import messages_of, rewritten, write_bag

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.recovered import DAMAGES, LOGS, NUM_MESSAGES, counted, damaged, log
+from benchmarks.mcap_recovery import DAMAGES, LOGS, NUM_MESSAGES, counted, damaged, log
 from tests.containers.mcap_recover import recover
 
 STEP = 211

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.containers.bag_log import is_bag_folder
+from splatctrl_cli.containers.log_formats import is_bag_folder
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.sources.source import open_source
 from tests.conftest import ROOT

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.ladder import Rung, descend
+from splatctrl_cli.control.fallbacks import Rung, descend
+from splatctrl_cli.control.qp_rows import RowBuilder
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop
-from splatctrl_cli.control.rows import RowBuilder
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import State, stray_cost
 from splatctrl_cli.field.distance import SphereField

@@ -17,7 +17,7 @@ from splatctrl_cli.control.events import (
     first_intervention,
     runs_of,
 )
-from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.signals import audit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep, Intervention, QpIkController, RowSlack
 from splatctrl_cli.control.terms import RowKind

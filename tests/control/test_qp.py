@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.barriers import can_bind
-from splatctrl_cli.control.ladder import Rung, assemble, assemble_hard, descend
+from splatctrl_cli.control.fallbacks import Rung, assemble, assemble_hard, descend
 from splatctrl_cli.control.qp import ClarabelSolver, DaqpSolver, QuadraticProgram, residuals, solver_named
 from splatctrl_cli.control.terms import Barrier, Cost, eliminated_weight, reach_cost, stray_cost
 from splatctrl_cli.errors import UsageError

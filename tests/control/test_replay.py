@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.replay import Outcome, ReplayTask, closed_loop, num_on_rung
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.records import Float64

@@ -7,8 +7,8 @@ import pytest
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control import barriers
-from splatctrl_cli.control.checks import static_violations
-from splatctrl_cli.control.ladder import Rung, is_usable
+from splatctrl_cli.control.fallbacks import Rung, is_usable
+from splatctrl_cli.control.preconditions import static_violations
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
 from splatctrl_cli.control.step import MULTIPLIER, QpIkController
 from splatctrl_cli.control.terms import RowKind

@@ -12,7 +12,7 @@ import pytest
 
 from splatctrl_cli.datasets.poses import OPENGL_FROM_OPTICAL
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.sources.source import open_source
 

@@ -15,7 +15,7 @@ from splatctrl_cli.datasets.layout_tum import marker_to_camera
 from splatctrl_cli.datasets.poses import stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, project, transform_points
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.sources.source import open_source
 from tests.datasets.make_layout import (

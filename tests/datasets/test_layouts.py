@@ -10,7 +10,7 @@ from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.datasets.layouts import LAYOUTS, layout_of
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source

@@ -9,7 +9,7 @@ from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from tests.cli.test_reconstruct import write_folder
 from tests.scene.wall import frame

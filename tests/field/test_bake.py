@@ -6,12 +6,12 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field import layout as layout_module
+from splatctrl_cli.field import grid_cells as layout_module
 from splatctrl_cli.field.baker import Baker
 from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
-from splatctrl_cli.field.layout import GridLayout, bounding_box
+from splatctrl_cli.field.grid_cells import GridLayout, bounding_box
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.grid_files.grid import write_npz
+from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.records import SWEPT, Box, DistanceGrid, Float64, Label, OccupancyGrid
 from tests.field.scenes import cloud, splat_set
 from tests.reference import field as reference

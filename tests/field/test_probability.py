@@ -3,6 +3,7 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import make_field
 from splatctrl_cli.field.probability import (
     CalibratedProbability,
@@ -11,7 +12,6 @@ from splatctrl_cli.field.probability import (
     probability_of_occupancy,
 )
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.records import Box
 from tests.field.scenes import cloud, queries, splat_set
 from tests.reference import field as reference

@@ -5,10 +5,10 @@ import pytest
 
 from splatctrl_cli.config import FieldConfig, OccupancyConfig
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.field import layout as layout_module
+from splatctrl_cli.field import grid_cells as layout_module
 from splatctrl_cli.field import slabs as slabs_module
 from splatctrl_cli.field.baker import CHANNELS, Baker
-from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.field.unknown import apply_unknown

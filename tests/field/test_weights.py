@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.field import conjugate, voxel_density
-from splatctrl_cli.field.conjugate import conjugate_gradients, solve_process
+from splatctrl_cli.field import full_gp, voxel_density
+from splatctrl_cli.field.clustered_splats import Spheres
 from splatctrl_cli.field.distance import GpdfField, SeField
+from splatctrl_cli.field.full_gp import conjugate_gradients, solve_process
 from splatctrl_cli.field.kernel import Matern12, SquaredExponential
-from splatctrl_cli.field.spheres import Spheres
 from splatctrl_cli.field.voxel_density import voxel_row_sums
 from splatctrl_cli.field.weights import weights_named
 from splatctrl_cli.geometry import rotation_from_quat
@@ -126,10 +126,10 @@ def test_what_cannot_be_solved_is_refused_in_words(monkeypatch: pytest.MonkeyPat
         UsageError, match=r"radii that differ by at most 16 length scales .*, got 60\.0; set a larger"
     ):
         GpdfField(centers, radii, 0.005, weights="cg")
-    monkeypatch.setattr(conjugate, "MAX_ITERATIONS", 20)
+    monkeypatch.setattr(full_gp, "MAX_ITERATIONS", 20)
     with pytest.raises(NotEvaluableError, match=r"after 20 iterations, got .*; set a larger field.noise"):
         SeField(centers, radii, LENGTH, weights="cg")
-    monkeypatch.setattr(conjugate, "available_memory", lambda: 1000)
+    monkeypatch.setattr(full_gp, "available_memory", lambda: 1000)
     with pytest.raises(UsageError, match=r"pairs of splats within 8 length scales need .* GiB is free"):
         SeField(centers, radii, LENGTH, weights="cg")
 

@@ -12,7 +12,7 @@ from splatctrl_cli.evaluate import perceptual
 from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.files.arrays import DAMAGE, read_arrays, savez
 from splatctrl_cli.files.npz_columns import NpzFile
-from splatctrl_cli.grid_files.grid import MOST_PACKED, read_npz
+from splatctrl_cli.grid_files.npz_grid import MOST_PACKED, read_npz
 from splatctrl_cli.scene import occupancy
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, read_checkpoint
 from splatctrl_cli.scene_files.voxel_file import MOST_VOXELS, read_occupancy, read_states

@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.field.baker import CHANNELS
-from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bake import BakeResult
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.splat_files.splats import write_ply

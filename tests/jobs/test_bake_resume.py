@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, UsageError, WriteError
-from splatctrl_cli.field import layout, slabs
+from splatctrl_cli.field import grid_cells, slabs
 from splatctrl_cli.field.baker import Baker
-from splatctrl_cli.field.layout import GridLayout
+from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 from splatctrl_cli.jobs import bake_slabs
@@ -126,7 +126,7 @@ def test_a_killed_process_goes_on_to_the_same_bytes(splats: Path, whole: dict[st
     program = """
 import os, signal, sys
 from pathlib import Path
-from splatctrl_cli.field import layout, slabs
+from splatctrl_cli.field import grid_cells, slabs
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs
 from tests.jobs.test_bake_resume import bake
 slabs.SLAB_BYTES, real, calls = 1, GridSlabs.write, []
@@ -216,11 +216,11 @@ def test_openvdb_that_does_not_fit_the_memory_is_told_before_anything_is_baked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     grid = GridLayout(origin=np.zeros(3), voxel=0.1, shape=(100, 100, 100))
-    monkeypatch.setattr(layout, "available_memory", lambda: 27 * 10**6)
+    monkeypatch.setattr(grid_cells, "available_memory", lambda: 27 * 10**6)
     bake_slabs.check_vdb(grid, ["sdf"], ["npz"])
     with pytest.raises(UsageError, match=r"format vdb: needs 0.0 GiB of memory.*leave it out of --formats"):
         bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
-    monkeypatch.setattr(layout, "available_memory", lambda: 28 * 10**6)
+    monkeypatch.setattr(grid_cells, "available_memory", lambda: 28 * 10**6)
     bake_slabs.check_vdb(grid, ["sdf"], ["npz", "vdb"])
 
 

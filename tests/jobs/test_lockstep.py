@@ -17,7 +17,7 @@ from splatctrl_cli.jobs.replays import known_scene
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, from_splats
 from splatctrl_cli.jobs.replays.lockstep import from_log
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, clearance, splats_of, write_scene
 

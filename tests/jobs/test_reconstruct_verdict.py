@@ -10,7 +10,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, longest_blind, reconstruct_verdict
 from splatctrl_cli.records import LossReport
-from splatctrl_cli.scene.audit import AuditRow
+from splatctrl_cli.scene.audit_row import AuditRow
 
 TENTH = 100_000_000  # [ns]
 CAMERAS = ("cam0", "cam1")

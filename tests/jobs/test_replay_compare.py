@@ -9,7 +9,7 @@ import pytest
 
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.grid_files.grid import write_npz
+from splatctrl_cli.grid_files.npz_grid import write_npz
 from splatctrl_cli.jobs.replays.compare import certified_distance, figure_names
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.records import Box

@@ -11,16 +11,16 @@ import pytest
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.events import EventFold, EventKind, Signal, events_of
 from splatctrl_cli.control.replay import ReplayTask, closed_loop
-from splatctrl_cli.files import rows
+from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.geometry import transform_points
-from splatctrl_cli.jobs.replays import files, record, store
+from splatctrl_cli.jobs.replays import files, state_pass, state_store
 from splatctrl_cli.jobs.replays.inputs import doubts_of, read_robot
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
 from splatctrl_cli.robot.coverage import coverage_deficit, refined
+from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.solids import read_solids
 from splatctrl_cli.robot.sphere_files import spheres_yaml
 from tests.cli.replay_desk import BALL, SECOND, START, Desk, logged, splats_of, write_scene
 from tests.control.fakes import Balls
@@ -189,7 +189,7 @@ FILES = ("steps.csv", "events.json", "summary.json", "states.json")
 
 
 def in_blocks_of(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
-    for module in (files, record, store, rows, state_columns):
+    for module in (files, state_pass, state_store, spilled_rows, state_columns):
         monkeypatch.setattr(module, "CHUNK" if module is files else "BLOCK", num)
 
 
@@ -248,7 +248,7 @@ def test_an_event_that_crosses_blocks_is_one(size: int) -> None:
 
 
 def test_stored_objects_are_those_of_a_list_over_the_borders_of_blocks() -> None:
-    stored: store.StoredObjects[int] = store.StoredObjects()
+    stored: state_store.StoredObjects[int] = state_store.StoredObjects()
     for block in ([0, 1], [], [2, 3, 4], [5]):
         stored.extend(block)
     whole = list(range(6))

@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.checks.clock_offset import ClockOffset
 from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.field.slabs import bake
-from splatctrl_cli.grid_files.grid import read_npz, write_npz
+from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs import replay as job
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.records import Box, VoxelState

@@ -10,9 +10,9 @@ import pytest
 
 from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.errors import NotEvaluableError, UsageError
-from splatctrl_cli.jobs.recording import RecordingRequest
+from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Label, RgbdFrame
 from tests.jobs.wall import (
     AWAY,

@@ -18,11 +18,11 @@ from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.cloud import spaced
 from splatctrl_cli.evaluate.protocols import score_protocol
-from splatctrl_cli.jobs.recording import RecordingRequest, is_folder_of_views
+from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.score_cloud import CloudSettings
 from splatctrl_cli.jobs.score_reference import missing_views
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 from tests.datasets.make_idr import half_size
 from tests.files.make_observed import write_observed

@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.events import UNREPRESENTED
-from splatctrl_cli.grid_files.grid import read_npz
+from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.replays.known_scene import from_splats, splat_fields
 from splatctrl_cli.records import Balls, Float64, KnownVoxels, Label
 from splatctrl_cli.scene_files.scene_folder import open_scene

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.planner.clearance import Clearance
+from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import ROUNDING, STILL, check_edges, check_sampled_edges
 from splatctrl_cli.planner.path import resampled
-from splatctrl_cli.planner.solids import Ball, Cuboid, Rod, Solid, Solids
+from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 

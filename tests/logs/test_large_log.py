@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.mcap_records import DATA_END

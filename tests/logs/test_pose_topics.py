@@ -8,7 +8,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import PoseTopic, SourceOptions
+from splatctrl_cli.logs.source_options import PoseTopic, SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source

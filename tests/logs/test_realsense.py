@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, quat_from_rotation, transform_from
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source

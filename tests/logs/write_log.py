@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from splatctrl_cli.containers.bag_log import open_raw_log
+from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -17,7 +17,7 @@ from splatctrl_cli.planner.planned import (
     planned_detours,
     planned_path,
 )
-from splatctrl_cli.planner.solids import Ball, Solids
+from splatctrl_cli.planner.solid_scene import Ball, Solids
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
 from tests.planner.walls import one_wall

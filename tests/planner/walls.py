@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from splatctrl_cli.planner.clearance import Clearance
-from splatctrl_cli.planner.solids import Ball, Cuboid, Solids
+from splatctrl_cli.planner.configuration_clearance import Clearance
+from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Solids
 from tests.control.fakes import PlanarArm
 
 

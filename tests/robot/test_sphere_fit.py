@@ -8,7 +8,7 @@ import trimesh
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.robot.coverage import coverage_of_solids
-from splatctrl_cli.robot.solids import read_solids
+from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.sphere_files import read_spheres, spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf

@@ -6,7 +6,7 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.records import Box, Label
-from splatctrl_cli.robot.declared import Carried, Declarations
+from splatctrl_cli.robot.declared_contact import Carried, Declarations
 from splatctrl_cli.scene.contact import CONTACT, contact_pixels, count_carried, hidden_objects
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.seeding import world_points

@@ -16,7 +16,7 @@ from splatctrl_cli.scene.gaussian_fitter import (
     scene_extent,
 )
 from splatctrl_cli.scene.gaussians import gaussians_of, parameters_of, render_gaussians
-from splatctrl_cli.scene.window import make_view
+from splatctrl_cli.scene.keyframes import make_view
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame, looking_down
 
 FAST = GaussianConfig(iterations=300, densify_from=60, densify_every=30, reset_every=0.2)

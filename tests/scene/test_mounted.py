@@ -8,8 +8,8 @@ import pytest
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.keyframes import make_view
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
-from splatctrl_cli.scene.window import make_view
 from tests.scene.wall import WORKSPACE, frame
 
 HAND = np.s_[:20, :25]  # rows and columns of what the camera carries

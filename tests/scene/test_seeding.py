@@ -6,8 +6,8 @@ import numpy as np
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float32, SplatSet
-from splatctrl_cli.scene.cubes import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.render import Rendering
+from splatctrl_cli.scene.seed_octree import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
     add_mask,

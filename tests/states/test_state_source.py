@@ -9,7 +9,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, JointState, RecordSource, RgbdFrame
 from splatctrl_cli.states.state_source import open_states
 from tests.logs.make_log import LogRecipe, make_log

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, JointState, RecordSource
 from splatctrl_cli.states.state_source import open_states
 

@@ -8,7 +8,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.states.state_source import open_states
 from splatctrl_cli.states.twists import read_twists
 from tests.logs.make_states import START_NS, STORE, Message, header, states_of, write_bag1, write_bag2, write_mcap

@@ -16,7 +16,7 @@ from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays import files, inputs
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Intrinsics, SphereSet
 from splatctrl_cli.robot.coverage import CoverageReport, coverage_deficit
 from splatctrl_cli.robot.model import RobotModel

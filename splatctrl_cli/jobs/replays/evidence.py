@@ -20,12 +20,12 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
 from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.field.distance import SphereField
-from splatctrl_cli.files.rows import ranges
+from splatctrl_cli.files.spilled_rows import ranges
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.jobs.reconstruction import SAME_MOMENT_NS, training_cameras
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
-from splatctrl_cli.jobs.replays.store import StoredAudit
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.jobs.replays.state_store import StoredAudit
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Box, Float64, RecordSource, RgbdFrame, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep, time_steps

@@ -7,7 +7,7 @@ import numpy as np
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, held, lacking
-from splatctrl_cli.jobs.replays.judged import (
+from splatctrl_cli.jobs.replays.criteria_input import (
     SLOW,
     UNKNOWN,
     Judged,

@@ -11,8 +11,8 @@ import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.checks import checked_posture
 from splatctrl_cli.control.goals import TwistTrack
+from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.control.replay import Waypoint
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, UsageError

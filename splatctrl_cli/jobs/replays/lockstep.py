@@ -12,9 +12,9 @@ from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
+from splatctrl_cli.jobs.open_recording import DEFAULT_POSE_JUMP, check_pose_jumps
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest
-from splatctrl_cli.jobs.recording import DEFAULT_POSE_JUMP, check_pose_jumps
 from splatctrl_cli.jobs.replays.evidence import EVERY, every_of, trained, training_options
 from splatctrl_cli.jobs.replays.known_scene import (
     KnownFields,
@@ -29,7 +29,7 @@ from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Float64, RecordSource, UInt8
-from splatctrl_cli.robot.declared import Declarations
+from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
 from splatctrl_cli.splat_files.splats import read_ply

@@ -10,11 +10,11 @@ from operator import attrgetter
 import numpy as np
 
 from splatctrl_cli.control.events import first_intervention
-from splatctrl_cli.control.ladder import Rung
+from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.motion_limits import WINDOW
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.evaluate.clearance import ClearanceAgreement
+from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
 from splatctrl_cli.evaluate.metrics import (
     LARGEST,
     LAST,
@@ -31,9 +31,9 @@ from splatctrl_cli.evaluate.metrics import (
 from splatctrl_cli.jobs.replays.compare import figure_names, figures_of
 from splatctrl_cli.jobs.replays.goal import TWIST_FIGURES
 from splatctrl_cli.jobs.replays.inputs import LOG_FIGURES, LoggedStates
-from splatctrl_cli.jobs.replays.people import BESIDE, FIGURES, STANDSTILL, separation_figures
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.jobs.replays.store import RUNGS
+from splatctrl_cli.jobs.replays.standstill_baseline import BESIDE, FIGURES, STANDSTILL, separation_figures
+from splatctrl_cli.jobs.replays.state_store import RUNGS
 from splatctrl_cli.records import Bool, Float64
 
 Metrics = dict[str, float | None]

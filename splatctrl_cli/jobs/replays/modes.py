@@ -7,9 +7,9 @@ import numpy as np
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.barriers import scene_margin
-from splatctrl_cli.control.checks import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
+from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
 from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.jobs.progress import Progress
@@ -17,11 +17,11 @@ from splatctrl_cli.jobs.replays.compare import compared, planned_ways_out
 from splatctrl_cli.jobs.replays.goal import goal_waypoints, twist_figures, twist_track
 from splatctrl_cli.jobs.replays.inputs import check_inside
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
-from splatctrl_cli.jobs.replays.people import read_baselines, read_zone, separations
-from splatctrl_cli.jobs.replays.record import ReplayRecord
 from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.jobs.replays.store import Figures, StoredLoop, StoredOpenLoop
+from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone, separations
+from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
+from splatctrl_cli.jobs.replays.state_store import Figures, StoredLoop, StoredOpenLoop
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel

@@ -8,7 +8,7 @@ import numpy as np
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, held, lacking
-from splatctrl_cli.jobs.replays.judged import (
+from splatctrl_cli.jobs.replays.criteria_input import (
     BROKEN,
     CONTACT,
     CONTROL,

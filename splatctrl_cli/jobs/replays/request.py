@@ -7,13 +7,13 @@ from pathlib import Path
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.jobs.recording import DEFAULT_POSE_JUMP
-from splatctrl_cli.jobs.replays.belonging import Mismatch
+from splatctrl_cli.jobs.open_recording import DEFAULT_POSE_JUMP
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
-from splatctrl_cli.logs.options import SourceOptions
+from splatctrl_cli.jobs.replays.provenance import Mismatch
+from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource
-from splatctrl_cli.robot.declared import Declarations
+from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import Truth
 

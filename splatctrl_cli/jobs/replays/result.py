@@ -4,14 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.checks import StaticViolation
 from splatctrl_cli.control.events import Event
+from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.standstill import Separation
 from splatctrl_cli.control.step import ControlStep
-from splatctrl_cli.evaluate.clearance import ClearanceAgreement
+from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
 from splatctrl_cli.jobs.replays.evidence import MapError
-from splatctrl_cli.jobs.replays.store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
+from splatctrl_cli.jobs.replays.state_store import Figures, StoredAudit, StoredOpenLoop, StoredSteps
 from splatctrl_cli.planner.comparison import Motion, MotionFigures
 from splatctrl_cli.planner.planned import PlannedPath
 from splatctrl_cli.records import FloatRows

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.events import Event, EventFold, EventKind, Obstacle
 from splatctrl_cli.control.signals import clearance_signals
-from splatctrl_cli.evaluate.clearance import clearance_agreement, mark_seen
-from splatctrl_cli.files.rows import RowFile, Rows, ranges
+from splatctrl_cli.evaluate.clearance_agreement import clearance_agreement, mark_seen
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
 from splatctrl_cli.jobs.replays.request import ReplayInputs
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.records import Float64, RgbdFrame

@@ -2,15 +2,15 @@
 
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
+from splatctrl_cli.jobs.replays.criteria_input import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replays.evidence_criteria import (
     OF_EVIDENCE,
     bound_words,
 )
 from splatctrl_cli.jobs.replays.golden import Golden, golden_reason
-from splatctrl_cli.jobs.replays.judged import CONTACT, SAFE, Judged, nearby
 from splatctrl_cli.jobs.replays.metrics import counts_of, first_time
 from splatctrl_cli.jobs.replays.motion_criteria import OF_MOTION
-from splatctrl_cli.robot.declared import carried_words
+from splatctrl_cli.robot.declared_contact import carried_words
 
 ASKED = ("--require", "golden")  # criteria that the request itself asked for
 CRITERIA = (*OF_MOTION, *OF_EVIDENCE)

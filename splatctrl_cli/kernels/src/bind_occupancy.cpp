@@ -2,7 +2,7 @@
 #include <stdexcept>
 
 #include "bind.h"
-#include "entity.h"
+#include "voxel_labels.h"
 #include "occupancy.h"
 
 namespace splatctrl {

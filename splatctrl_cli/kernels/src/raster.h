@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "projection.h"
-#include "tile.h"
+#include "raster_tile.h"
 
 namespace splatctrl {
 

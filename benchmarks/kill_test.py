@@ -1,0 +1,236 @@
+"""`python -m benchmarks.kill_test [--kills N]`: kills commands at random moments; what is half-written must not read.
+
+Each command first runs to its end. Then it is killed (SIGKILL) N times, after a random part of that time, every
+other time with --force over an output that is there. After each kill the output is not there, or holds the same
+bytes as the whole one (but for times and paths in run.json), and what is left under NAME.partial is refused by the
+tool's own readers or is whole, too. Commands that can go on are killed anew N times, every third time once more while
+they go on, and then end with --resume: every byte has to be that of the whole run, but for the times in run.json.
+Commands run in forked children that have their imports behind them, so that the
+moments fall where files are written.
+"""
+
+import argparse
+import contextlib
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatctrl_cli.cli.commands import COMMANDS
+from splatctrl_cli.cli.common import table
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.files.output import partial_path
+from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.splat_files.splat_formats import FORMATS
+from tests.splat_files.test_gaussian_ply import gaussian_set
+
+SAMPLE = Path(__file__).parent.parent / "sample_data" / "tabletop"
+_OWN = ("seconds", "arguments")  # of run.json
+_TIMED = ("run.json", "SHA256SUMS")  # SHA256SUMS holds the sum of run.json where it lists it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A command's arguments before ``-o OUT``, and the name of its output."""
+
+    name: str
+    arguments: tuple[str, ...]
+    out: str
+    resumes: bool = False
+
+
+def tasks(folder: Path) -> list[Task]:
+    """What is killed; each task may use what the ones before it wrote."""
+    robot = ("--urdf", str(SAMPLE / "robot.urdf"), "--spheres", str(SAMPLE / "robot_spheres.yaml"))
+    audit = ("replay", str(SAMPLE / "log.mcap"), "--field", str(folder / "field"), *robot, "--max-unknown", "1")
+    bake = ("sdf-bake", str(folder / "splats.ply"), "--set", "field.max_loss=1", "--no-report", "--voxel", "0.1")
+    fine = (*bake[:-1], "0.06", "--threads", "1")
+    found = [
+        Task(name="ingest", arguments=("ingest", str(SAMPLE / "log.mcap")), out="log.capture", resumes=True),
+        Task(name="export", arguments=("export", str(folder / "a.ply"), "--isotropic"), out="splats.ply"),
+        Task(name="sdf-bake", arguments=bake, out="field"),
+        Task(name="sdf-bake, fine", arguments=fine, out="fine", resumes=True),
+        Task(name="replay", arguments=audit, out="replay"),
+    ]
+    if "capture" in COMMANDS:
+        pack = ("capture", "pack", str(folder / "log.capture"))
+        found.append(Task(name="capture pack", arguments=pack, out="packed.mcap"))
+    return found
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Kill each task and print a table; 1 where something half-written reads as whole."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.kill_test", description=__doc__)
+    parser.add_argument("--kills", type=int, default=50, help="of each command")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--only", nargs="+", help="names of commands")
+    args = parser.parse_args(argv)
+    rows, resumed, faults = [], [], []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        FORMATS[".ply"].write(folder / "a.ply", gaussian_set(2000), {})
+        for task in tasks(folder):
+            row, found = kill(task, folder, args.kills, random.Random(args.seed), args.only)
+            if row:
+                rows.append([task.name, *row])
+                print("\t".join(map(str, rows[-1])), flush=True)
+            faults += found
+            if task.resumes and (args.only is None or task.name in args.only):
+                row, found = kill_and_resume(task, folder, args.kills, random.Random(args.seed + 1))
+                resumed.append([task.name, *row])
+                print("\t".join(map(str, resumed[-1])), flush=True)
+                faults += found
+    print("\n".join(table(["command", "seconds", "killed", "ended first", "left partial", "faults"], rows)))
+    print("\n".join(table(["command", "seconds", "kills", "went on", "of these twice", "differ"], resumed)))
+    print("\n".join(faults))
+    return 1 if faults else 0
+
+
+def kill(
+    task: Task, folder: Path, num: int, moments: random.Random, only: Sequence[str] | None = None
+) -> tuple[list[object], list[str]]:
+    """Run a task to its end, then kill it `num` times; its row of the table and what was wrong."""
+    out = folder / task.out
+    _wait(_start([*task.arguments, "-o", str(out)]), None)  # the first run also imports what it needs
+    start = time.monotonic()
+    _wait(_start([*task.arguments, "-o", str(out), "--force"]), None)
+    seconds = time.monotonic() - start
+    if only is not None and task.name not in only:
+        return [], []
+    whole = contents(out)
+    box = folder / "box"
+    ended, partial, faults = 0, 0, []
+    for number in range(num):
+        shutil.rmtree(box, ignore_errors=True)
+        box.mkdir()
+        target = box / task.out
+        is_forced = number % 2 == 1
+        if is_forced:
+            (shutil.copytree if out.is_dir() else shutil.copy)(out, target)  # type: ignore[operator]
+        force = ["--force"] if is_forced else []
+        moment = moments.uniform(0.0, 1.05 * seconds)
+        ended += _wait(_start([*task.arguments, "-o", str(target), *force]), moment)
+        fault = judge(target, whole)
+        partial += partial_path(target).exists()
+        if fault:
+            faults.append(f"{task.name}, killed after {moment:.3f} s: {fault}")
+    return [f"{seconds:.2f}", num - ended, ended, partial, len(faults)], faults
+
+
+def kill_and_resume(task: Task, folder: Path, num: int, moments: random.Random) -> tuple[list[object], list[str]]:
+    """Kill a task `num` times, each time anew, and go on; its row of the table and what was wrong."""
+    out, box = folder / task.out, folder / "box"
+    start = time.monotonic()
+    _wait(_start([*task.arguments, "-o", str(out), "--force"]), None)
+    seconds = time.monotonic() - start
+    whole = exact(out)
+    kills, went_on, twice, faults = 0, 0, 0, []
+    while kills < num:
+        shutil.rmtree(box, ignore_errors=True)
+        box.mkdir()
+        target = box / task.out
+        arguments = [*task.arguments, "-o", str(target)]
+        again = [*arguments, "--resume", "--force"]  # it may have been killed when all was done
+        moment = moments.uniform(0.0, seconds)
+        if _wait(_start(arguments), moment):
+            continue
+        kills += 1
+        went_on += partial_path(target).exists()
+        if kills % 3 == 0 and not _wait(_start(again), moments.uniform(0.0, seconds)):
+            kills, twice = kills + 1, twice + 1
+        _wait(_start(again), None)
+        if exact(target) != whole or partial_path(target).exists():
+            faults.append(f"{task.name}, killed after {moment:.3f} s: goes on to other bytes")
+    return [f"{seconds:.2f}", kills, went_on, twice, len(faults)], faults
+
+
+def exact(path: Path) -> dict[str, object]:
+    """sha256 of each file of a folder, by name; of run.json what it says but for times and paths."""
+    found: dict[str, object] = {}
+    for file in sorted(p for p in path.rglob("*") if p.is_file()):
+        data, name = file.read_bytes(), str(file.relative_to(path))
+        if file.name == "run.json":
+            found[name] = {key: value for key, value in json.loads(data).items() if key not in _OWN}
+        elif file.name == "SHA256SUMS":
+            found[name] = [line for line in data.decode().splitlines() if not line.endswith("run.json")]
+        else:
+            found[name] = hashlib.sha256(data).hexdigest()
+    return found
+
+
+def judge(target: Path, whole: dict[str, str]) -> str:
+    """What is wrong with the output that a killed run left; empty where nothing."""
+    if target.exists() and contents(target) != whole:
+        return f"{target.name} is there and differs"
+    left = partial_path(target)
+    if left.exists() and contents(left) != whole and _reads(left):
+        return f"{left.name} reads as whole"
+    return ""
+
+
+def contents(path: Path) -> dict[str, str]:
+    """sha256 of each file, by name in the output; of those that hold times, whether they end as they should."""
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    found = {}
+    for file in files:
+        name = str(file.relative_to(path)) if path.is_dir() else ""
+        data = file.read_bytes()
+        found[name] = str(data.endswith(b"\n")) if file.name in _TIMED else hashlib.sha256(data).hexdigest()
+    return found
+
+
+def _reads(path: Path) -> bool:
+    """Whether a reader takes it as it is, without a word."""
+    try:
+        if path.is_dir():
+            source = open_source(path)
+            num = sum(1 for _ in source.records())
+            return num > 0 and not source.loss.damaged
+        return not describe(path).damaged
+    except SplatCtrlError:
+        return False
+
+
+def _start(arguments: list[str]) -> int:
+    child = os.fork()
+    if child == 0:
+        code = 70
+        try:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, 1)
+            os.dup2(nowhere, 2)
+            with contextlib.suppress(SystemExit):
+                code = main(arguments)
+        finally:
+            os._exit(code)
+    return child
+
+
+def _wait(child: int, moment: float | None) -> bool:
+    """Wait for a child, or kill it at its moment [s]; whether it ended by itself. Raises where it failed."""
+    start = time.monotonic()
+    while moment is None or time.monotonic() - start < moment:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            code = os.waitstatus_to_exitcode(status)
+            if code not in {0, 1}:
+                raise SystemExit(f"a command that was not killed ended with {code}")
+            return True
+        time.sleep(0.001)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return False
+
+
+if __name__ == "__main__":
+    sys.exit(run())

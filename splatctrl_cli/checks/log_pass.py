@@ -1,0 +1,265 @@
+"""One pass over a log for all that `check` asks: messages watched on their way, and a few frames of each camera."""
+
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.checks.check_images import ImageWatch, Kept, strided_lens, thumbnail_lens
+from splatctrl_cli.checks.check_times import TimesWatch
+from splatctrl_cli.checks.clock_offset import ImageMotion
+from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.decoder import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    TRANSFORMS,
+    MessageDecoder,
+    UndecodableMessageError,
+    header_stamp_ns,
+    is_ros,
+    stamp_ns,
+)
+from splatctrl_cli.logs.messages import color_of, depth_of, num_invalid, read_image
+from splatctrl_cli.logs.registration import DepthToColor
+from splatctrl_cli.logs.rig import Camera, build_cameras
+from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
+from splatctrl_cli.logs.survey import Survey
+from splatctrl_cli.logs.tf_tree import TfTree
+from splatctrl_cli.records import Float64, RgbdFrame
+
+_HEADED = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu")
+_FIRST_FIELD = re.compile(r"^(?:std_msgs/(?:msg/)?)?Header\s+\w+")
+
+
+class LogWatch:
+    """A log whose messages are looked at while somebody else reads them; images are decoded here, as far as needed.
+
+    num_images: reading ends once a topic has had as many images. files: first and last log time by file.
+    """
+
+    def __init__(self, log: RawLog, options: SourceOptions, num_images: int | None = None) -> None:
+        self._log, self._scale, self._num_images = log, options.depth_scale, num_images
+        self._by_log_time = options.stamps == "log"
+        self.path, self.files, self.container = log.path, log.files, log.container
+        self.times: dict[str, TimesWatch] = {}
+        self.transforms: dict[str, TimesWatch] = {}
+        self.images: dict[str, ImageWatch] = {}
+        self.changed_infos: dict[str, int] = {}
+        self.spans: dict[str, tuple[int, int]] = {}
+        self.is_whole = True
+        self._infos: dict[str, tuple[object, ...]] = {}
+        self._decoder = MessageDecoder()
+        self._headed: dict[Topic, bool] = {}
+
+    @property
+    def first_ns(self) -> int | None:
+        """The first log time or stamp."""
+        return min((t.first_ns for t in self.times.values() if t.first_ns), default=None)
+
+    def topics(self) -> tuple[Topic, ...]:
+        """Of the log."""
+        return self._log.topics()
+
+    def messages(self, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Those of the log, each watched."""
+        for message in self._log.messages(damage, names):
+            self._take(message)
+            yield message
+            images = self.images.get(message.topic.name)
+            if images is not None and images.count == self._num_images:
+                self.is_whole = False
+                return
+
+    def _take(self, message: RawMessage) -> None:
+        topic, name, stamp = message.topic, message.topic.name, message.log_time_ns
+        first, last = self.spans.get(message.file, (stamp, stamp))
+        self.spans[message.file] = min(first, stamp), max(last, stamp)
+        has_stamps = not self._by_log_time and self._is_headed(topic)
+        if has_stamps:
+            try:
+                stamp = header_stamp_ns(message)
+            except UndecodableMessageError:
+                has_stamps = False
+        times = self.times.get(name)
+        if times is None:
+            times = self.times[name] = TimesWatch(name, has_stamps=has_stamps)
+        times.add(stamp, message.log_time_ns)
+        if not is_ros(topic):
+            return
+        try:
+            if topic.type_name in (IMAGE, COMPRESSED_IMAGE):
+                self._image(message, stamp)
+            elif topic.type_name == CAMERA_INFO and name not in self.changed_infos:
+                self._info(message, stamp)
+            elif topic.type_name in TRANSFORMS and not name.endswith("tf_static"):
+                self._transforms(message)
+        except UndecodableMessageError:
+            return  # the survey counts it
+
+    def _is_headed(self, topic: Topic) -> bool:
+        """Whether messages begin with a std_msgs/Header."""
+        if topic not in self._headed:
+            fields = [line.split("#")[0].strip() for line in topic.definition.splitlines()]
+            first = next((line for line in fields if line), "")
+            is_headed = bool(_FIRST_FIELD.match(first)) if topic.definition else topic.type_name in _HEADED
+            self._headed[topic] = is_ros(topic) and (is_headed or topic.type_name in _HEADED)
+        return self._headed[topic]
+
+    def _image(self, message: RawMessage, stamp: int) -> None:
+        name = message.topic.name
+        images = self.images.setdefault(name, ImageWatch(name, self._scale))
+        is_wanted = images.is_wanted()
+        try:
+            image = read_image(self._decoder.decode(message), message.topic.type_name, lazily=True)
+            if is_wanted and image.kind == "depth":
+                images.add_depth(stamp, depth_of(image, self._scale), image.encoding, num_invalid(image.pixels))
+            elif is_wanted and image.kind == "color":
+                images.add_color(stamp, color_of(image), image.encoding)
+            else:
+                images.add_undecoded(image.encoding, image.width, image.height)
+        except (UndecodableMessageError, ValueError) as reason:
+            images.add_bad(stamp, str(reason))
+
+    def _info(self, message: RawMessage, stamp: int) -> None:
+        info = self._decoder.decode(message)
+        fields = {name.lower(): getattr(info, name) for name in ("K", "k", "D", "d") if hasattr(info, name)}
+        said = (info.width, info.height, tuple(fields["k"]), tuple(fields["d"]))
+        if self._infos.setdefault(message.topic.name, said) != said:
+            self.changed_infos[message.topic.name] = stamp
+
+    def _transforms(self, message: RawMessage) -> None:
+        for item in self._decoder.decode(message).transforms:
+            child = item.child_frame_id.strip("/")
+            edge = f"tf {item.header.frame_id.strip('/')} -> {child}"
+            if child not in self.transforms:
+                self.transforms[child] = TimesWatch(edge, has_stamps=True)
+            stamp = message.log_time_ns if self._by_log_time else stamp_ns(item.header)
+            self.transforms[child].add(stamp, message.log_time_ns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedCamera:
+    """A camera that is ready to be read, and reduced frames of it, spread over the log; color is black where none was
+    kept at the time of the depth.
+    """
+
+    topics: CameraTopics
+    camera: Camera
+    frames: tuple[RgbdFrame, ...]
+
+
+def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptions) -> Camera | None:
+    """The camera as `ingest` makes it ready; None where it lacks something (rig.missing says what)."""
+    try:
+        return build_cameras(log, found, replace(options, cameras=(topics.name,)))[0]
+    except InputError:
+        return None
+
+
+def checked_camera(
+    topics: CameraTopics, camera: Camera, images: Mapping[str, ImageWatch], tf: TfTree, options: SourceOptions
+) -> CheckedCamera:
+    """With the frames whose depth was kept and whose pose is known."""
+    depths, colors = images.get(topics.depth), images.get(topics.color)
+    kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
+    frames = []
+    for kept in depths.kept if depths is not None else ():
+        near = nearest(sorted(kept_colors), kept.stamp_ns)
+        is_near = near is not None and abs(near - kept.stamp_ns) <= options.pairing_tolerance_s * 1e9
+        color = kept_colors[near] if near is not None and is_near else None
+        stamp_ns = kept.stamp_ns if color is None else color.stamp_ns
+        T = camera.pose_at(tf, stamp_ns, round(options.pose_tolerance_s * 1e9))
+        if T is not None:
+            frames.append(_frame(camera, kept, color, stamp_ns, T))
+    return CheckedCamera(topics=topics, camera=camera, frames=tuple(frames))
+
+
+def _frame(camera: Camera, kept: Kept, color: Kept | None, stamp_ns: int, T: Float64) -> RgbdFrame:
+    """Depth in the colour camera's view, without lens distortion, as `ingest` gives it but reduced."""
+    assert kept.depth is not None
+    depth: NDArray[Any] = kept.depth
+    stride = kept.stride
+    if camera.depth_to_color is not None:
+        stride = max(1, round(camera.intrinsics.height / kept.depth.shape[0]))
+        warp = camera.depth_to_color
+        depth = DepthToColor(
+            depth_intrinsics=strided_lens(warp.depth_intrinsics, kept.stride),
+            color_intrinsics=strided_lens(camera.intrinsics, stride),
+            T_color_depth=warp.T_color_depth,
+        ).warp(depth)
+    elif camera.undistortion is not None:
+        depth = _reduced(camera.undistortion.depth(_enlarged(depth, kept)), stride)
+    pixels: NDArray[Any] = np.zeros((*depth.shape, 3), np.uint8)
+    if color is not None and color.color is not None:
+        pixels = color.color
+        if camera.undistortion is not None:
+            pixels = _reduced(camera.undistortion.color(_enlarged(pixels, color)), color.stride)
+    if pixels.shape[:2] != depth.shape:
+        pixels = np.zeros((*depth.shape, 3), np.uint8)
+    return RgbdFrame(
+        stamp_ns=stamp_ns,
+        camera=camera.name,
+        color=pixels,
+        depth=np.asarray(depth, np.float32),
+        intrinsics=strided_lens(camera.intrinsics, stride),
+        T_world_camera=T,
+    )
+
+
+def _enlarged(image: NDArray[Any], kept: Kept) -> NDArray[Any]:
+    rows = np.repeat(image, kept.stride, axis=0)[: kept.height]
+    return np.repeat(rows, kept.stride, axis=1)[:, : kept.width]
+
+
+def _reduced(image: NDArray[Any], stride: int) -> NDArray[Any]:
+    return image[::stride, ::stride]
+
+
+def nearest(stamps: Sequence[int], stamp_ns: int) -> int | None:
+    """Of stamps in order."""
+    if not stamps:
+        return None
+    after = int(np.searchsorted(np.array(stamps), stamp_ns))
+    return min(stamps[max(0, after - 1) : after + 1], key=lambda stamp: abs(stamp - stamp_ns))
+
+
+def image_motion(watch: LogWatch, cameras: Sequence[CheckedCamera]) -> ImageMotion:
+    """How the first images of each camera change."""
+    motion = ImageMotion()
+    for checked in cameras:
+        if checked.frames and checked.topics.color in watch.images:
+            for frame in _thumbnails(watch, checked.camera, checked):
+                motion.add(frame)
+    return motion
+
+
+def _thumbnails(watch: LogWatch, camera: Camera, checked: CheckedCamera) -> list[RgbdFrame]:
+    """Colour beside depth only where both are of one view."""
+    is_registered = camera.depth_to_color is None
+    colors = watch.images[checked.topics.color].thumbnails if is_registered else []
+    gray = {thumbnail.stamp_ns: thumbnail.color for thumbnail in colors}
+    at, frames = sorted(gray), []
+    poses = {frame.stamp_ns: frame.T_world_camera for frame in checked.frames}
+    stamps = sorted(poses)
+    for thumbnail in watch.images[checked.topics.depth].thumbnails:
+        near, depth = nearest(at, thumbnail.stamp_ns), thumbnail.depth
+        assert depth is not None
+        color = gray.get(near) if near is not None else None
+        if color is None or color.shape[:2] != depth.shape:
+            color = np.zeros((*depth.shape, 3), np.uint8)
+        frames.append(
+            RgbdFrame(
+                stamp_ns=thumbnail.stamp_ns,
+                camera=camera.name,
+                color=color,
+                depth=depth,
+                intrinsics=thumbnail_lens(camera.intrinsics),
+                T_world_camera=poses[nearest(stamps, thumbnail.stamp_ns) or stamps[0]],
+            )
+        )
+    return frames

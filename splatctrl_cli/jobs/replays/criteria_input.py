@@ -1,0 +1,72 @@
+"""What the criteria of a replay's verdict look at, and how they put it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.control.events import Event, EventKind
+from splatctrl_cli.jobs.replays.inputs import LoggedStates
+from splatctrl_cli.jobs.replays.metrics import Metrics
+from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
+from splatctrl_cli.jobs.replays.result import Replay
+from splatctrl_cli.jobs.replays.state_pass import SLIGHT
+
+SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
+BROKEN, UNKNOWN = "failed", "*not evaluable*"  # as the table of the criteria has them
+SLOW = "log joint states more often"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """What the criteria look at."""
+
+    request: ReplayRequest
+    inputs: ReplayInputs
+    logged: LoggedStates
+    replay: Replay
+    metrics: Metrics
+
+    @property
+    def threshold(self) -> float:
+        """The margin [m], less what solver and rounding may leave."""
+        return self.replay.margin - SLIGHT
+
+    @property
+    def num_states(self) -> int:
+        """That were judged."""
+        return len(self.replay.audit.stamp_ns)
+
+
+def events_of(replay: Replay, kind: EventKind, source: str = "") -> Sequence[Event]:
+    return [event for event in replay.events if event.kind is kind and event.source == source]
+
+
+def least_of(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float | None:
+    there = values[~np.isnan(values)]
+    return float(there.min()) if len(there) else None
+
+
+def time_of_least(judged: Judged, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    return seconds_at(judged, int(np.nanargmin(values)))
+
+
+def seconds_at(judged: Judged, index: int) -> float:
+    """Of a state, since the first."""
+    stamps = judged.replay.audit.stamp_ns
+    return float(stamps[index] - stamps[0]) * 1e-9
+
+
+def counted(number: int, what: str) -> str:
+    return f"{number} {what}" + ("s" if number != 1 else "")
+
+
+def mm(metres: float) -> str:
+    return f"{1e3 * metres:.1f} mm"
+
+
+def nearby(judged: Judged, column: str) -> tuple[float, float, int] | None:
+    """The largest value of what was known about the arm, when [s], and over how many states; None without one."""
+    values = judged.replay.near[column]
+    num = int(np.isfinite(values).sum())
+    return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None

@@ -1,0 +1,128 @@
+"""Whether a scene or field, a log and a robot belong together, by what they contain."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.evaluate.same_recording import changed_files, differences
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.records import RecordSource
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.scene.splats_and_occupancy import agreement_with_grid
+from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from splatctrl_cli.simulate.truth import Truth
+
+S = TypeVar("S", SceneConfig, OccupancyConfig)
+COMPARED = 20  # states
+SAME_CLEARANCE = 1e-3  # [m]: a truth file keeps six digits
+APART = 1_000_000_000  # [ns] between the times of two recordings that can still be one
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mismatch:
+    """What does not fit, as a sentence, and what to do about it."""
+
+    sentence: str
+    remedy: str
+
+
+def scene_mismatches(
+    scene: SceneFolder, source: RecordSource, states: StateColumns, model: RobotModel
+) -> Iterator[Mismatch]:
+    """How a reconstruction and a log with states of a robot do not belong together; nothing where they do.
+
+    By the digests of files of the same names, each training camera's first frame, the times that both cover, and the
+    joints of the robot that the scene was told apart with.
+    """
+    run: Mapping[str, Any] = scene.run
+    if not scene.has_digests:
+        yield Mismatch(
+            sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
+            remedy="reconstruct again",
+        )
+    other = changed_files(run.get("inputs", {}), source.digests())
+    recorded = run.get("metrics", {}).get("first_frames")
+    if not other and recorded and source.cameras:
+        other = differences(recorded, source.records())
+    if other:
+        yield Mismatch(
+            sentence=f"{scene.path} was made from another recording: {'; '.join(other[:3])}",
+            remedy="reconstruct this log",
+        )
+    if scene.has_clock and not scene.snapshots:
+        yield Mismatch(
+            sentence=f"{scene.path} has no snapshot: the map of its end would judge the log from its beginning",
+            remedy="reconstruct again",
+        )
+    if scene.has_clock and len(states):
+        stamps = [snapshot.stamp_ns for snapshot in scene.snapshots] or [scene.stamp_ns]
+        first, last = int(states.stamp_ns[0]), int(states.stamp_ns[-1])
+        if last < stamps[0] - APART or first > max(stamps[-1], scene.stamp_ns) + APART:
+            yield Mismatch(
+                sentence=f"joint states from {first} to {last} ns and a scene from {stamps[0]} to "
+                f"{scene.stamp_ns} ns are of different times",
+                remedy="record both by one clock, or reconstruct this log",
+            )
+    yield from _map_mismatches(scene)
+    joints = run.get("metrics", {}).get("robot_joints")
+    if joints is not None and tuple(joints) != tuple(model.joint_names):
+        yield Mismatch(
+            sentence=f"{scene.path} was told apart from another robot, with joints {', '.join(joints)}",
+            remedy="reconstruct with this --urdf",
+        )
+
+
+def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
+    """Splats that are not those of their occupancy grid: of another scale, moved, or taken away."""
+    known = scene.known() if scene.has_digests else None
+    if known is None:
+        return
+    used = scene.run.get("config", {})
+    found = agreement_with_grid(
+        scene.splats(), known, _used(SceneConfig, used.get("scene")), _used(OccupancyConfig, used.get("occupancy"))
+    )
+    if not found.holds and found.num_voxels:
+        yield Mismatch(
+            sentence=f"{scene.path}: splats and occupancy disagree: {100 * found.on_surface:.0f} % of the splats "
+            f"lie on occupied voxels, {100 * found.represented:.0f} % of {found.num_voxels} occupied "
+            "voxels are represented",
+            remedy="check the splats' units and frame, or reconstruct again",
+        )
+
+
+def _used(section: type[S], values: object) -> S:
+    """The section of a configuration that a ``run.json`` has; the default where it has none."""
+    known = {field.name for field in fields(section)}
+    given = values if isinstance(values, dict) else {}
+    return section(**{name: value for name, value in given.items() if name in known})
+
+
+def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mismatch | None:
+    """How a truth file and a log with states are of different recordings, by the clearance that the truth has."""
+    stamps = states.stamp_ns
+    shared = np.intersect1d(truth.stamps, stamps)
+    if not len(shared):
+        return Mismatch(
+            sentence=f"{truth.path} is of another recording: none of its {len(truth.stamps)} stamps is in the log",
+            remedy="give the truth.json that simulate wrote beside the log",
+        )
+    if tuple(truth.joint_names) != tuple(model.joint_names) or not truth.robot_spheres.is_file():
+        return None  # another model on purpose: nothing to compare with
+    own = RobotModel.from_urdf(truth.robot_urdf, truth.robot_spheres, T_world_base=truth.T_world_base)
+    moving = np.flatnonzero(own.moving_spheres)
+    worst = 0.0
+    for stamp in shared[:: max(len(shared) // COMPARED, 1)]:
+        q = states.position[int(np.searchsorted(stamps, stamp))]
+        gap = truth.distance(own.sphere_centers(q)[moving], int(stamp)) - own.sphere_set.radii[moving]
+        recorded = truth.clearance[int(np.searchsorted(truth.stamps, stamp))]
+        worst = max(worst, abs(float(gap.min()) - float(recorded)))
+    if worst <= SAME_CLEARANCE:
+        return None
+    return Mismatch(
+        sentence=f"{truth.path} is of another recording: the logged motion has clearances up to {1e3 * worst:.0f} mm "
+        "off those that it recorded",
+        remedy="give the truth.json that simulate wrote beside the log",
+    )

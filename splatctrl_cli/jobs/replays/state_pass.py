@@ -1,0 +1,224 @@
+"""States of a replay as they come, block by block: measured, explained, and kept in files."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from splatctrl_cli.config import Config
+from splatctrl_cli.control.arm import sphere_names
+from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance
+from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
+from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
+from splatctrl_cli.control.motion_limits import MotionLimits
+from splatctrl_cli.control.near_space import NearSpace
+from splatctrl_cli.control.preconditions import static_clearance
+from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
+from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene
+from splatctrl_cli.jobs.replays.state_store import BLOCK, Figures, StoredAudit, StoredObjects
+from splatctrl_cli.records import Float64, Stamps
+from splatctrl_cli.robot.declared_contact import Declarations
+from splatctrl_cli.robot.model import RobotModel
+
+SLIGHT = 1e-3  # [m] under a margin that solver, rounding and a map that is still being fitted may leave
+
+
+class ReplayRecord:
+    """The audit of states (T,) in the scenes as they were known, what is nearest to the nearest sphere of each, in
+    words, the age (T,) [s] of each state's scene, and what happened.
+
+    between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), 1 where that is
+    the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
+    clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
+    near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at. strain:
+    velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in
+    the first scene and the least in any.
+    """
+
+    def __init__(
+        self,
+        model: RobotModel,
+        scene: KnownScene,
+        *,
+        config: Config,
+        max_map_age: float,
+        is_continuous: bool = True,
+        declared: Declarations | None = None,
+        first_state_ns: int = 0,
+    ) -> None:
+        """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states.
+        declared: contact that is meant, at times that count from `first_state_ns`.
+        """
+        self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
+        self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
+        self.between, self.strain = Figures(), Figures()
+        self.statics: dict[str, tuple[float, float]] = {}
+        self.events = EventFold()
+        self._model, self._scene, self._max_map_age = model, scene, max_map_age
+        self._margin, self._longest = config.control.margin, config.verdict.longest_interval
+        self._spheres = sphere_names(model.sphere_set)
+        self._number = {name: number for number, name in enumerate(self._spheres)}
+        self._pairs = [(int(a), int(b)) for a, b in model.self_pairs()]
+        self._reach, self._is_continuous = Reach.of(model), is_continuous
+        limit = np.asarray(config.control.max_acceleration, np.float64)
+        self._limits = MotionLimits(
+            np.asarray(model.velocity_limit),
+            np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
+        )
+        self.near, self._near = Figures(), NearSpace(model, config.control.margin)
+        self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
+        self._last_scene: KnownFields | None = None
+
+    def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
+        """Ranges of at most BLOCK consecutive states of stamps (T,) that see the same scene."""
+        first = 0
+        while first < len(stamps):
+            scene, last = self._scene.at(int(stamps[first])), first + 1
+            end = min(first + BLOCK, len(stamps))
+            while last < end and self._scene.at(int(stamps[last])) is scene:
+                last += 1
+            yield first, last
+            first = last
+
+    def measured(self, stamps: Stamps, positions: Float64, velocities: Float64) -> AuditTrace:
+        """The audit of the next block of states (T, J), which see one scene."""
+        scene = self._scene
+        part = audited(
+            self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed
+        )
+        part = self._without_expected(part)
+        self.audit.add(part)
+        self.obstacles.extend(["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)])
+        self.ages.append(map_age_s=np.array([scene.age_s(stamp) for stamp in stamps.tolist()]))
+        self._bound(part, velocities)
+        strain = self._limits.add(stamps, positions if self._is_continuous else np.zeros_like(positions))
+        self.strain.append(velocity=strain.velocity, acceleration=strain.acceleration)
+        self._strain = strain
+        self._look_at_statics(part)
+        self._look_around(part)
+        self._tell_represented(part)
+        return part
+
+    def explain(self, part: AuditTrace, steps: Sequence[ControlStep | None] = ()) -> None:
+        """Find what happened in the block that was measured last, with what a controller did there."""
+        signals = audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs)
+        signals += limit_signals(self._strain, self._model.joint_names)
+        signals += interval_signals(self._lower, self._unbounded, self._margin - SLIGHT)
+        age_s = np.array([self._scene.age_s(stamp) for stamp in part.stamp_ns.tolist()])
+        signals.append(stale_signal(age_s, self._max_map_age))
+        if steps:
+            signals += step_signals(steps)
+
+        def near(kind: EventKind, name: str, at: int) -> Obstacle | None:
+            if name not in self._number or kind is EventKind.WITHOUT_DISTANCE:
+                return None
+            center = self._model.sphere_centers(part.position[at])[[self._number[name]]]
+            return self._scene.at(int(part.stamp_ns[at])).obstacles(center)[0]
+
+        self.events.add(part.stamp_ns, signals, near)
+
+    def _without_expected(self, part: AuditTrace) -> AuditTrace:
+        """The audit without the spheres whose contact is declared, where they would break the margin."""
+        if not self._declared.expected_contact:
+            return part
+        links, moving = self._model.sphere_set.links, self._reach.moving
+        clearance, of_spheres = dict(part.clearance), dict(part.of_spheres)
+        for name, each in part.of_spheres.items():
+            kept = each.copy()
+            for state, column in zip(*np.nonzero(each < self._margin), strict=True):
+                stamp, sphere = int(part.stamp_ns[state]), int(moving[column])
+                center = self._model.sphere_centers(part.position[state])[[sphere]]
+                place = np.array(self._scene.at(stamp).obstacles(center)[0].position)
+                if self._declared.expects(links[sphere], place, (stamp - self._first_state_ns) * 1e-9):
+                    kept[state, column] = np.inf
+            nearest = kept.argmin(axis=1)
+            of_spheres[name] = kept
+            clearance[name] = Clearance(distance=kept[np.arange(len(kept)), nearest], sphere=moving[nearest])
+        return replace(part, clearance=clearance, of_spheres=of_spheres)
+
+    def _bound(self, part: AuditTrace, velocities: Float64) -> None:
+        """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
+        known = self._scene.at(int(part.stamp_ns[0])).distances
+        name = "certified" if "certified" in known else "exact"
+        deficit = self._reach.radii - self._model.sphere_set.radii[self._reach.moving]
+        stamps, positions, at_states = part.stamp_ns, part.position, part.of_spheres[name] - deficit
+        if self._before is not None:
+            stamp, q, velocity = self._before
+            earlier = clearances(self._model, self._reach, q[None], known[name])
+            earlier[:, np.isinf(at_states[0])] = np.inf  # what is meant now was meant on the way
+            stamps, positions = np.concatenate([[stamp], stamps]), np.concatenate([q[None], positions])
+            velocities = np.concatenate([velocity[None], velocities])
+            at_states = np.concatenate([earlier, at_states])
+        between = between_states(
+            self._model,
+            self._reach,
+            stamps,
+            positions,
+            velocities,
+            at_states,
+            known[name],
+            margin=self._margin - SLIGHT,
+            longest=self._longest,
+        )
+        self._keep_bounds(between, stamps, at_states, is_first=self._before is None)
+        self._before = int(stamps[-1]), positions[-1], velocities[-1]
+
+    def _keep_bounds(self, between: Between, stamps: Stamps, at_states: Float64, *, is_first: bool) -> None:
+        unbounded = np.where(between.is_bounded | (not self._is_continuous), 0.0, np.diff(stamps) * 1e-9)
+        lower = np.where(between.is_bounded & self._is_continuous, between.lower, np.nan)
+        surface = at_states.min(axis=1) if is_first else at_states[1:].min(axis=1)
+        met = between.is_met.astype(np.float64)
+        if is_first:
+            lower, unbounded, met = np.insert(lower, 0, np.nan), np.insert(unbounded, 0, 0.0), np.insert(met, 0, 0.0)
+        self._lower, self._unbounded = lower, unbounded
+        self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
+
+    def _look_at_statics(self, part: AuditTrace) -> None:
+        """The clearance of spheres that no joint moves, once a scene."""
+        known = self._scene.at(int(part.stamp_ns[0]))
+        if known is self._last_scene:
+            return
+        self._last_scene = known
+        for name, value in static_clearance(self._model, known.distances["exact"], part.position[0]).items():
+            first, least = self.statics.get(name, (value, value))
+            self.statics[name] = (first, min(least, value))
+
+    def _look_around(self, part: AuditTrace) -> None:
+        """What was known of the space about the arm, at some of the states."""
+        num = len(part.stamp_ns)
+        unseen, blind, age, ahead, unanswered = np.full((5, num), np.nan)
+        place = np.full((num, 3), np.nan)
+        for at in self._near.due(part.stamp_ns):
+            stamp = int(part.stamp_ns[at])
+            known = self._scene.seen_at(stamp)
+            if known is not None:
+                figures = self._near.look(stamp, part.position[at], known)
+                unseen[at], blind[at] = figures.unseen, figures.blind
+                unanswered[at], place[at] = figures.unanswered, figures.place
+                if self._scene.has_seen_times:
+                    age[at], ahead[at] = figures.age, figures.ahead
+        self.near.append(unseen=unseen, blind=blind, age=age, ahead=ahead, unanswered=unanswered, place=place)
+
+    def _tell_represented(self, part: AuditTrace) -> None:
+        """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""
+        exact = part.clearance["exact"].distance
+        alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
+        low = np.flatnonzero(exact < self._margin - SLIGHT)
+        if splats_alone is not None and len(low):
+            centers = self._model.sphere_centers_batch(part.position[low])
+            alone[low] = moving_clearance(self._model, centers, splats_alone)[0].distance
+        self.between.append(represented=alone)
+
+    def _nearest(self, part: AuditTrace) -> list[Obstacle | None]:
+        """What is nearest to the nearest sphere, by the controller's field; None without a distance."""
+        nearest = part.clearance["barrier"]
+        found: list[Obstacle | None] = [None] * len(part.stamp_ns)
+        states = np.flatnonzero(np.isfinite(nearest.distance))
+        if len(states):
+            centers = self._model.sphere_centers_batch(part.position[states])
+            points = np.ascontiguousarray(centers[np.arange(len(states)), nearest.sphere[states]])
+            obstacles = self._scene.at(int(part.stamp_ns[0])).obstacles(points)
+            for state, obstacle in zip(states.tolist(), obstacles, strict=True):
+                found[state] = obstacle
+        return found

@@ -1,0 +1,335 @@
+"""What a replay keeps of its states: columns and objects in files, read whole, one at a time, or by blocks."""
+
+import pickle
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Generic, TypeVar, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.control.audit import AuditTrace, Clearance
+from splatctrl_cli.control.fallbacks import Rung
+from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
+from splatctrl_cli.control.step import ControlStep, VelocityMargin
+from splatctrl_cli.control.terms import RowKind
+from splatctrl_cli.files.spilled_rows import IN_MEMORY, RowFile, Rows, scratch_folder
+from splatctrl_cli.records import Float64
+
+BLOCK = 1024  # states that are replayed at once
+RUNGS = tuple(Rung)
+STEP_FIGURES = (
+    *("clearance", "residual", "scale", "rung", "refused", "shaped"),
+    *(f"shaped {kind}" for kind in RowKind),
+)
+STEP_BLANK = (np.nan,) * len(STEP_FIGURES)
+Stamps = NDArray[np.int64]
+T = TypeVar("T")
+
+
+class StampColumn:
+    """Stamps [ns], in memory: eight bytes for each state."""
+
+    def __init__(self) -> None:
+        self._parts: list[Stamps] = []
+
+    def append(self, stamp_ns: Stamps) -> None:
+        """Add the next (T,)."""
+        self._parts.append(stamp_ns)
+
+    @property
+    def all(self) -> Stamps:
+        """(T,)."""
+        if len(self._parts) != 1:
+            self._parts = [np.concatenate([np.zeros(0, dtype=np.int64), *self._parts])]
+        return self._parts[0]
+
+
+class StoredObjects(Sequence[T], Generic[T]):
+    """Objects in a file without a name, read a block at a time."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
+        self._starts: list[int] = []  # of each block: its first object, and where it is in the file
+        self._places: list[int] = []
+        self._num = 0
+        self._read: tuple[int, list[T]] = (-1, [])
+
+    def extend(self, objects: Sequence[T]) -> None:
+        """Add a block."""
+        if not objects:
+            return
+        self._starts.append(self._num)
+        self._places.append(self._file.seek(0, 2))
+        pickle.dump(list(objects), self._file, protocol=pickle.HIGHEST_PROTOCOL)
+        self._num += len(objects)
+
+    def __len__(self) -> int:
+        return self._num
+
+    def __iter__(self) -> Iterator[T]:
+        for number in range(len(self._starts)):
+            yield from self._block(number)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(self._num))]
+        at = index + (self._num if index < 0 else 0)
+        if not 0 <= at < self._num:
+            raise IndexError(f"{index} of {self._num}")
+        number = int(np.searchsorted(self._starts, at, side="right")) - 1
+        return self._block(number)[at - self._starts[number]]
+
+    def _block(self, number: int) -> list[T]:
+        if self._read[0] != number:
+            self._file.seek(self._places[number])
+            self._read = number, pickle.load(self._file)
+        return self._read[1]
+
+
+class Figures:
+    """Columns of one number, or one row of them, per state, by name; NaN where a state has none."""
+
+    def __init__(self) -> None:
+        self._files: dict[str, RowFile] = {}
+
+    def append(self, **columns: Float64) -> None:
+        """Add the next states' (T,)."""
+        for name, values in columns.items():
+            self._files.setdefault(name, RowFile(values.shape[1:])).append(values)
+
+    def __getitem__(self, name: str) -> Float64:
+        """A whole column (T,)."""
+        return self._files[name].read(0, len(self._files[name]))
+
+    def rows(self, name: str) -> Rows:
+        """A column (T,) that is read as it is asked for."""
+        return Rows(self._files[name])
+
+    def block(self, name: str, first: int, last: int) -> Float64:
+        """Part of a column."""
+        return self._files[name].read(first, last)
+
+
+class StoredClearance:
+    """As `Clearance`, a column read each time it is asked for."""
+
+    def __init__(self, figures: Figures, name: str) -> None:
+        self._figures, self._name = figures, name
+
+    @property
+    def distance(self) -> Float64:
+        """(T,) [m]."""
+        return self._figures[f"distance {self._name}"]
+
+    @property
+    def rows(self) -> Rows:
+        """The distance (T,) [m], read as it is asked for."""
+        return self._figures.rows(f"distance {self._name}")
+
+    @property
+    def sphere(self) -> NDArray[np.int64]:
+        """(T,)."""
+        return self._figures[f"sphere {self._name}"].astype(np.int64)
+
+
+class StoredAudit:
+    """As `AuditTrace`, in files: position is read by rows, the other columns each time they are asked for."""
+
+    def __init__(self) -> None:
+        self._stamps, self._figures = StampColumn(), Figures()
+        self._names: tuple[str, ...] = ()
+
+    def add(self, part: AuditTrace) -> None:
+        """The next states."""
+        self._names = tuple(part.clearance)
+        self._stamps.append(part.stamp_ns)
+        for name, clearance in part.clearance.items():
+            columns = {f"distance {name}": clearance.distance, f"sphere {name}": clearance.sphere.astype(np.float64)}
+            self._figures.append(**columns)
+        self._figures.append(
+            position=part.position,
+            limit_margin=part.limit_margin,
+            limit_joint=part.limit_joint.astype(np.float64),
+            self_clearance=part.self_clearance,
+            self_pair=part.self_pair.astype(np.float64),
+            unknown_share=part.unknown_share,
+        )
+
+    @property
+    def stamp_ns(self) -> Stamps:
+        """(T,)."""
+        return self._stamps.all
+
+    @property
+    def position(self) -> Rows:
+        """(T, J)."""
+        return self._figures.rows("position")
+
+    @property
+    def clearance(self) -> Mapping[str, StoredClearance]:
+        """By field name."""
+        return {name: StoredClearance(self._figures, name) for name in self._names}
+
+    @property
+    def limit_margin(self) -> Float64:
+        """(T,) [rad]."""
+        return self._figures["limit_margin"]
+
+    @property
+    def self_clearance(self) -> Float64:
+        """(T,) [m]."""
+        return self._figures["self_clearance"]
+
+    @property
+    def unknown_share(self) -> Float64:
+        """(T,)."""
+        return self._figures["unknown_share"]
+
+    def block(self, first: int, last: int) -> AuditTrace:
+        """Some of the states."""
+
+        def part(name: str) -> Float64:
+            return self._figures.block(name, first, last)
+
+        return AuditTrace(
+            stamp_ns=self.stamp_ns[first:last],
+            position=part("position"),
+            clearance={
+                name: Clearance(distance=part(f"distance {name}"), sphere=part(f"sphere {name}").astype(np.int64))
+                for name in self._names
+            },
+            limit_margin=part("limit_margin"),
+            limit_joint=part("limit_joint").astype(np.int64),
+            self_clearance=part("self_clearance"),
+            self_pair=part("self_pair").astype(np.int64),
+            unknown_share=part("unknown_share"),
+        )
+
+
+class StoredSteps:
+    """Steps of a controller, None where it was not asked, with the figures (T,) that are asked for over all of them:
+    clearance, residual, scale, rung (its number), refused, shaped, and shaped by each kind of row.
+    """
+
+    def __init__(self) -> None:
+        self.stored: StoredObjects[ControlStep | None] = StoredObjects()
+        self.figures = Figures()
+
+    @property
+    def velocity(self) -> Rows:
+        """(T, J) [rad/s], NaN without a step."""
+        return self.figures.rows("velocity")
+
+    def extend(self, steps: Sequence[ControlStep | None], num_joints: int) -> None:
+        """The next steps."""
+        blank = np.full(num_joints, np.nan)
+        self.stored.extend(steps)
+        rows = np.array([STEP_BLANK if step is None else _figures_of(step) for step in steps])
+        self.figures.append(
+            velocity=np.array([blank if step is None else step.velocity for step in steps]),
+            **dict(zip(STEP_FIGURES, rows.T, strict=True)),
+        )
+
+
+def _figures_of(step: ControlStep) -> tuple[float, ...]:
+    """`STEP_FIGURES` of a step."""
+    shaped = (is_shaped(step), *(is_shaped(step, kind) for kind in RowKind))
+    return (step.clearance, step.residual, step.scale, RUNGS.index(step.rung), step.num_refused, *shaped)
+
+
+class StoredLoop:
+    """A `StepRecord` in files."""
+
+    def __init__(self, num_joints: int) -> None:
+        self.kept, self._num_joints = StoredSteps(), num_joints
+        self._stamps, self._position = StampColumn(), RowFile((num_joints,))
+        self._waiting: list[tuple[int, Float64, ControlStep]] = []
+
+    @property
+    def stamp_ns(self) -> Stamps:
+        """(T,)."""
+        self._flush()
+        return self._stamps.all
+
+    @property
+    def position(self) -> Rows:
+        """(T, J)."""
+        self._flush()
+        return Rows(self._position)
+
+    @property
+    def steps(self) -> Sequence[ControlStep]:
+        """The steps; none is None."""
+        self._flush()
+        return self.kept.stored  # type: ignore[return-value]
+
+    def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
+        """The next step."""
+        self._waiting.append((stamp_ns, q, step))
+        if len(self._waiting) == BLOCK:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._waiting:
+            return
+        stamps, positions, steps = zip(*self._waiting, strict=True)
+        self._waiting = []
+        self._stamps.append(np.array(stamps, dtype=np.int64))
+        self._position.append(np.array(positions))
+        self.kept.extend(steps, self._num_joints)
+
+
+class StoredOpenLoop:
+    """As `OpenLoopTrace`, in files; figures (T,): size and largest of the difference, and by how much the logged
+    velocity keeps the tightest barrier row and limit.
+    """
+
+    def __init__(self) -> None:
+        self.kept, self.figures = StoredSteps(), Figures()
+        self.margins: StoredObjects[VelocityMargin | None] = StoredObjects()
+
+    @property
+    def steps(self) -> Sequence[ControlStep | None]:
+        """None where the controller was not asked."""
+        return self.kept.stored
+
+    @property
+    def logged(self) -> Rows:
+        """(T, J) [rad/s]."""
+        return self.figures.rows("logged")
+
+    @property
+    def difference(self) -> Rows:
+        """(T, J) [rad/s] commanded less logged."""
+        return self.figures.rows("difference")
+
+    def add(self, part: OpenLoopTrace) -> None:
+        """The next states."""
+        self.kept.extend(part.steps, part.logged.shape[1])
+        self.margins.extend(part.margins)
+        nothing = (np.nan, np.nan)
+        room = np.array([nothing if m is None else (m.barrier, m.limit) for m in part.margins])
+        self.figures.append(
+            logged=part.logged,
+            difference=part.difference,
+            size=np.linalg.norm(part.difference, axis=1),
+            largest=np.max(np.abs(part.difference), axis=1),
+            barrier=room[:, 0],
+            limit=room[:, 1],
+        )
+
+    def block(self, first: int, last: int) -> OpenLoopTrace:
+        """Some of the states."""
+        return OpenLoopTrace(
+            logged=self.logged[first:last],
+            commanded=self.kept.velocity[first:last],
+            steps=tuple(self.steps[first:last]),
+            margins=tuple(self.margins[first:last]),
+        )

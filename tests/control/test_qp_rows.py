@@ -1,0 +1,183 @@
+"""Every row of the program against finite differences of the distance that it guards, on real kinematic chains."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.barriers import BRAKING_SHARE, scene_margin
+from splatctrl_cli.control.limits import JointLimits, box_rows
+from splatctrl_cli.control.printed_program import assemble_printed
+from splatctrl_cli.control.qp_rows import RowBuilder, Rows
+from splatctrl_cli.control.scene_field import SceneStep, distance_rate
+from splatctrl_cli.control.step import QpIkController
+from splatctrl_cli.control.terms import State, stray_cost
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.model import RobotModel
+from tests.control.fakes import Balls, PlanarArm, Plane, far_away
+from tests.reference.control import braking_room
+
+CONFIG = ControlConfig()
+STEP = 1e-6
+ROOM = Balls([[0.6, 0.3, 0.5], [-0.4, 0.5, 0.7], [0.2, -0.6, 0.4]], [0.1, 0.05, 0.15])
+SLOPE = Plane([0.4, -0.5, 0.6], -1.2, scale=0.8)
+
+
+def sample_arm(sample_data: Path) -> RobotModel:
+    tabletop = sample_data / "tabletop"
+    return RobotModel.from_urdf(tabletop / "robot.urdf", tabletop / "robot_spheres.yaml")
+
+
+@pytest.fixture(scope="session", params=["sample arm", "Panda"])
+def arm(request: pytest.FixtureRequest, sample_data: Path) -> RobotModel:
+    if request.param == "sample arm":
+        return sample_arm(sample_data)
+    real = request.getfixturevalue("real_data")
+    spheres = real / "robot_spheres" / "robometrics" / "robometrics" / "content" / "robot" / "franka_spheres.yml"
+    urdf = real / "vamp_panda" / "resources" / "panda" / "panda.urdf"
+    return RobotModel.from_urdf(urdf, spheres)
+
+
+def postures(arm: RobotModel, num: int) -> Float64:
+    """Postures well within the limits."""
+    half = 0.4 * (arm.upper - arm.lower)
+    return arm.middle + np.random.default_rng(5).uniform(-half, half, (num, len(half)))
+
+
+def wide(arm: RobotModel) -> tuple[Float64, Float64]:
+    """A box of velocities in which every row could bind."""
+    return np.full(arm.num_joints, -1e3), np.full(arm.num_joints, 1e3)
+
+
+def state_at(arm: RobotModel, q: Float64, rate: float | Float64 = 0.0) -> State:
+    return State(model=arm, frame=arm.frame_names[-1], q=q, box=wide(arm), distance_rate=rate)
+
+
+def rows_of(arm: RobotModel, field: Balls | Plane, q: Float64, rate: float = 0.0, **options: object) -> Rows:
+    return RowBuilder(arm, CONFIG, field, **options).at(state_at(arm, q, rate))  # type: ignore[arg-type]
+
+
+def slopes(arm: RobotModel, field: Balls | Plane, q: Float64) -> Float64:
+    """``dd/dq`` (M, J) by central differences of the distances of every row."""
+    builder = RowBuilder(arm, CONFIG, field)
+    steps = STEP * np.eye(arm.num_joints)
+    return np.stack([(builder.distances(q + e) - builder.distances(q - e)) / (2 * STEP) for e in steps], axis=1)
+
+
+@pytest.mark.parametrize("field", [ROOM, SLOPE], ids=["balls", "scaled plane"])
+def test_every_row_is_less_the_derivative_of_its_distance_along_each_joint(
+    arm: RobotModel, field: Balls | Plane
+) -> None:
+    for q in postures(arm, 6):
+        rows, by_difference = rows_of(arm, field, q), slopes(arm, field, q)
+        num_external = len(rows.external)
+        np.testing.assert_allclose(rows.external.G, -by_difference[:num_external], atol=2e-8)
+        np.testing.assert_allclose(rows.own.G, -by_difference[num_external:], atol=2e-8)
+        assert len(rows.own) > 100 and np.abs(rows.own.G).max() > 0.1
+
+
+def test_the_bound_of_every_row_is_the_gain_times_the_distance_above_its_margin(arm: RobotModel) -> None:
+    q = postures(arm, 1)[0]
+    rows = rows_of(arm, ROOM, q, rate=-0.07)
+    centers = arm.sphere_centers(q)
+    expected = [10.0 * (ROOM.query(centers[[s]])[0][0] - arm.sphere_set.radii[s] - 0.02) - 0.07
+                for s in np.flatnonzero(arm.moving_spheres)]  # fmt: skip
+    np.testing.assert_allclose(rows.external.h, expected, atol=1e-12)
+    radii = arm.sphere_set.radii
+    between = [np.linalg.norm(centers[a] - centers[b]) - radii[a] - radii[b] for a, b in arm.self_pairs()]
+    np.testing.assert_allclose(rows.own.h, 10.0 * (np.array(between) - 0.02), atol=1e-12)
+
+
+def test_what_is_left_of_a_row_is_its_promise_along_any_velocity(arm: RobotModel) -> None:
+    random, builder = np.random.default_rng(7), RowBuilder(arm, CONFIG, ROOM)
+    for q in postures(arm, 4):
+        velocity = random.uniform(-1.0, 1.0, arm.num_joints)
+        ahead, behind = builder.distances(q + STEP * velocity), builder.distances(q - STEP * velocity)
+        margin = np.where(np.arange(len(ahead)) < builder.num_external, CONFIG.margin, CONFIG.self_margin)
+        promise = 10.0 * (builder.distances(q) - margin) + (ahead - behind) / (2 * STEP)
+        np.testing.assert_allclose(builder.room(state_at(arm, q), velocity), promise, atol=1e-7)
+
+
+def test_a_row_with_limited_braking_asks_for_the_room_that_braking_takes(arm: RobotModel) -> None:
+    acceleration = np.linspace(2.0, 5.0, arm.num_joints)
+    for q in postures(arm, 2):
+        rows = rows_of(arm, ROOM, q, acceleration=acceleration)
+        num_fast = 0
+        for G, h, room in (
+            *zip(rows.external.G, rows.external.h, rows.external.distance - CONFIG.margin, strict=True),
+            *list(zip(rows.own.G, rows.own.h, rows.own.distance - CONFIG.self_margin, strict=True))[::40],
+        ):
+            deceleration = BRAKING_SHARE * float(np.abs(G) @ acceleration)
+            if room > 0 and deceleration > 1e-6:
+                assert braking_room(float(h), 10.0, deceleration, 0.01) == pytest.approx(room, rel=1e-9)
+                num_fast += h < 10.0 * room - 1e-9
+        assert num_fast > 5
+        builder = RowBuilder(arm, CONFIG, ROOM, acceleration)
+        velocity = np.full(arm.num_joints, 0.3)
+        G_all = np.concatenate([rows.external.G, rows.own.G])
+        np.testing.assert_allclose(builder.room(state_at(arm, q), velocity), rows.h - G_all @ velocity, atol=1e-12)
+
+
+def test_the_rate_of_a_row_is_the_derivative_of_its_distance_in_time(arm: RobotModel) -> None:
+    q, speed, dt = postures(arm, 1)[0], np.array([-0.2, -0.3, 0.1]), 1e-3
+    moved = Balls(ROOM.centers + dt * speed, ROOM.radii)
+    points = arm.sphere_centers(q)[arm.moving_spheres]
+    rate = distance_rate(SceneStep(newer=moved, older=ROOM, seconds=dt), points, limit=9.0)
+    offset = points[:, None] - ROOM.centers
+    nearest = np.argmin(np.linalg.norm(offset, axis=2) - ROOM.radii, axis=1)
+    away = offset[np.arange(len(points)), nearest]
+    expected = -(away @ speed) / np.linalg.norm(away, axis=1)
+    np.testing.assert_allclose(rate, np.minimum(expected, 0.0), atol=1e-3)
+    assert np.min(expected) < -0.1 < 0.1 < np.max(expected)
+    still, coming = rows_of(arm, ROOM, q), RowBuilder(arm, CONFIG, ROOM).at(state_at(arm, q, rate))
+    np.testing.assert_allclose(coming.external.h - still.external.h, rate, atol=1e-12)
+    np.testing.assert_array_equal(coming.own.h, still.own.h)
+
+
+def test_a_limit_row_is_less_the_derivative_of_the_way_to_the_limit(arm: RobotModel) -> None:
+    q = arm.upper - 0.001
+
+    def ways(q: Float64) -> Float64:
+        return np.concatenate([arm.upper - q, q - arm.lower])
+
+    lowest, highest = JointLimits.of(arm, replace(CONFIG, barrier_gain=0.1)).box(q)
+    G, h = box_rows(lowest, highest)
+    by_difference = np.stack([(ways(q + e) - ways(q - e)) / (2 * STEP) for e in STEP * np.eye(len(q))], axis=1)
+    np.testing.assert_allclose(G, -by_difference, atol=1e-8)
+    np.testing.assert_allclose(h, np.minimum(0.1 * ways(q), np.tile(arm.velocity_limit, 2)), atol=1e-12)
+
+
+def test_the_printed_rows_hold_the_same_derivatives_and_give_way_outside_alone(arm: RobotModel) -> None:
+    q, J = postures(arm, 1)[0], arm.num_joints
+    rows, state = rows_of(arm, ROOM, q), state_at(arm, q)
+    bias, ones = stray_cost(np.zeros(J), 1e-3), np.ones(6)
+    program = assemble_printed(state, (ones, ones), bias, rows.external, [rows.own])
+    by_difference, M = slopes(arm, ROOM, q), len(rows.external)
+    np.testing.assert_allclose(program.G[2 * J :, :J], -by_difference, atol=2e-8)
+    np.testing.assert_array_equal(program.G[2 * J : 2 * J + M, J + 6 :], np.eye(M))
+    assert not program.G[2 * J + M :, J:].any() and not program.G[:, J : J + 6].any()
+    np.testing.assert_array_equal(program.h[2 * J :], rows.h)
+    z = np.random.default_rng(0).normal(size=len(program.c))
+    v, x = z[:J], z[J : J + 6]
+    value = 0.5 * z @ program.H @ z + program.c @ z
+    gap = x - state.jacobian @ v
+    printed = x @ x + gap @ gap + CONFIG.weight_slack * z[J + 6 :] @ z[J + 6 :] + 1e-3 * v @ v
+    assert value == pytest.approx(printed)
+
+
+def test_the_margin_of_a_row_grows_by_what_its_body_leaves_uncovered_where_that_is_asked_for() -> None:
+    arm, q = PlanarArm(), np.array([0.3, 0.6])
+    arm.sphere_deficit = np.array([np.nan, 0.01, 0.01, 0.03, 0.0])
+    wanted = replace(CONFIG, coverage="margin")
+    np.testing.assert_allclose(scene_margin(arm, CONFIG), 0.02)
+    np.testing.assert_allclose(scene_margin(arm, wanted)[1:], [0.03, 0.03, 0.05, 0.02])
+    state = State(model=arm, frame="tip", q=q, box=(np.full(2, -9.0), np.full(2, 9.0)))
+    plain, wider = (RowBuilder(arm, config, far_away()).at(state) for config in (CONFIG, wanted))
+    np.testing.assert_allclose(plain.external.h - wider.external.h, [0.1, 0.1, 0.3, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(plain.own.h, wider.own.h)
+    arm.sphere_deficit[3] = np.nan
+    with pytest.raises(InputError, match=r"sphere fore\[0\]: expected a measured coverage"):
+        QpIkController(arm, wanted, far_away(), frame="tip")

@@ -1,0 +1,161 @@
+"""What a folder's run.json says of its files is checked when they are opened."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.digests import Parts
+from splatctrl_cli.files.output import Stopwatch, part_digests, sha256, write_run
+from splatctrl_cli.jobs.replays.known_scene import from_grid
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
+from splatctrl_cli.splat_files.splats import read_ply, read_world_splats, write_ply
+from tests.cli.replay_desk import SECOND, splats_of, write_scene
+
+BOX = ("--box=-0.1,-0.1,-0.1,0.1,0.1,0.1", "--voxel", "0.02", "--no-report")
+
+
+def as_written(folder: Path, command: str = "reconstruct") -> Path:
+    """The folder with a run.json that knows its files."""
+    metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": 2 * SECOND}
+    write_run(folder, command=command, config={}, inputs={}, metrics=metrics, stopwatch=Stopwatch())
+    return folder
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    sets = [(second * SECOND, splats_of(((0.1 * second, 0.0, 0.0), 0.05))) for second in range(3)]
+    return as_written(write_scene(tmp_path / "scene", *sets))
+
+
+def spoil(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def test_every_file_is_known_but_run_json_and_the_checkpoint(scene: Path) -> None:
+    (scene / "checkpoint" / "state.npz").write_bytes(b"x")
+    digests = part_digests(scene)
+    assert list(digests) == sorted(digests)
+    assert {"splats.ply", "occupancy.npz", "snapshots.csv", "snapshots/000000.ply"} <= set(digests)
+    assert digests["snapshots/000002.npz"] == sha256(scene / "snapshots" / "000002.npz")
+    assert not {"run.json", "checkpoint/state.npz"} & set(digests)
+    assert json.loads((scene / "run.json").read_text())["parts"].keys() == digests.keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "look"),
+    [
+        ("splats.ply", lambda scene: scene.splats()),
+        ("occupancy.npz", lambda scene: scene.occupancy()),
+        ("occupancy.npz", lambda scene: scene.known()),
+        ("occupancy.npz", lambda scene: scene.unrepresented_at(None)),
+        ("snapshots.csv", lambda scene: scene.snapshots),
+        ("snapshots/000001.ply", lambda scene: scene.splats_at(SECOND)),
+        ("snapshots/000001.npz", lambda scene: scene.snapshots[1].occupancy()),
+        ("snapshots/000001.npz", lambda scene: scene.snapshots[1].known()),
+        ("snapshots/000001.npz", lambda scene: scene.unrepresented_at(SECOND)),
+    ],
+)
+def test_a_file_that_was_changed_or_removed_is_refused_by_name(
+    scene: Path, name: str, look: Callable[[SceneFolder], object]
+) -> None:
+    look(open_scene(scene))
+    spoil(scene / name)
+    with pytest.raises(InputError, match=rf"{name}: was changed after it was written.*; make it again"):
+        look(open_scene(scene))
+    if name != "splats.ply":  # without which it is no scene
+        (scene / name).unlink()
+        with pytest.raises(InputError, match=f"{name}: missing; it was listed"):
+            look(open_scene(scene))
+
+
+def test_only_what_is_opened_is_looked_at(scene: Path) -> None:
+    spoil(scene / "snapshots" / "000002.ply")
+    assert len(open_scene(scene).splats_at(SECOND)) == 1
+
+
+def test_a_table_emptied_or_reversed_is_refused_in_an_old_scene_too_where_it_can_be(scene: Path) -> None:
+    table = scene / "snapshots.csv"
+    head, *rows = table.read_text().splitlines(keepends=True)
+    for lines in ([head], [head, *rows[::-1]]):
+        table.write_text("".join(lines))
+        with pytest.raises(InputError, match=r"snapshots.csv: was changed"):
+            open_scene(scene).snapshot_at(SECOND)
+    run = json.loads((scene / "run.json").read_text())
+    del run["parts"]
+    (scene / "run.json").write_text(json.dumps(run))
+    with pytest.raises(InputError, match="stamp 1000000000 after 2000000000: expected stamps that ascend"):
+        open_scene(scene).snapshot_at(SECOND)
+
+
+def test_a_scene_of_an_older_version_is_read_and_says_so(scene: Path) -> None:
+    assert open_scene(scene).has_digests
+    run = json.loads((scene / "run.json").read_text())
+    del run["parts"]
+    (scene / "run.json").write_text(json.dumps(run))
+    assert not open_scene(scene).has_digests
+    assert len(open_scene(scene).splats_at(SECOND)) == 1
+
+
+@pytest.mark.parametrize("parts", [3, {"splats.ply": 3}])
+def test_digests_that_are_none_are_named(scene: Path, parts: object) -> None:
+    run = json.loads((scene / "run.json").read_text())
+    (scene / "run.json").write_text(json.dumps({**run, "parts": parts}))
+    with pytest.raises(InputError, match=r"run.json: parts: expected digests"):
+        open_scene(scene).splats()
+
+
+def test_a_file_that_run_json_does_not_know_is_no_part(scene: Path) -> None:
+    (scene / "other.ply").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"other.ply: not among the parts"):
+        Parts.beside(scene / "other.ply").checked(scene / "other.ply")
+
+
+def test_an_altered_field_is_refused_and_one_alone_is_read(scene: Path, tmp_path: Path) -> None:
+    field = tmp_path / "field"
+    assert main(["sdf-bake", str(scene), "-o", str(field), *BOX, "-q"]) == 0
+    names = set(json.loads((field / "run.json").read_text())["parts"])
+    assert {"field.npz", "field.json"} <= names
+    assert not any(name.startswith("channels") for name in names)
+    alone = tmp_path / "alone.npz"
+    alone.write_bytes((field / "field.npz").read_bytes())
+    from_grid(alone)
+    from_grid(field)
+    spoil(field / "field.npz")
+    for path in (field, field / "field.npz"):
+        with pytest.raises(InputError, match=r"field.npz: was changed"):
+            from_grid(path)
+    assert main(["sdf-bake", str(scene), "--update", str(field), "-o", str(tmp_path / "new"), *BOX, "-q"]) == 4
+
+
+@pytest.mark.parametrize(("key", "value", "wanted"), [("units", "mm", "m"), ("frame", "camera_link", "world")])
+def test_splats_in_other_units_or_another_frame_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str, value: str, wanted: str
+) -> None:
+    path = tmp_path / "splats.ply"
+    write_ply(path, splats_of(((0.0, 0.0, 0.0), 0.05)), {key: value})
+    assert main(["sdf-bake", str(path), "-o", str(tmp_path / "field"), *BOX, "-q"]) == 4
+    assert f"splats.ply: comment '{key}: {value}': expected {wanted}" in capsys.readouterr().err
+    folder = write_scene(tmp_path / "scene", (0, splats_of(((0.0, 0.0, 0.0), 0.05))))
+    for file in (folder / "splats.ply", folder / "snapshots" / "000000.ply"):
+        file.write_bytes(path.read_bytes())
+    as_written(folder)
+    for look in (SceneFolder.splats, lambda scene: scene.splats_at(0)):
+        with pytest.raises(InputError, match=f"comment '{key}: {value}'"):
+            look(open_scene(folder))
+    assert read_ply(path)[1][key] == value  # who only copies or shows them may
+
+
+def test_splats_that_name_neither_units_nor_frame_are_taken(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", splats_of(((0.0, 0.0, 0.0), 0.05)), {})
+    content = (tmp_path / "a.ply").read_bytes()
+    for line in (b"comment frame: world\n", b"comment units: metre\n"):
+        assert line in content
+        content = content.replace(line, b"")
+    (tmp_path / "a.ply").write_bytes(content)
+    assert len(read_world_splats(tmp_path / "a.ply")) == 1

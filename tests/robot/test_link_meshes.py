@@ -1,0 +1,129 @@
+"""Collision geometry: primitives against their formulas, meshes with scale and pose, and where files are found."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.robot.link_meshes import SolidDistance, read_solids
+from splatctrl_cli.robot.urdf import read_urdf
+from tests.robot.shapes import BALL, BOX, ROD, arm_of, l_shape, written
+
+
+def box_distance(p: np.ndarray) -> np.ndarray:
+    q = np.abs(p) - [0.15, 0.1, 0.05]
+    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+
+
+def rod_distance(p: np.ndarray) -> np.ndarray:
+    q = np.stack([np.hypot(p[:, 0], p[:, 1]) - 0.05, np.abs(p[:, 2]) - 0.2], axis=1)
+    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+
+
+def ball_distance(p: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(p, axis=1) - 0.08
+
+
+@pytest.mark.parametrize(("shape", "truth"), [(BOX, box_distance), (ROD, rod_distance), (BALL, ball_distance)])
+def test_signed_distance_to_a_primitive_is_that_of_its_formula(tmp_path: Path, shape: str, truth) -> None:  # type: ignore[no-untyped-def]
+    (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(shape, BALL))))["base"]
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3))
+    assert solid.is_closed
+    assert solid.slack <= 4e-4
+    np.testing.assert_allclose(SolidDistance([solid])(points), truth(points), atol=solid.slack + 1e-12)
+
+
+@pytest.mark.parametrize("shape", [ROD, BALL])
+def test_the_true_surface_is_within_the_slack_of_the_triangles(tmp_path: Path, shape: str) -> None:
+    (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(shape, BOX))))["base"]
+    rng = np.random.default_rng(1)
+    way = rng.normal(size=(4000, 3))
+    if shape == BALL:
+        surface = 0.08 * way / np.linalg.norm(way, axis=1, keepdims=True)
+    else:
+        round_ = 0.05 * way[:, :2] / np.linalg.norm(way[:, :2], axis=1, keepdims=True)
+        surface = np.column_stack([round_, rng.uniform(-0.2, 0.2, 4000)])
+    mesh = trimesh.Trimesh(solid.surface.vertices, solid.surface.faces, process=False)
+    corners = solid.surface.corners
+    normals = mesh.face_normals
+    height = np.einsum("fa,qfa->qf", normals, surface[:, None] - corners[None, :, 0]).max(axis=1)
+    assert 0.5 * solid.slack < height.max() <= solid.slack  # convex: the distance is at least the highest plane
+
+
+def test_meshes_take_scale_and_origin_of_the_urdf(tmp_path: Path) -> None:
+    l_shape().export(tmp_path / "ell.stl")
+    origin = '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'
+    mesh = '<mesh filename="ell.stl" scale="2 -1 1"/>'
+    (solid,) = read_solids(read_urdf(written(tmp_path, arm_of(mesh, BALL, origin=origin))))["base"]
+    assert solid.is_closed
+    vertices = solid.surface.vertices
+    np.testing.assert_allclose(vertices.min(axis=0), [1, 2, 3], atol=1e-6)  # (x, -y) turned by a quarter: (y, x)
+    np.testing.assert_allclose(vertices.max(axis=0), [1.3, 2.6, 3.1], atol=1e-6)
+    inside, hollow = np.array([[1.05, 2.1, 3.05]]), np.array([[1.2, 2.4, 3.05]])
+    assert SolidDistance([solid])(inside)[0] < 0 < SolidDistance([solid])(hollow)[0]
+
+
+@pytest.mark.parametrize(
+    ("filename", "place", "folder"),
+    [
+        ("meshes/ell.stl", "meshes/ell.stl", None),
+        ("package://my_robot/meshes/ell.stl", "meshes/ell.stl", None),
+        ("package://other/ell.stl", "other/ell.stl", None),
+        ("package://far/ell.stl", "../elsewhere/far/ell.stl", "elsewhere"),
+    ],
+)
+def test_mesh_paths_are_found(tmp_path: Path, filename: str, place: str, folder: str | None) -> None:
+    root = tmp_path / "my_robot"
+    (root / place).parent.mkdir(parents=True)
+    l_shape().export(root / place)
+    urdf = read_urdf(
+        written(
+            root,
+            arm_of(f'<mesh filename="{filename}"/>', BALL),
+            "urdf/robot.urdf" if "package" in filename else "robot.urdf",
+        )
+    )
+    if folder is not None:
+        with pytest.raises(
+            InputError, match=r"link 'base': mesh package://far/ell.stl was not found; give the folder"
+        ):
+            read_solids(urdf)
+    folders = [] if folder is None else [tmp_path / folder]
+    assert len(read_solids(urdf, folders)["base"][0].surface.faces) == 20
+
+
+def test_a_missing_mesh_is_named_with_its_link(tmp_path: Path) -> None:
+    urdf = read_urdf(written(tmp_path, arm_of('<mesh filename="none.stl"/>', BALL)))
+    with pytest.raises(
+        InputError, match=r"robot.urdf: link 'base': mesh none.stl was not found; expected .*none.stl"
+    ):
+        read_solids(urdf)
+
+
+def test_shapes_of_another_kind_and_no_shapes_are_refused(tmp_path: Path) -> None:
+    urdf = read_urdf(written(tmp_path, arm_of('<cone radius="0.1" length="1"/>', BALL)))
+    with pytest.raises(InputError, match="link 'base': expected mesh, box, cylinder, capsule or sphere, got <cone>"):
+        read_solids(urdf)
+    bare = arm_of(BALL, BALL).replace("collision>", "visual>")
+    with pytest.raises(InputError, match="expected collision geometry, got none"):
+        read_solids(read_urdf(written(tmp_path, bare)))
+
+
+def test_an_open_mesh_is_taken_apart_and_its_open_part_measured_by_its_hull(tmp_path: Path) -> None:
+    closed, opened = trimesh.creation.box(extents=(0.1, 0.1, 0.1)), trimesh.creation.box(extents=(0.2, 0.2, 0.2))
+    opened = trimesh.Trimesh(opened.vertices + np.array([1, 0, 0]), opened.faces[1:], process=False)
+    trimesh.util.concatenate([closed, opened]).export(tmp_path / "two.stl")
+    solids = read_solids(read_urdf(written(tmp_path, arm_of('<mesh filename="two.stl"/>', BALL))))["base"]
+    assert [solid.is_closed for solid in solids] == [True, False]
+    distance = SolidDistance(solids)(np.array([[0.0, 0, 0], [1.0, 0, 0], [0.5, 0, 0]]))
+    np.testing.assert_allclose(distance, [-0.05, -0.1, 0.4], atol=1e-6)
+
+
+def test_a_flat_open_mesh_has_no_inside(tmp_path: Path) -> None:
+    sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
+    sheet.export(tmp_path / "sheet.stl")
+    (solid,) = read_solids(read_urdf(written(tmp_path, arm_of('<mesh filename="sheet.stl"/>', BALL))))["base"]
+    assert solid.body is None
+    np.testing.assert_allclose(SolidDistance([solid])(np.array([[0.2, 0.2, 0.3]])), [0.3])

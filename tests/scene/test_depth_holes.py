@@ -1,0 +1,124 @@
+"""A thing in full view that returns no depth leaves a hole, and what may be in it is known as such."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.records import UNANSWERED, Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.scene.depth_holes import unanswered_points
+from splatctrl_cli.scene.fitter import SceneFitter
+from splatctrl_cli.scene.occupancy import OccupancyMap
+from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame
+
+CONFIG = OccupancyConfig()
+NOBODY: Float32 = np.zeros((INTRINSICS.height, INTRINSICS.width), np.float32)
+BLOCK = 0.1  # [m] of which no depth comes back
+
+
+def dark(rows: slice = slice(20, 40), columns: slice = slice(30, 50), *, x: float = 0.0) -> RgbdFrame:
+    """The floor, without depth in these pixels."""
+    seen = frame(x=x)
+    seen.depth[rows, columns] = 0.0
+    return seen
+
+
+def dark_block(x: float) -> RgbdFrame:
+    """A block at the origin, 0.2 m wide, that the camera above (x, 0) gets no depth from."""
+    seen = frame(block=BLOCK, x=x)
+    seen.depth[seen.depth < HEIGHT] = 0.0
+    return seen
+
+
+def points_of(seen: RgbdFrame, robot: Float32 = NOBODY) -> Float64:
+    return np.concatenate([np.empty((0, 3)), *unanswered_points(seen, robot, CONFIG)])
+
+
+def unanswered(*frames: RgbdFrame) -> OccupancyMap:
+    grid = OccupancyMap(WORKSPACE, CONFIG, 1)
+    grid.take_in(frames)
+    for seen in frames:
+        grid.mark_unanswered(points_of(seen))
+    return grid
+
+
+def test_points_lie_on_the_rays_of_the_hole_and_before_the_floor() -> None:
+    points = points_of(dark())
+    depth = HEIGHT - points[:, 2]
+    u = INTRINSICS.fx * points[:, 0] / depth + INTRINSICS.cx
+    v = -INTRINSICS.fy * points[:, 1] / depth + INTRINSICS.cy
+    assert u.min() > 29.9 and u.max() < 49.1 and v.min() > 19.9 and v.max() < 39.1
+    assert depth.min() == pytest.approx(CONFIG.min_range) and HEIGHT - CONFIG.voxel < depth.max() < HEIGHT
+    rays = np.unique(np.round([u, v], 3), axis=1)
+    assert rays.shape[1] == 20 * 20  # a pixel is 12.5 mm, less than a voxel
+
+
+def test_a_large_hole_is_taken_a_piece_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = points_of(dark())
+    monkeypatch.setattr("splatctrl_cli.scene.depth_holes.MOST_POINTS", 1000)
+    pieces = list(unanswered_points(dark(), NOBODY, CONFIG))
+    assert len(pieces) > 10 and max(map(len, pieces)) <= 1000
+    assert np.concatenate(pieces).tolist() == whole.tolist()
+
+
+def robot_beside() -> Float32:
+    shown = NOBODY.copy()
+    shown[25:35, 51:60] = 0.5
+    return shown
+
+
+def unseen_by_the_lens() -> Bool:
+    return np.asarray(np.mgrid[:60, :80][1] > 45)
+
+
+@pytest.mark.parametrize(
+    ("seen", "robot"),
+    [
+        pytest.param(frame(), NOBODY, id="no hole"),
+        pytest.param(dark(columns=slice(60, 80)), NOBODY, id="at the border"),
+        pytest.param(dark(columns=slice(30, 32)), NOBODY, id="narrower than two voxels"),
+        pytest.param(dark(), robot_beside(), id="beside the robot"),
+        pytest.param(replace(dark(), valid=~unseen_by_the_lens()), NOBODY, id="not in the lens"),
+    ],
+)
+def test_other_gaps_are_no_holes(seen: RgbdFrame, robot: Float32) -> None:
+    assert not len(points_of(seen, robot))
+
+
+def test_a_dark_block_is_where_all_cameras_look_in_vain() -> None:
+    one, three = unanswered(dark_block(0.0)), unanswered(dark_block(0.0), dark_block(-0.15), dark_block(0.15))
+    top, above = (0.0, 0.0, BLOCK - 0.02), (0.0, 0.0, 0.5)
+    marked = [[is_marked(grid, at) for at in (top, above)] for grid in (one, three)]
+    assert marked == [[True, True], [True, False]]  # the others see through the space above it
+    assert 0 < (three.last_seen == UNANSWERED).sum() < 0.75 * (one.last_seen == UNANSWERED).sum()
+
+
+def is_marked(grid: OccupancyMap, point: tuple[float, float, float]) -> bool:
+    cell = np.round((np.array(point) - grid.origin) / grid.config.voxel).astype(int)
+    return bool(grid.last_seen[tuple(cell)] == UNANSWERED)
+
+
+def test_what_a_later_image_sees_is_answered() -> None:
+    grid = unanswered(dark())
+    assert (grid.last_seen == UNANSWERED).any()
+    grid.take_in([frame()])
+    assert not (grid.last_seen == UNANSWERED).any()
+    grid.mark_unanswered(points_of(dark()))
+    assert not (grid.last_seen == UNANSWERED).any()  # what was seen once has an age instead
+
+
+def test_steps_that_are_thinned_leave_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatctrl_cli.scene.occupancy.MAX_STEPS", 1)
+    grid = unanswered(dark())
+    marked = grid.last_seen == UNANSWERED
+    grid.take_in([replace(dark(), stamp_ns=1)])
+    assert (grid.last_seen == UNANSWERED).tolist() == marked.tolist()
+
+
+def test_a_fitted_scene_knows_it() -> None:
+    fitter = SceneFitter(SceneConfig(max_splats=300, first_iterations=1, iterations_per_step=1), CONFIG, WORKSPACE)
+    fitter.step([dark_block(0.0)])
+    known = fitter.known_voxels().seen
+    assert np.linalg.norm(known.unanswered - [0.0, 0.0, 0.5 * BLOCK], axis=1).min() < CONFIG.voxel
+    assert (known.last_seen_ns(known.unanswered) == -1).all()

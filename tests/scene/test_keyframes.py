@@ -1,0 +1,92 @@
+"""Which views the optimiser looks at."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.scene.keyframes import View, Window, halved, make_view
+from tests.scene.wall import frame
+
+CONFIG = SceneConfig(window=3)
+
+
+def view(stamp_ns: int, x: float = 0.0, camera: str = "cam0") -> View:
+    seen = frame(stamp_ns, x=x, camera=camera)
+    return make_view(seen, seen.depth > 0)
+
+
+def stamps(views: list[View]) -> list[int]:
+    return [v.frame.stamp_ns for v in views]
+
+
+def test_a_camera_that_stands_still_makes_no_keyframes() -> None:
+    window = Window(CONFIG)
+    for k in range(6):
+        window.advance([view(k), view(k, x=0.3, camera="cam1")])
+    assert window.keyframes == []
+    assert stamps(window.newest) == [5, 5]
+
+
+def test_a_camera_that_moves_leaves_keyframes_oldest_dropped_first() -> None:
+    window = Window(CONFIG)
+    for k in range(7):
+        window.advance([view(k, x=0.1 * k)])
+    assert stamps(window.keyframes) == [3, 4, 5]
+    assert stamps(window.newest) == [6]
+
+
+def test_a_silent_camera_keeps_its_newest_view() -> None:
+    window = Window(CONFIG)
+    window.advance([view(0), view(0, x=0.3, camera="cam1")])
+    window.advance([view(1)])
+    assert sorted(stamps(window.newest)) == [0, 1]
+
+
+def test_every_round_shows_all_newest_views_and_as_many_keyframes() -> None:
+    window = Window(CONFIG)
+    for k in range(7):
+        window.advance([view(k, x=0.1 * k)])
+    shown = stamps(window.schedule(10, np.random.default_rng(0)))
+    assert len(shown) == 10
+    assert all(6 in shown[i : i + 2] for i in range(0, 10, 2))
+    assert len(set(shown)) > 2
+    assert Window(CONFIG).schedule(5, np.random.default_rng(0)) == []
+
+
+def test_pixels_without_depth_count_and_pixels_outside_the_workspace_do_not() -> None:
+    seen = frame()
+    seen.depth[:10] = 0.0
+    mappable = seen.depth > 0
+    mappable[50:] = False
+    target = make_view(replace(seen), mappable).target
+    assert target.counted[:50].all()
+    assert not target.counted[50:].any()
+    assert not target.depth[50:].any()
+
+
+def test_pixels_that_the_lens_did_not_see_count_neither_for_colour_nor_for_depth() -> None:
+    seen = frame()
+    valid = np.ones(seen.depth.shape, bool)
+    valid[:, :7] = False
+    made = make_view(replace(seen, valid=valid), seen.depth > 0)
+    assert np.array_equal(made.target.counted > 0, valid)
+    assert np.array_equal(made.mappable, valid & (seen.depth > 0))
+    assert not made.target.depth[:, :7].any()
+
+
+def test_a_halved_view_looks_along_the_same_rays_with_mean_colours_and_nearest_depths() -> None:
+    seen = frame(0, block=0.2)
+    seen.depth[10, 10] = 0.0
+    whole = make_view(seen, seen.depth > 0)
+    half = halved(whole)
+    fx, _, cx, _, width, height = half.camera[:6]
+    assert (width, height) == (40, 30)
+    assert half.target.color.shape == (3, 30, 40)
+    assert half.target.color[:, 3, 4] == pytest.approx(whole.target.color[:, 6:8, 8:10].mean(axis=(1, 2)))
+    quads = np.where(whole.target.depth > 0, whole.target.depth, np.inf).reshape(30, 2, 40, 2)
+    assert np.array_equal(half.target.depth, quads.min(axis=(1, 3)))
+    k = seen.intrinsics
+    assert (7 - cx) / fx == pytest.approx((14.5 - k.cx) / k.fx)  # pixel 7 is centred between 14 and 15
+    assert half.target.counted[5, 5] == whole.target.counted[10:12, 10:12].min()

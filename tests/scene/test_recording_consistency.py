@@ -1,0 +1,99 @@
+"""Whether views agree on where the surfaces are, and poses on a path."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.scene.recording_consistency import LIMIT, Agreement, agreements, differences, largest_jump
+from tests.scene.wall import frame
+
+RANGE = (0.2, 3.0)
+
+
+def moved(view: RgbdFrame, **offset: float) -> RgbdFrame:
+    """The same images with a pose that is off [m]."""
+    T = view.T_world_camera.copy()
+    T[:3, 3] += [offset.get(axis, 0.0) for axis in "xyz"]
+    return replace(view, T_world_camera=T)
+
+
+def views(**offset: float) -> list[RgbdFrame]:
+    return [frame(block=0.2, x=0.1), moved(frame(block=0.2, x=-0.1, camera="cam1"), **offset)]
+
+
+def test_cameras_with_good_poses_agree() -> None:
+    (pair,) = agreements(views(), *RANGE)
+    assert pair.cameras == ("cam0", "cam1")
+    assert pair.median < 1e-6
+    assert pair.holds
+
+
+@pytest.mark.parametrize(("offset", "holds"), [(0.01, True), (0.025, True), (0.035, False), (-0.09, False)])
+def test_a_pose_that_is_off_shows_as_that_much(offset: float, holds: bool) -> None:
+    (pair,) = agreements(views(z=offset), *RANGE)
+    assert pair.median == pytest.approx(abs(offset), abs=1e-6)
+    assert pair.holds == holds
+
+
+def test_what_only_some_pixels_disagree_on_is_no_wrong_pose() -> None:
+    values = {"cameras": ("a", "b"), "num_pixels": 900}
+    assert Agreement(median=0.1, quartile=0.01, depth=0.8, **values).holds
+    assert not Agreement(median=0.1, quartile=0.02, depth=0.8, **values).holds
+    assert not Agreement(median=1.01 * LIMIT, quartile=LIMIT, depth=0.8, **values).holds
+    assert Agreement(median=0.08, quartile=0.06, depth=3.0, **values).holds
+
+
+def test_too_few_common_pixels_say_nothing() -> None:
+    assert agreements(views(x=5.0, z=0.5), *RANGE) == []
+    assert agreements(views()[:1], *RANGE) == []
+    assert agreements([], *RANGE) == []
+
+
+def test_views_of_one_camera_are_compared_too() -> None:
+    still = [replace(view, camera="camera") for view in views(z=0.09)]
+    (pair,) = agreements(still, *RANGE)
+    assert pair.cameras == ("camera", "camera")
+    assert not pair.holds
+
+
+def test_neither_the_order_of_views_nor_a_common_motion_matters() -> None:
+    a, b = views(z=0.05)
+    (want,) = agreements([a, b], *RANGE)
+    assert agreements([b, a], *RANGE) == [want]
+    turn = np.eye(4)
+    turn[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    turn[:3, 3] = [1.0, -2.0, 0.5]
+    (got,) = agreements([replace(v, T_world_camera=turn @ v.T_world_camera) for v in (a, b)], *RANGE)
+    assert got.median == pytest.approx(want.median, abs=1e-6)
+
+
+def test_depth_that_is_missing_or_out_of_range_is_not_compared() -> None:
+    a, b = views()
+    blind = replace(b, depth=np.zeros_like(b.depth))
+    for one, other in ((a, blind), (blind, a)):
+        assert len(differences(one, other, *RANGE)) == 0
+    assert len(differences(a, b, 0.2, 0.7)) == 0
+
+
+def poses(*xs: float, period_ns: int = 100_000_000, camera: str = "a") -> list[tuple[int, str, Float64]]:
+    found = []
+    for k, x in enumerate(xs):
+        T = np.eye(4)
+        T[0, 3] = x
+        found.append((k * period_ns, camera, T))
+    return found
+
+
+def test_the_largest_jump_of_a_camera_is_found() -> None:
+    jump = largest_jump([*poses(0.0, 0.1, 3.1, 3.2), *poses(9.0, 9.1, camera="b")])
+    assert jump is not None
+    assert (jump.camera, jump.before_ns, jump.after_ns) == ("a", 100_000_000, 200_000_000)
+    assert jump.distance == pytest.approx(3.0)
+
+
+def test_cameras_apart_and_frames_long_after_each_other_are_no_jump() -> None:
+    for given in (poses(0.0, 5.0, period_ns=2_000_000_000), poses(0.0) + poses(5.0, camera="b"), []):
+        jump = largest_jump(given)
+        assert jump is None or jump.distance == 0.0
