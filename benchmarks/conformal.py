@@ -38,9 +38,10 @@ from splatctrl_cli.records import Float64, JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.time_steps import TimeStep
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.recording import NOISES, START_NS, Recording, RecordingOptions
-from splatctrl_cli.simulate.tabletop import WAYPOINTS, Motion
+from splatctrl_cli.simulate.tabletop import WAYPOINTS
 from splatctrl_cli.simulate.truth import distance_to
 
 EVIDENCE = "cam3"

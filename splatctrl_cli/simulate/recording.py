@@ -11,9 +11,9 @@ from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import shared_workspace, tabletop
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive
 from splatctrl_cli.simulate.render import DepthNoise, Renderer
-from splatctrl_cli.simulate.tabletop import Motion
 from splatctrl_cli.simulate.truth import distance_to
 
 START_NS = 1_700_000_000_000_000_000

@@ -12,8 +12,9 @@ from itertools import pairwise
 import numpy as np
 
 from splatctrl_cli.records import Float64
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive, Texture, Track
-from splatctrl_cli.simulate.tabletop import PALETTE, Motion
+from splatctrl_cli.simulate.tabletop import PALETTE
 
 PLACES = ("near-pickup", "near-goal")
 

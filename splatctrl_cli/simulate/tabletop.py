@@ -5,13 +5,13 @@ things from a turntable are in the manner of a DTU scan.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame
 from splatctrl_cli.robot.urdf import Shape
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture
 from splatctrl_cli.simulate.render import Camera, Renderer
 
@@ -37,24 +37,6 @@ NUM_VIEWS = 8
 VIEW_SIZE = (256, 208)  # width, height [px]
 LEAST_DEPTH = 1e-4  # [m] by which a thing stands before the furniture
 MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """Waypoints (W, J) [rad], reached at rest at times (W,) [s], joined by minimum-jerk segments."""
-
-    times: Float64
-    waypoints: Float64
-
-    def at(self, time: float) -> tuple[Float64, Float64]:
-        """Positions (J,) [rad] and velocities (J,) [rad/s]; at rest before the first and after the last waypoint."""
-        time = float(np.clip(time, self.times[0], self.times[-1]))
-        index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
-        span = self.times[index + 1] - self.times[index]
-        s = (time - self.times[index]) / span
-        step = self.waypoints[index + 1] - self.waypoints[index]
-        position = self.waypoints[index] + step * (10 * s**3 - 15 * s**4 + 6 * s**5)
-        return position, step * (30 * s**2 - 60 * s**3 + 30 * s**4) / span
 
 
 def furniture() -> list[Primitive]:
