@@ -31,7 +31,7 @@ from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
 
 DOCS = Path(__file__).parent
 NOTICE = "<!-- Made by docs/generate.py; `make docs` writes it again. -->"
-SHARED_BY = 3  # commands with the same option, in the same words, from which on it is explained once
+SHARED_BY = 2  # commands with the same option, in the same words, from which on it is explained once
 INPUT = "input"  # the group of options that say how a recording is read
 HELP = ("help", "help_all")
 SIMPLE = ("int", "float", "str")  # types that a default shows
@@ -85,14 +85,13 @@ def cli_page() -> str:
         "",
         f"`splatctrl COMMAND ...`: {parser.description}",
         "",
-        *_table(("command", "what it does"), summaries),
+        *_list(summaries),
         "",
-        "`--help` shows what people use of a command, `--help-all` everything, in the groups that are named here.",
-        "Results go to stdout, as a table or with `--json` as one JSON object; progress and log lines go to stderr.",
-        "An error is one line on stderr with its remedy. Options cannot be abbreviated. Relative paths start at the",
-        "folder you are in; missing folders above an output are made. An output that is a link is written where the",
-        "link leads to. An output that another run is writing is refused (exit 2); a killed run leaves no lock. With",
-        "stdout closed, a command that had something to print ends with 6, its files whole.",
+        "`--help` shows what people use of a command, `--help-all` everything. Results go to stdout, as a table or",
+        "with `--json` as one JSON object; progress, log lines and errors (one line with a remedy) go to stderr.",
+        "Options cannot be abbreviated. Missing folders above an output are made. A linked output is written where",
+        "the link leads to. An output that another run is writing is refused (exit 2). With stdout closed, a command",
+        "that had something to print ends with 6, its files complete.",
         "",
         EXIT_CODES[0].upper() + EXIT_CODES[1:] + ".",
     ]
@@ -103,10 +102,10 @@ def cli_page() -> str:
     shared = {row: kind for row, kind in shared.items() if kind or counts[row] >= SHARED_BY}
     for command in commands.values():
         lines += _command_section("##", command, shared)
-    lines += ["", "## Options of several commands", "", "The same in every command that has them."]
+    lines += ["", "## Options of several commands"]
     for kind in sorted(set(shared.values())):
         rows = [row for row, other in shared.items() if other == kind]
-        lines += ["", *([f"### {kind}", ""] if kind else []), *_table(("argument", "meaning"), rows)]
+        lines += ["", *([f"### {kind}", ""] if kind else []), *_list(rows)]
     return "\n".join(lines) + "\n"
 
 
@@ -122,18 +121,18 @@ def _leaves(parsers: Iterable[Parser]) -> Iterator[Parser]:
 
 
 def _command_section(level: str, parser: Parser, shared: Mapping[Row, str]) -> list[str]:
-    """Heading, usage, summary and arguments by group; of a command with actions, a section for each below it."""
+    """Heading, usage and arguments by group; of a command with actions, their summaries and a section for each."""
     name = parser.prog.partition(" ")[2]
     usage = parser.format_usage().strip().removeprefix("usage: ")
-    lines = ["", f"{level} {name}", "", f"`{usage}`", "", parser.description or ""]
+    lines = ["", f"{level} {name}", "", f"`{usage}`"]
     if parser.actions is not None:
         below = parser.actions.choices
         summaries = [(f"`{name} {action}`", one.summary) for action, one in (COMMANDS[name].actions or {}).items()]
-        lines += ["", *_table(("action", "what it does"), summaries)]
+        lines += ["", *_list(summaries)]
         return [*lines, *(line for one in below.values() for line in _command_section(f"{level}#", one, shared))]
     for title, rows in _groups(parser):
         own = [row for row in rows if row not in shared]
-        lines += ["", *_table((title or "argument", "meaning"), own)] if own else []
+        lines += ["", *([f"{title.capitalize()}:", ""] if title else []), *_list(own)] if own else []
     common = [row for _, rows in _groups(parser) for row in rows if row in shared]
     names = dict.fromkeys(shared[row] or re.findall(r"--[a-z][a-z-]*", row[0])[-1] for row in common)
     also = ", ".join(_link(name) for name in names if name != "Of every command")
@@ -155,15 +154,15 @@ def _groups(parser: Parser) -> list[tuple[str, list[Row]]]:
 
 
 def config_page() -> str:
-    """One table per section of the configuration: key, default, type, range with unit, and reason, as declared."""
+    """One list per section of the configuration: key, default, type, range with unit, and reason, as declared."""
     lines = [
         NOTICE,
         "# Configuration",
         "",
         "Give a TOML file with `--config FILE.toml`, single values with `--set section.key=value` (these win). An",
-        "unknown key is an error that names the nearest good one. A value of another type, out of its range, not",
-        "finite, or in contradiction to another one is refused (exit 2) before any work. What a run used stands in",
-        "its `run.json`. A default without a decimal point or exponent is an integer.",
+        "unknown key, a value of another type or out of its range, and keys that contradict each other are refused",
+        "(exit 2) before any work. `run.json` holds what a run used. Each line: key, default, (range), meaning. A",
+        "default without a decimal point or exponent is an integer.",
         "",
         "```toml",
         "[scene]",
@@ -175,27 +174,29 @@ def config_page() -> str:
         "",
         "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it.",
     ]
-    header = ("key", "default", "range", "meaning")
     for section in fields(config.Config):
         kind: Any = type(getattr(config.Config(), section.name))
         rows = [_setting_row(kind, key) for key in kind.declared]
-        lines += ["", f"## [{section.name}]", "", inspect.cleandoc(kind.__doc__), "", *_table(header, rows)]
+        lines += ["", f"## [{section.name}]", "", inspect.cleandoc(kind.__doc__), "", *_list(rows)]
     return "\n".join(lines) + "\n"
 
 
-def _setting_row(section: type[Section], key: str) -> tuple[str, ...]:
+def _setting_row(section: type[Section], key: str) -> Row:
+    """A key with its default and range, and what it means."""
     declared, hint = section.declared[key], get_type_hints(section)[key]
     quoted = isinstance(declared, OneOf) and ", ".join(f'`"{word}"`' for word in declared.words)
-    return (
-        f"`{key}`",
-        f"`{_toml(getattr(section, key))}`" + ("" if type_name(hint) in SIMPLE else f" ({type_name(hint)})"),
-        quoted or declared.expected.replace(" to ", "…"),
-        declared.reason,
-    )
+    kind = "" if type_name(hint) in SIMPLE else f"{type_name(hint)}: "
+    expected = quoted or declared.expected.replace(" to ", "…")
+    return f"`{key} = {_toml(getattr(section, key))}` ({kind}{expected})", declared.reason
 
 
 def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def _list(rows: Iterable[Row]) -> list[str]:
+    """A line for each row."""
+    return [f"- {name}: {meaning}" for name, meaning in rows]
 
 
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
