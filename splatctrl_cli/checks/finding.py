@@ -46,36 +46,36 @@ damaged | warning |  | a part of the file cannot be read; the rest is judged
 loss | note |  | topics and frames that the source leaves out
 missing | error | all | what `ingest` needs is not there, or cannot be joined (depth, CameraInfo, tf)
 refused | error | all | the capture or folder cannot be read as described
-gap | warning |  | an image or state topic pauses for over 0.1 s and three of its median intervals; the time is where
-    the longest begins; topics and transforms that pause together are one finding
+gap | warning |  | an image or state topic pauses for over 0.1 s and three median intervals; topics and transforms
+    that pause together are one finding
 part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log on
 files-apart | warning |  | over 60 s between two files of one recording
 stamp-repeats | warning |  | header stamps that repeat the one before
 stamp-back | warning |  | header stamps that go back
-stamp-zero | warning, error | all | header stamps of 0; an error where all of an image topic are (`--stamps log`)
-clock | note |  | stamps are of another clock than the log's, by the same for all topics (a played log)
-clock-offset | warning |  | stamps over 20 ms after their log time, over 1 s before it, or over 0.2 s from what most
-    topics have; or over 60 ms from those of the other cameras (three or more)
+stamp-zero | warning, error | all | header stamps of 0 (use `--stamps log`); an error where all of an image topic are
+clock | note |  | the stamps of all topics are shifted alike against the log's clock (a played log)
+clock-offset | warning |  | stamps over 20 ms after or 1 s before their log time, or shifted against it by over 0.2 s
+    more or less than most topics, or by over 60 ms more or less than the other cameras (three or more)
 clock-drift | warning |  | the time from stamp to log changes by over 20 ms (and six times its spread) over the log
 robot-clock | note, warning |  | the offset of cameras and robot: with `--urdf` from where depth shows the arm (a
-    warning beyond 40 ms, for a single camera where only it is off), else from when both see motion (beyond 30 ms plus
-    twice its uncertainty)
+    warning beyond 40 ms, for one camera if only it is off), else from when both show motion (beyond 30 ms plus twice
+    its uncertainty)
 sampled | note |  | not every image was decoded
-undecodable | note, warning, error | all | images that do not decode; an error where none does, a note where no camera
-    uses the topic
+undecodable | note, warning, error | all | images that do not decode; an error where none decodes, a note where no
+    camera uses the topic
 encoding | note, warning |  | an encoding that is not read, or that changes; a note where no camera uses the topic
 image-size | note, warning |  | images of one topic of several sizes; a note where no camera uses the topic
 pairing | warning, error | all | less than 95 % of the images of colour or depth find a partner; an error where none
-    does
+    is found
 rates-differ | note |  | one of colour and depth has 1.5 times as many images as the other
 pair-offset | note |  | depth over 10 ms from its colour image
 depth-scale | note, error | all | median depth outside 0.05 to 20 m (metres stored as integers, millimetres as floats,
     another unit); a note outside 0.15 to 8 m
 depth-share | note, warning |  | less than half of the pixels have depth; a warning below a tenth
-depth-empty | warning, error | later | depth images without any depth; an error where none has
+depth-empty | warning, error | later | depth images without any depth; an error where all are
 depth-invalid | note |  | pixels that are NaN, infinite or negative
-principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error where both fit
-    another image size, which it names
+principal-point | warning, error | later | cx or cy over 15 % of the size off the middle; an error, naming the size,
+    where both fit another image size
 focal-ratio | warning |  | fx and fy differ by over 5 %
 field-of-view | warning |  | horizontal field of view outside 20 to 140 degrees
 uncalibrated | note, warning |  | a CameraInfo whose K is zero; a note where no camera needs it
@@ -88,26 +88,26 @@ tf-gap | warning |  | a moving transform pauses
 tf-ends | warning |  | a moving transform ends over 1 s before the last image
 tf-roots | note, error | all | separate trees; an error where the cameras are in several
 tf-parents | warning |  | a frame with two parents
-pose-missing | warning, error | all | images without a known pose; an error where none has one
-pose-jump | error | later | a camera is over 0.2 m, and ten times its median step, further in the next frame
-alignment | error | later | the edges of depth are over 1.5 % of the width from those of colour, or match another
-    camera's colour
-views-scale | warning, error | later | the factor on the depths (of all cameras or one) with which views fit together;
-    a warning where they hardly overlap at an unusual depth
-views-pose | warning |  | by how much a camera must be moved and turned for its views to fit the others', from 12 mm
-    or 0.8 deg on and where depths then differ by 4 % or less
-agreement | note, error | later | how far apart views place a surface that both see [mm]; an error beyond 30 mm (from
-    1 m on 3 % of the depth), which `reconstruct` refuses
+pose-missing | warning, error | all | images without a known pose; an error where all are
+pose-jump | error | later | a camera moves over 0.2 m, and ten times its median step, from one frame to the next
+alignment | error | later | edges of depth are over 1.5 % of the width from those of colour, or match another camera's
+    colour
+views-scale | warning, error | later | the factor on depths (of all cameras or one) that makes views fit together; a
+    warning where they hardly overlap at an unusual depth
+views-pose | warning |  | how far a camera must be moved and turned for its views to fit the others' (from 12 mm or
+    0.8 deg, where depths then differ by at most 4 %)
+agreement | note, error | later | how far apart views place a surface that both see [mm]; an error beyond 30 mm (3 %
+    of depth above 1 m), which `reconstruct` refuses
 joints | note, error | replay | which topics and velocities are used; an error where the robot's joints are missing
 joints-nan | warning |  | positions that are not finite
-joints-degrees | error | replay | positions that no joint reaches in radians
+joints-degrees | error | replay | positions that no joint can reach in radians
 joints-velocity | note, warning |  | velocities that are missing (note) or zero throughout
 joints-still | note |  | no joint moves
 joints-limits | warning |  | states beyond the URDF's limits
 end-effector | note, error | replay | logged end-effector poses against the robot's kinematics
-arm | note, warning |  | depth minus the depth of the robot's rendered surface over the pixels it covers, per camera
-    [mm]; a warning beyond 30 mm, where it is 25 mm off in the mean, where a quarter of the pixels show what is
-    behind, or where depth is 4 % off throughout
+arm | note, warning |  | measured minus rendered depth of the robot's surface, per camera [mm]; a warning beyond 30
+    mm, beyond 25 mm in the mean, where a quarter of the pixels show the background, or where depth is 4 % off
+    throughout
 quick | note |  | only the first images were read
 """
 _BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}

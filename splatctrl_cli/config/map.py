@@ -39,7 +39,9 @@ class SceneConfig(Section, section="scene"):
     lambda_mde: Annotated[float, Within(0, 1e6, "", "factor on the median depth error in eq. 5; 50 is SplaTAM's")] = (
         50.0
     )
-    min_depth_error: Annotated[float, Within(0, 10, "m", "least threshold of eq. 5: spares a perfect map")] = 0.02
+    min_depth_error: Annotated[
+        float, Within(0, 10, "m", "least threshold of eq. 5, so that a perfect map is left alone")
+    ] = 0.02
     max_depth_error: Annotated[
         float, Within(1e-4, 1e9, "m", "largest threshold of eq. 5, so that new objects are seeded; 1e9: no limit")
     ] = 0.04
@@ -48,9 +50,7 @@ class SceneConfig(Section, section="scene"):
     radius_per_edge: Annotated[float, Within(0.05, 5, "", "radius of a seed, in edges of its cube")] = 0.45
     max_gap: Annotated[
         float,
-        Within(
-            0, 1e9, "m", "a measured point farther than this from every splat's sphere gets a splat; 1e9: none does"
-        ),
+        Within(0, 1e9, "m", "a measured point farther than this from every splat's sphere gets a splat; 1e9: off"),
     ] = 0.018
     contact_radius: Annotated[
         float,
@@ -177,7 +177,7 @@ class OccupancyConfig(Section, section="occupancy"):
     )
     max_range: Annotated[float, Within(0.01, 100, "m", "farther depth is no hit, but frees what is nearer")] = 3.0
     see_through: Annotated[
-        float, Within(0, 1e9, "m", "a splat this far before all depth around its pixel is removed; 1e9: none is")
+        float, Within(0, 1e9, "m", "a splat this far before all depth around its pixel is removed; 1e9: off")
     ] = 0.015
     uncertain_patience: Annotated[int, Within(0, 1_000_000, "", "time steps a splat may be in uncertain voxels")] = 10
     self_mask_tolerance: Annotated[float, Within(0, 0.1, "m", "how far off its joints the robot may be seen")] = 0.004

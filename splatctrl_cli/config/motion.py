@@ -44,7 +44,7 @@ class ControlConfig(Section, section="control"):
     posture_gain: Annotated[float, Within(0, 1000, "1/s", "pull towards the home posture")] = 0.5
     pose_gain: Annotated[float, Within(0, 1000, "1/s", "pose error to end-effector velocity")] = 2.0
     max_linear_speed: Annotated[
-        float, Within(1e-4, 20, "m/s", "cap of the end effector's speed: usual beside people")
+        float, Within(1e-4, 20, "m/s", "cap of the end effector's speed, usual near people")
     ] = 0.25
     max_angular_speed: Annotated[float, Within(1e-4, 50, "rad/s", "cap of its rotation")] = 1.0
     twist_timeout: Annotated[float, Within(1e-3, 60, "s", "how long a logged twist holds; then stand still")] = 0.5

@@ -28,10 +28,9 @@ MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a 
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """At most half of the space just outside of the arm that the motion comes to was never seen; at most 9 % of the
-    moving spheres come to space of which less than a tenth was; no place within the margin that cameras looked at
-    and got no depth from; at most `--max-unknown` of the sphere centres; a baked field says so by its channel
-    `observed`.
+    """Cameras saw at least half of the space around the moving arm; at most 9 % of the moving spheres come to space
+    of which less than a tenth was seen; at most `--max-unknown` of the sphere centres are in space never seen; within
+    the margin there is no place where cameras looked and got no depth. A baked field needs its channel `observed`.
     """
     for column, allowed, words in (
         ("unseen", UNSEEN, "of the space about the arm that the motion comes to was never seen by a camera"),
@@ -156,8 +155,9 @@ def map_age(judged: Judged) -> Iterator[Reason]:
 
 
 def judged_time(judged: Judged) -> Iterator[Reason]:
-    """No gap longer than `verdict.longest_interval` that the velocity limits could use to reach the margin, no state
-    without a distance, none dropped for its stamp (*judged states*), at most `verdict.lead_in` before the first map.
+    """No gap longer than `verdict.longest_interval` in which the arm could reach the margin within its velocity
+    limits; no state without a distance or dropped for its stamp (*judged states*); at most `verdict.lead_in` before
+    the first map.
     """
     config, stamps = judged.request.config.verdict, judged.replay.audit.stamp_ns
     blank = is_blank(judged.replay)

@@ -66,7 +66,7 @@ def clearance_of_people(judged: Judged) -> Iterator[Reason]:
 
 
 def true_clearance(judged: Judged) -> Iterator[Reason]:
-    """With `--truth`: the same by the truth."""
+    """With `--truth`: the true clearance of every moving sphere keeps the margin."""
     if judged.replay.true_clearance is not None:
         yield from _by_source(judged, "true")
 
@@ -173,7 +173,7 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def position_limits(judged: Judged) -> Iterator[Reason]:
-    """Of the URDF, less what an encoder may be off."""
+    """Those of the URDF, with `control.limit_tolerance` for encoder noise."""
     least, tolerance = least_of(judged.replay.audit.limit_margin), judged.request.config.control.limit_tolerance
     if least is None:
         return
@@ -199,7 +199,7 @@ def velocity_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def acceleration_limits(judged: Judged) -> Iterator[Reason]:
-    """The same of `control.max_acceleration`, where it is set."""
+    """At most one percent above `control.max_acceleration`, where it is set."""
     yield from _share_of_limit(judged, "acceleration", EventKind.TOO_SUDDEN)
 
 
@@ -281,8 +281,8 @@ def goal(judged: Judged) -> Iterator[Reason]:
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:
-    """The spheres' clearance less what they leave of the body uncovered keeps the margin, and every moving link has
-    a sphere.
+    """The spheres' clearance less what they leave uncovered keeps the margin, and every moving link has a
+    sphere.
     """
     model = judged.replay.model
     deficit = model.sphere_deficit[np.asarray(model.moving_spheres)]
@@ -318,7 +318,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def clearance_between_states(judged: Judged) -> Iterator[Reason]:
-    """Bounded from both ends by the spheres' lever arms, halved where that is too low."""
+    """A lower bound, by the spheres' lever arms, keeps the margin; intervals are halved where it is too low."""
     model, columns = judged.replay.model, judged.replay.between
     _, surface, between = _of_body(judged)
     if np.isnan(model.sphere_deficit[np.asarray(model.moving_spheres)]).any() or surface is None or between is None:
