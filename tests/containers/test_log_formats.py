@@ -53,28 +53,10 @@ def test_a_ros2_bag_folder_gives_the_records_of_its_mcap(tmp_path: Path, plugin:
     assert describe(bag).missing == ()
 
 
-def test_a_single_sqlite_file_is_read_without_its_folder(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap")
-    bag = as_ros2_folder(log, tmp_path / "bag", StoragePlugin.SQLITE3)
-    assert_same(list(open_source(log).records()), list(open_source(bag / "bag.db3").records()))
-
-
 def test_a_ros1_bag_gives_the_same_records(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
     bag = as_ros1_bag(log, tmp_path / "log.bag")
     assert_same(list(open_source(log).records()), list(open_source(bag).records()))
-
-
-def test_a_cut_ros1_bag_gives_what_precedes_the_cut(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=20, color_format="rgb8"))
-    bag = as_ros1_bag(log, tmp_path / "log.bag")
-    whole = list(open_source(bag).records())
-    bag.write_bytes(bag.read_bytes()[: bag.stat().st_size * 2 // 3])
-    source = open_source(bag)
-    found = list(source.records())
-    assert_same(found, whole[: len(found)])
-    assert 0 < len(found) < len(whole)
-    assert source.loss.damaged >= 1
 
 
 def test_a_bag_folder_that_lacks_a_file_is_refused(tmp_path: Path) -> None:

@@ -21,18 +21,3 @@ def test_no_message_is_lost_that_the_tool_recovers_and_each_loss_is_told(tmp_pat
             found = counted(file, truth, tmp_path / "x.mcap")
             assert not found.lacking, f"{kind} {number}: {found}"
             assert found.read == NUM_MESSAGES or found.is_told, f"{kind} {number}: {found}"
-
-
-def test_the_tool_loses_the_chunk_that_a_cut_goes_through(tmp_path: Path) -> None:
-    data = log(*LOGS["not compressed"])
-    truth = Counter(recover(data).kept)
-    found = counted(data[: len(data) // 3], truth, tmp_path / "x.mcap")
-    assert found.read > found.copied == found.decoded > 0
-
-
-def test_a_chunk_that_the_tool_copies_unread_is_counted_by_it_and_left_out_here(tmp_path: Path) -> None:
-    data = bytearray(log(*LOGS["not compressed"]))
-    truth = Counter(recover(bytes(data)).kept)
-    data[len(data) // 2] ^= 1
-    found = counted(bytes(data), truth, tmp_path / "x.mcap")
-    assert found.claimed == NUM_MESSAGES > found.read == found.decoded

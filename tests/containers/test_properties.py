@@ -14,7 +14,6 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_of, read_arrays, savez
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.logs.encodings import decode_rvl
-from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.tf_tree import MAX_GAP_NS, TfTree
 from tests.logs.test_rvl import encoded_rvl
 from tests.properties import few
@@ -34,26 +33,6 @@ def test_bytes_that_are_no_record_of_an_mcap_are_refused_as_such(opcode: int, co
 def test_rvl_gives_back_any_image(pixels: list[int]) -> None:
     image = np.array(pixels, np.uint16)
     assert np.array_equal(decode_rvl(encoded_rvl(image), image.size), image)
-
-
-TIMES = st.lists(st.integers(0, 60), max_size=25)
-
-
-@few(150)
-@given(TIMES, TIMES, st.integers(0, 12))
-def test_pairs_are_one_to_one_near_and_none_is_left_that_could_be(
-    color: list[int], depth: list[int], tolerance: int
-) -> None:
-    pairs = pair_by_stamp(color, depth, tolerance)
-    ones, others = [i for i, _ in pairs], [j for _, j in pairs]
-    assert len(set(ones)) == len(ones) and len(set(others)) == len(others)
-    assert all(abs(color[i] - depth[j]) <= tolerance for i, j in pairs)
-    assert [color[i] for i in ones] == sorted(color[i] for i in ones)
-    free = [i for i in range(len(color)) if i not in ones], [j for j in range(len(depth)) if j not in others]
-    assert not any(abs(color[i] - depth[j]) <= tolerance for i in free[0] for j in free[1])
-    mirrored = pair_by_stamp(depth, color, tolerance)
-    gaps = sorted(abs(color[i] - depth[j]) for i, j in pairs)
-    assert gaps[:1] == sorted(abs(depth[i] - color[j]) for i, j in mirrored)[:1], "the closest pair is one both ways"
 
 
 NUMBER = st.floats(-10, 10)

@@ -15,7 +15,6 @@ from tests.conftest import ROOT
 
 EXAMPLES = ROOT / "docs" / "examples"
 STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-NOT_RECORDINGS = {"franka_description", "meshes", "robot_spheres", "vamp_panda"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,10 +125,3 @@ def test_every_conformance_file_is_refused_for_its_missing_images(real_data: Pat
         reason = "expected messages in cdr, .*, got a" if "Message" in path.parent.name else "holds no messages"
         with pytest.raises(InputError, match=reason):
             open_source(path)
-
-
-def test_no_recording_is_left_out(real_data: Path) -> None:
-    folders = {path.name for path in real_data.iterdir() if path.is_dir()}
-    known = {recording.path.partition("/")[0] for recording in RECORDINGS}
-    known |= {path.partition("/")[0] for path in REFUSED} | {"rosbag2_testbags", "mcap_conformance"}
-    assert folders <= known | NOT_RECORDINGS

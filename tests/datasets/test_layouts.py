@@ -214,18 +214,6 @@ def test_frames_can_be_held_out_of_a_layout(tmp_path: Path) -> None:
     assert [frame.camera for frame in frames] == ["camera", "holdout", "camera"]
 
 
-def test_a_real_open3d_scene_opens_by_its_folder(real_data: Path) -> None:
-    frames = frames_of(real_data / "open3d_rgbd/RGBD")
-    assert len(frames) == 5
-    assert (frames[0].intrinsics.fx, frames[0].intrinsics.cx) == (525.0, 319.5)
-
-
-def test_a_real_nerfstudio_folder_opens_by_itself(real_data: Path) -> None:
-    frames = frames_of(real_data / "tabletop_views", SourceOptions(depth_scale=1e-4))
-    assert len(frames) == 12
-    assert (frames[0].intrinsics.fx, frames[0].intrinsics.cx) == (288.0, 159.5)
-
-
 def test_a_tum_folder_without_its_poses_names_the_file(tmp_path: Path) -> None:
     folder = make_tum(tmp_path / "rgbd_dataset_freiburg3_x")
     (folder / "groundtruth.txt").unlink()
