@@ -16,6 +16,7 @@ from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from tests.known_voxels import known
+from tests.plain import plain_grid, plain_splats
 
 SECOND = 1_000_000_000
 START = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])
@@ -49,26 +50,11 @@ def logged(end: Float64 = START, num: int = 11, start_ns: int = 0) -> list[Joint
 
 
 def splats_of(*balls: tuple[tuple[float, float, float], float]) -> SplatSet:
-    num = len(balls)
-    return SplatSet(
-        centers=np.array([ball[0] for ball in balls], np.float32),
-        radii=np.array([ball[1] for ball in balls], np.float32),
-        colors=np.zeros((num, 3), np.float32),
-        opacities=np.full(num, 0.9, np.float32),
-        labels=np.zeros(num, np.uint8),
-        density=np.zeros(num, np.float32),
-    )
+    return plain_splats([ball[0] for ball in balls], [ball[1] for ball in balls])
 
 
 def grid_seen(is_seen: bool = True) -> OccupancyGrid:
-    shape = (40, 40, 40)
-    return OccupancyGrid(
-        origin=np.array([-1.5, -1.5, -1.0]),
-        voxel=0.1,
-        log_odds=np.full(shape, -1.0, np.float32),
-        num_updates=np.full(shape, int(is_seen), np.uint16),
-        entity=np.zeros(shape, np.uint8),
-    )
+    return plain_grid((40, 40, 40), 0.1, [-1.5, -1.5, -1.0], log_odds=-1.0, num_updates=int(is_seen))
 
 
 def write_scene(

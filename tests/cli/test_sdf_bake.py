@@ -20,7 +20,6 @@ from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.grid_files import grid_formats
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bake import SUMMARY_METRICS
-from splatctrl_cli.records import OccupancyGrid
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.truth import load_truth
 from splatctrl_cli.splat_files import splat_formats
@@ -28,6 +27,7 @@ from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli import here
 from tests.field.scenes import cloud, splat_set
 from tests.known_voxels import known
+from tests.plain import plain_grid
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 COARSE = ("--set", "field.max_loss=1")  # cells that are baked in no time
@@ -132,13 +132,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = SceneWriter(folder, {})
     start_ns, shape = 7_000_000_000, (4, 4, 4)
     at = [splat_set(np.array([[0.0, 0.0, 0.1 * second]]), np.array([0.01])) for second in range(3)]
-    free = OccupancyGrid(
-        origin=np.full(3, -1.5),
-        voxel=1.0,
-        log_odds=np.full(shape, -2.0, np.float32),
-        num_updates=np.ones(shape, np.uint16),
-        entity=np.zeros(shape, np.uint8),
-    )
+    free = plain_grid(shape, 1.0, -1.5)
     for second, splats in enumerate(at):
         writer.snapshot(start_ns + second * 10**9, splats, known(free), np.full(shape, second, np.uint8))
     (folder / "snapshots" / "000000.npz").unlink()  # as in a scene of an older version

@@ -5,7 +5,8 @@ import pytest
 
 from splatctrl_cli.evaluate import clearance_agreement as module
 from splatctrl_cli.evaluate.clearance_agreement import clearance_agreement, least, mark_seen
-from splatctrl_cli.records import Intrinsics, RgbdFrame
+from splatctrl_cli.records import Intrinsics
+from tests.plain import plain_frame
 
 STAMPS = np.arange(6, dtype=np.int64) * 10
 
@@ -35,14 +36,7 @@ def test_without_a_state_to_compare_there_is_no_figure() -> None:
 
 @pytest.mark.parametrize("block", [1, 4, 6])
 def test_a_frame_shows_a_surface_to_later_states_only(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
-    frame = RgbdFrame(
-        stamp_ns=20,
-        camera="cam0",
-        color=np.zeros((3, 3, 3), np.uint8),
-        depth=np.ones((3, 3), np.float32),
-        intrinsics=Intrinsics(fx=3.0, fy=3.0, cx=1.0, cy=1.0, width=3, height=3),
-        T_world_camera=np.eye(4),
-    )
+    frame = plain_frame(1.0, Intrinsics(fx=3.0, fy=3.0, cx=1.0, cy=1.0, width=3, height=3), stamp_ns=20)
     monkeypatch.setattr(module, "BLOCK", block)
     points = np.tile([0.0, 0.0, 1.0], (6, 1))
     points[5] = [0.0, 0.0, 1.5]

@@ -7,31 +7,19 @@ import pytest
 
 from splatctrl_cli.evaluate.score import free_mass, in_front
 from splatctrl_cli.records import Label, OccupancyGrid, SplatSet
+from tests.plain import plain_grid, plain_splats
 
 FREE, FULL = -2.0, 2.0
 
 
 def grid() -> OccupancyGrid:
     """Three voxels of 10 cm along x, from 0 on: free, full, never seen."""
-    return OccupancyGrid(
-        origin=np.array([0.05, 0.05, 0.05]),
-        voxel=0.1,
-        log_odds=np.float32([FREE, FULL, 0.0]).reshape(3, 1, 1),
-        num_updates=np.uint16([4, 4, 0]).reshape(3, 1, 1),
-        entity=np.zeros((3, 1, 1), np.uint8),
-    )
+    odds, updates = np.reshape([FREE, FULL, 0.0], (3, 1, 1)), np.reshape([4, 4, 0], (3, 1, 1))
+    return plain_grid((3, 1, 1), 0.1, 0.05, log_odds=odds, num_updates=updates)
 
 
 def splats(x: list[float], opacities: list[float], radii: list[float], labels: list[int] | None = None) -> SplatSet:
-    count = len(x)
-    return SplatSet(
-        centers=np.array([[value, 0.05, 0.05] for value in x], np.float32),
-        radii=np.array(radii, np.float32),
-        colors=np.zeros((count, 3), np.float32),
-        opacities=np.array(opacities, np.float32),
-        labels=np.array(labels or [0] * count, np.uint8),
-        density=np.zeros(count, np.float32),
-    )
+    return plain_splats([[value, 0.05, 0.05] for value in x], radii, opacities=opacities, labels=labels or 0)
 
 
 def test_mass_is_opacity_times_radius_squared_of_what_stands_in_free_voxels() -> None:

@@ -8,6 +8,7 @@ from splatctrl_cli.evaluate.held_out_depth import ROBOT_MARGIN, compare_with_hel
 from splatctrl_cli.evaluate.views import surface_points
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Box, DistanceGrid, Intrinsics, RgbdFrame
+from tests.plain import plain_frame
 
 CAMERA = Intrinsics(fx=200.0, fy=200.0, cx=99.5, cy=79.5, width=200, height=160)
 
@@ -19,14 +20,7 @@ def floor_frame(eye: tuple[float, float, float], target: tuple[float, float, flo
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
     falls = (rays @ T[:3, :3].T)[..., 2]
     depth = np.where(falls < 0, -T[2, 3] / np.where(falls < 0, falls, -1.0), 0.0)
-    return RgbdFrame(
-        stamp_ns=0,
-        camera="held-out",
-        color=np.zeros((160, 200, 3), np.uint8),
-        depth=depth.astype(np.float32),
-        intrinsics=CAMERA,
-        T_world_camera=T,
-    )
+    return plain_frame(depth, CAMERA, T, camera="held-out")
 
 
 def height_grid(error: float = 0.0) -> DistanceGrid:

@@ -9,20 +9,16 @@ import pytest
 from splatctrl_cli.evaluate.same_recording import changed_files, differences, first_frame
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
+from tests.plain import plain_frame
 
 SECOND = 1_000_000_000
 
 
 def frame(camera: str = "cam0", second: float = 1.0, eye: tuple[float, ...] = (0.0, 0.0, 0.0)) -> RgbdFrame:
     color = np.random.default_rng(3).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-    return RgbdFrame(
-        stamp_ns=round(second * SECOND),
-        camera=camera,
-        color=color,
-        depth=np.ones((48, 64), np.float32),
-        intrinsics=Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48),
-        T_world_camera=look_at(eye, [1.0, 0.0, 0.0]),
-    )
+    lens = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
+    place = look_at(eye, [1.0, 0.0, 0.0])
+    return plain_frame(1.0, lens, place, stamp_ns=round(second * SECOND), camera=camera, color=color)
 
 
 def kept(*frames: RgbdFrame) -> list[dict[str, object]]:

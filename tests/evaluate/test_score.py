@@ -8,8 +8,9 @@ import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate import score_report
-from splatctrl_cli.evaluate.score import PROTOCOL, ViewScore, as_json, metric_names, score_view, total_score
+from splatctrl_cli.evaluate.score import ViewScore, as_json, metric_names, score_view, total_score
 from splatctrl_cli.records import Bool, Float32, Intrinsics, RgbdFrame
+from tests.plain import plain_frame
 
 H, W = 20, 30
 NONE = np.zeros((H, W), dtype=bool)
@@ -25,14 +26,8 @@ def photo() -> RgbdFrame:
     color = np.random.default_rng(0).integers(51, 153, (H, W, 3)).astype(np.uint8)
     depth = np.full((H, W), 1.0, np.float32)
     depth[:5] = 0.0
-    return RgbdFrame(
-        stamp_ns=7,
-        camera="cam3",
-        color=color,
-        depth=depth,
-        intrinsics=Intrinsics(fx=30.0, fy=30.0, cx=14.5, cy=9.5, width=W, height=H),
-        T_world_camera=np.eye(4),
-    )
+    lens = Intrinsics(fx=30.0, fy=30.0, cx=14.5, cy=9.5, width=W, height=H)
+    return plain_frame(depth, lens, stamp_ns=7, camera="cam3", color=color)
 
 
 def perfect() -> Float32:
@@ -156,10 +151,6 @@ def test_totals_of_no_view_cannot_be_evaluated() -> None:
 
 def test_json_holds_none_for_what_is_no_number() -> None:
     assert as_json({"a": math.nan, "b": math.inf, "c": 1.5}) == {"a": None, "b": None, "c": 1.5}
-
-
-def test_the_protocol_names_every_kind_of_figure() -> None:
-    assert {"average", "all", "seen", "mask", "psnr", "ssim", "depth"} <= set(PROTOCOL)
 
 
 def test_the_names_of_the_totals_are_known_beforehand() -> None:

@@ -10,20 +10,17 @@ from splatctrl_cli.evaluate.score_doubts import Doubts
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame
+from tests.plain import plain_frame
 
 H, W = 24, 32
 
 
 def frame(number: int) -> RgbdFrame:
     rng = np.random.default_rng(number)
-    return RgbdFrame(
-        stamp_ns=number,
-        camera="camera",
-        color=np.kron(rng.integers(0, 256, (3, 4, 3)), np.ones((8, 8, 1))).astype(np.uint8),
-        depth=np.ones((H, W), np.float32),
-        intrinsics=Intrinsics(fx=30.0, fy=30.0, cx=15.5, cy=11.5, width=W, height=H),
-        T_world_camera=look_at([0.1 * number, -1.0, 0.4], [0.0, 0.0, 0.0]),
-    )
+    lens = Intrinsics(fx=30.0, fy=30.0, cx=15.5, cy=11.5, width=W, height=H)
+    place = look_at([0.1 * number, -1.0, 0.4], [0.0, 0.0, 0.0])
+    color = np.kron(rng.integers(0, 256, (3, 4, 3)), np.ones((8, 8, 1)))
+    return plain_frame(1.0, lens, place, stamp_ns=number, camera="camera", color=color)
 
 
 TRAINING = (frame(7), frame(8))

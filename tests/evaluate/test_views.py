@@ -6,19 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.evaluate.views import seen_by, seen_pixels, surface_points, views_to_score
-from splatctrl_cli.geometry import look_at, transform_points
+from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame
+from tests.plain import plain_frame
 
 
 def frame(stamp_ns: int, camera: str) -> RgbdFrame:
-    return RgbdFrame(
-        stamp_ns=stamp_ns,
-        camera=camera,
-        color=np.zeros((2, 2, 3), np.uint8),
-        depth=np.ones((2, 2), np.float32),
-        intrinsics=Intrinsics(fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=2, height=2),
-        T_world_camera=np.eye(4),
-    )
+    lens = Intrinsics(fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=2, height=2)
+    return plain_frame(1.0, lens, stamp_ns=stamp_ns, camera=camera)
 
 
 class FakeSource:
@@ -87,14 +82,7 @@ def wall_frame(T_world_camera: Float64 | None = None) -> RgbdFrame:
     depth = np.full((48, 64), 2.0, dtype=np.float32)
     depth[:, :32] = 1.0
     depth[0] = 0.0
-    return RgbdFrame(
-        stamp_ns=0,
-        camera="cam0",
-        color=np.zeros((48, 64, 3), dtype=np.uint8),
-        depth=depth,
-        intrinsics=INTRINSICS,
-        T_world_camera=np.eye(4) if T_world_camera is None else T_world_camera,
-    )
+    return plain_frame(depth, INTRINSICS, T_world_camera)
 
 
 def points(values: ArrayLike) -> Float64:
@@ -148,12 +136,3 @@ def test_any_frame_suffices_and_no_frame_sees_nothing() -> None:
     assert seen_by(target, [away, wall_frame()]).all()
     assert not seen_by(target, []).any()
     assert seen_by(points([]), [wall_frame()]).shape == (0,)
-
-
-def test_seen_moves_with_the_world() -> None:
-    T = look_at([0.3, -0.2, 0.4], [1.0, 1.0, 0.0])
-    target = np.random.default_rng(0).uniform([-1, -1, 0.5], [1, 1, 2.5], size=(500, 3))
-    here = seen_by(target, [wall_frame()], tolerance=0.5)
-    there = seen_by(transform_points(T, target), [wall_frame(T)], tolerance=0.5)
-    assert np.array_equal(here, there)
-    assert 0 < here.sum() < 500

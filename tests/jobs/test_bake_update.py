@@ -13,12 +13,13 @@ import pytest
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.field import slabs
 from splatctrl_cli.jobs.bake import BakeResult
-from splatctrl_cli.records import Label, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bakes import Said, baked, field_json
 from tests.known_voxels import known
+from tests.plain import plain_grid
 
 BOX = (-0.6, -0.6, -0.5, 0.6, 0.6, 0.5)
 SECOND = 10**9
@@ -44,13 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
     writer = SceneWriter(folder, {})
     shape = (6, 6, 6)
-    occupancy = OccupancyGrid(
-        origin=np.full(3, -1.5),
-        voxel=0.5,
-        log_odds=np.full(shape, -2.0, np.float32),
-        num_updates=np.ones(shape, np.uint16),
-        entity=np.zeros(shape, np.uint8),
-    )
+    occupancy = plain_grid(shape, 0.5, -1.5)
     writer.snapshot(5 * SECOND, before(), known(occupancy), np.full(shape, 1, np.uint8))
     writer.snapshot(7 * SECOND, after(before()), known(occupancy), np.full(shape, 2, np.uint8))
     writer.finish(7 * SECOND, after(before()), known(occupancy))

@@ -13,6 +13,7 @@ from splatctrl_cli.jobs import score, score_reference
 from splatctrl_cli.records import Float64, Intrinsics, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
 from splatctrl_cli.splat_files.splats import write_ply
+from tests.plain import plain_frame, plain_grid, plain_splats
 
 INTRINSICS = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 SECOND = 1_000_000_000
@@ -21,29 +22,15 @@ SECOND = 1_000_000_000
 def wall(brightness: float = 0.5) -> SplatSet:
     """A dense wall in the plane x = 1, of one colour."""
     y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-0.8, 0.8, 0.02), np.arange(-0.8, 0.8, 0.02)))
-    num = len(y)
-    return SplatSet(
-        centers=np.column_stack([np.ones(num), y, z]).astype(np.float32),
-        radii=np.full(num, 0.02, np.float32),
-        colors=np.full((num, 3), brightness, np.float32),
-        opacities=np.full(num, 0.95, np.float32),
-        labels=np.zeros(num, np.uint8),
-        density=np.zeros(num, np.float32),
-    )
+    return plain_splats(np.column_stack([np.ones(len(y)), y, z]), 0.02, colors=brightness, opacities=0.95)
 
 
 def frame(stamp_ns: int, camera: str, T_world_camera: Float64, color_offset: float = 0.0) -> RgbdFrame:
     """What a camera records of the wall; its colour is off by `color_offset`."""
     rendering = render(wall(), INTRINSICS, T_world_camera, threads=1)
-    color = np.clip(255 * (rendering.color + color_offset), 0, 255)
-    return RgbdFrame(
-        stamp_ns=stamp_ns,
-        camera=camera,
-        color=np.round(color).astype(np.uint8),
-        depth=rendering.normalised_depth(),
-        intrinsics=INTRINSICS,
-        T_world_camera=T_world_camera,
-    )
+    color = np.round(np.clip(255 * (rendering.color + color_offset), 0, 255))
+    depth = rendering.normalised_depth()
+    return plain_frame(depth, INTRINSICS, T_world_camera, stamp_ns=stamp_ns, camera=camera, color=color)
 
 
 FRONT = look_at([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
@@ -93,13 +80,7 @@ class FakeScene:
 
     def occupancy(self) -> OccupancyGrid:
         """One voxel of free space that holds the left half of the wall."""
-        return OccupancyGrid(
-            origin=np.array([1.0, 5.0, 0.0]),
-            voxel=10.0,
-            log_odds=np.full((1, 1, 1), -2.0, np.float32),
-            num_updates=np.ones((1, 1, 1), np.uint16),
-            entity=np.zeros((1, 1, 1), np.uint8),
-        )
+        return plain_grid((1, 1, 1), 10.0, [1.0, 5.0, 0.0])
 
     def unrepresented_at(self, stamp_ns: int | None) -> None:
         return None

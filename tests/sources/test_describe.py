@@ -9,13 +9,14 @@ import pytest
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError
-from splatctrl_cli.records import SWEPT, Label, OccupancyGrid, SplatSet
+from splatctrl_cli.records import SWEPT, Label
 from splatctrl_cli.scene_files.voxel_file import write_occupancy
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import SourceOptions, open_source
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.known_voxels import known
 from tests.logs.make_log import LogRecipe, make_log
+from tests.plain import plain_grid, plain_splats
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
@@ -50,9 +51,7 @@ def test_topics_come_with_count_rate_size_and_encoding(tmp_path: Path) -> None:
     ("recipe", "said"),
     [
         (LogRecipe(has_depth=False), "no depth topic"),
-        (LogRecipe(has_info=False), "has no usable CameraInfo"),
         (LogRecipe(has_tf=False), "no tf for frame 'cam0_optical'"),
-        (LogRecipe(depth_size=(16, 12)), "depth 16UC1 16x12 of /cam0/depth/image_raw is not registered to colour"),
         (LogRecipe(num_frames=1, depth_delay_ns=35_000_000), "never closer than 35 ms"),
         (LogRecipe(num_frames=0, has_tf=False), "the log holds no messages"),
     ],
@@ -111,27 +110,8 @@ def test_a_splat_file_is_described_by_its_header(tmp_path: Path) -> None:
     assert describe(tmp_path / "scene").kind == "scene folder"
 
 
-def test_a_grid_is_described_without_unpickling(tmp_path: Path) -> None:
-    path = tmp_path / "grid.npz"
-    header = json.dumps({"frame": "world", "units": "m"})
-    np.savez(path, sdf=np.zeros((3, 4, 5), np.float32), origin=np.arange(3.0), header=np.array(header))
-    summary = describe(path)
-    assert summary.kind == "distance grid"
-    assert summary.facts["header"] == {"frame": "world", "units": "m"}
-    assert summary.facts["origin"] == [0.0, 1.0, 2.0]
-    assert ["sdf", "3x4x5", "float32"] in list(summary.grids[0].rows)
-
-
 def test_a_field_folder_is_described_by_what_its_grid_covers(tmp_path: Path) -> None:
-    splats = SplatSet(
-        centers=np.zeros((1, 3), np.float32),
-        radii=np.full(1, 0.01, np.float32),
-        colors=np.zeros((1, 3), np.float32),
-        opacities=np.ones(1, np.float32),
-        labels=np.zeros(1, np.uint8),
-        density=np.zeros(1, np.float32),
-    )
-    write_ply(tmp_path / "splats.ply", splats, {})
+    write_ply(tmp_path / "splats.ply", plain_splats([0, 0, 0], 0.01), {})
     baked = ["--box=-0.1,-0.1,-0.1,0.1,0.1,0.3", "--voxel", "0.1", "-q", "-o", str(tmp_path / "field")]
     baked += ["--set", "field.max_loss=1"]
     assert main(["sdf-bake", str(tmp_path / "splats.ply"), *baked]) == 0
@@ -268,12 +248,6 @@ def test_every_ros2_test_bag_is_described(real_data: Path) -> None:
         assert summary.grids[0].rows
 
 
-def test_a_real_robot_is_described(real_data: Path) -> None:
-    summary = describe(real_data / "vamp_panda/resources/panda/panda.urdf")
-    assert summary.kind == "URDF"
-    assert summary.facts["movable_joints"] == 7
-
-
 def test_a_real_image_folder_is_described(real_data: Path) -> None:
     options = SourceOptions(root=real_data / "apc_shelf/scene-0000")
     summary = describe(EXAMPLES / "apc_shelf.toml", options)
@@ -282,13 +256,11 @@ def test_a_real_image_folder_is_described(real_data: Path) -> None:
 
 
 def test_a_scene_says_how_much_of_its_space_is_known_by_its_own_thresholds(tmp_path: Path) -> None:
-    grid = OccupancyGrid(
-        origin=np.zeros(3),
-        voxel=0.1,
-        log_odds=np.float32([-2.0, -2.0, -0.9, 2.0, 0.0, 0.0, 0.0, 0.0]).reshape(2, 2, 2),
-        num_updates=np.uint16([1, 1, 1, 1, 1, 0, 0, 0]).reshape(2, 2, 2),
-        entity=np.uint8([0, 0, 0, Label.HUMAN, Label.ROBOT | SWEPT, SWEPT, 0, 0]).reshape(2, 2, 2),
-    )
+    shape = (2, 2, 2)
+    odds = np.reshape([-2.0, -2.0, -0.9, 2.0, 0.0, 0.0, 0.0, 0.0], shape)
+    updates = np.reshape([1, 1, 1, 1, 1, 0, 0, 0], shape)
+    entity = np.reshape([0, 0, 0, Label.HUMAN, Label.ROBOT | SWEPT, SWEPT, 0, 0], shape)
+    grid = plain_grid(shape, 0.1, 0.0, log_odds=odds, num_updates=updates, entity=entity)
     write_occupancy(tmp_path / "occupancy.npz", known(grid))
     (tmp_path / "splats.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n")
     expected = {"never_seen": 0.25, "free": 0.375, "occupied": 0.125, "uncertain": 0.125, "swept_by_robot": 0.125}
@@ -300,3 +272,9 @@ def test_a_scene_says_how_much_of_its_space_is_known_by_its_own_thresholds(tmp_p
     space = describe(tmp_path).facts["space"]
     assert isinstance(space, dict)
     assert space["share"] == expected | {"free": 0.25, "uncertain": 0.25}
+
+
+def test_a_real_robot_is_described(real_data: Path) -> None:
+    summary = describe(real_data / "vamp_panda/resources/panda/panda.urdf")
+    assert summary.kind == "URDF"
+    assert summary.facts["movable_joints"] == 7
