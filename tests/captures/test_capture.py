@@ -14,35 +14,25 @@ from splatctrl_cli.containers.mcap_records import CHUNK
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.source import SourceOptions, open_source
+from tests.containers.test_log_formats import assert_same
 from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log
 
 
-def captured(tmp_path: Path, recipe: LogRecipe, name: str = "x.capture") -> tuple[list[Record], Path]:
-    source = open_source(make_log(tmp_path / "log.mcap", recipe))
+def captured(
+    tmp_path: Path, recipe: LogRecipe, name: str = "x.capture", options: SourceOptions | None = None
+) -> tuple[list[Record], Path]:
+    source = open_source(make_log(tmp_path / "log.mcap", recipe), options)
     folder = tmp_path / name
     folder.mkdir()
     write_capture(folder, source)
     return list(source.records()), folder
 
 
+MASKED = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
+
+
 def frames_of(records: list[Record]) -> list[RgbdFrame]:
     return [record for record in records if isinstance(record, RgbdFrame)]
-
-
-def assert_same(before: list[Record], after: list[Record]) -> None:
-    assert len(before) == len(after) > 0
-    for a, b in zip(before, after, strict=True):
-        assert a.stamp_ns == b.stamp_ns
-        if isinstance(a, RgbdFrame):
-            assert isinstance(b, RgbdFrame)
-            assert (a.camera, a.intrinsics) == (b.camera, b.intrinsics)
-            assert np.array_equal(a.color, b.color)
-            assert np.array_equal(a.depth, b.depth)
-            assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
-        else:
-            assert isinstance(b, JointState)
-            assert np.array_equal(a.position, b.position)
-            assert np.array_equal(a.velocity, b.velocity)
 
 
 @pytest.mark.parametrize("color_format", ["jpeg", "png", "rgb8", "bgra8", "mono8"])
@@ -58,20 +48,17 @@ def test_a_capture_gives_the_same_records(tmp_path: Path, color_format: str) -> 
 def test_float_depth_on_a_grid_becomes_png_and_other_depth_stays_float(tmp_path: Path) -> None:
     on_grid, folder = captured(tmp_path, LogRecipe(depth_encoding="32FC1", depth_m=1.2345), "grid.capture")
     assert (folder / "depth/cam0/000000.png").is_file()
-    back = [r for r in open_source(folder).records() if isinstance(r, RgbdFrame)]
-    first = next(r for r in on_grid if isinstance(r, RgbdFrame))
-    assert np.abs(back[0].depth - first.depth).max() <= 1e-6
+    back = frames_of(list(open_source(folder).records()))
+    assert np.abs(back[0].depth - frames_of(on_grid)[0].depth).max() <= 1e-6
     off_grid, folder = captured(tmp_path, LogRecipe(depth_encoding="32FC1", depth_m=1.23457), "float.capture")
     assert (folder / "depth/cam0/000000.npy").is_file()
     assert_same(off_grid, list(open_source(folder).records()))
 
 
 def test_compressed_color_is_kept_byte_for_byte(tmp_path: Path) -> None:
-    source = open_source(make_log(tmp_path / "log.mcap"))
-    folder = tmp_path / "x.capture"
-    folder.mkdir()
-    write_capture(folder, source)
-    frames = [stored for stored in source.stored() if not isinstance(stored, JointState)]
+    _, folder = captured(tmp_path, LogRecipe())
+    stored = open_source(tmp_path / "log.mcap").stored()
+    frames = [item for item in stored if not isinstance(item, JointState)]
     assert [(folder / f"color/cam0/{i:06d}.jpg").read_bytes() for i in range(5)] == [s.color_file for s in frames]
 
 
@@ -136,14 +123,6 @@ def test_a_capture_of_a_newer_version_is_refused(tmp_path: Path) -> None:
         open_source(folder)
 
 
-@pytest.mark.parametrize("name", ["SHA256SUMS", "frames.csv", "joints.npz"])
-def test_a_capture_without_an_index_is_refused(tmp_path: Path, name: str) -> None:
-    _, folder = captured(tmp_path, LogRecipe())
-    (folder / name).unlink()
-    with pytest.raises(InputError, match=name):
-        open_source(folder)
-
-
 def test_options_that_a_capture_cannot_honour_are_refused(tmp_path: Path) -> None:
     _, folder = captured(tmp_path, LogRecipe())
     options = SourceOptions()
@@ -185,24 +164,28 @@ def test_real_folders_are_captured_without_loss(real_data: Path, tmp_path: Path,
     assert_same(list(source.records()), list(capture.records()))
 
 
-@pytest.mark.parametrize("name", ["capture.json", "frames.csv", "joints.npz"])
-def test_an_index_that_was_changed_is_refused(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "is_there"),
+    [
+        *(("capture.json", True), ("frames.csv", True), ("joints.npz", True)),
+        *(("SHA256SUMS", False), ("frames.csv", False), ("joints.npz", False)),
+    ],
+)
+def test_an_index_that_was_changed_or_is_gone_is_refused(tmp_path: Path, name: str, is_there: bool) -> None:
     _, folder = captured(tmp_path, LogRecipe())
-    (folder / name).write_bytes((folder / name).read_bytes() + b"\n")
-    with pytest.raises(InputError, match=f"{name}: its checksum differs"):
+    content = (folder / name).read_bytes()
+    (folder / name).unlink()
+    if is_there:
+        (folder / name).write_bytes(content + b"\n")
+    with pytest.raises(InputError, match=f"{name}: its checksum differs" if is_there else name):
         open_source(folder)
 
 
 def test_masks_come_back_and_frames_without_one_stay_without(tmp_path: Path) -> None:
-    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
-    source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=2)), options)
-    folder = tmp_path / "x.capture"
-    folder.mkdir()
-    write_capture(folder, source)
-    before, after = list(source.records()), list(open_source(folder).records())
+    before, folder = captured(tmp_path, LogRecipe(mask_every=2), options=MASKED)
+    after = list(open_source(folder).records())
     assert_same(before, after)
-    masks = [(a.human, b.human) for a, b in zip(before, after, strict=True) if isinstance(a, RgbdFrame)
-             and isinstance(b, RgbdFrame)]  # fmt: skip
+    masks = [(a.human, b.human) for a, b in zip(frames_of(before), frames_of(after), strict=True)]
     assert [a is not None for a, _ in masks] == [True, False, True, False, True]
     assert all((a is None and b is None) or np.array_equal(a, b) for a, b in masks)
 
@@ -230,13 +213,10 @@ def test_a_frame_whose_valid_pixels_are_not_known_is_left_out(tmp_path: Path) ->
 
 
 def test_a_damaged_mask_is_counted_and_its_frame_kept(tmp_path: Path) -> None:
-    options = SourceOptions(human_topics={"cam0": "/cam0/people/mask"})
-    folder = tmp_path / "x.capture"
-    folder.mkdir()
-    write_capture(folder, open_source(make_log(tmp_path / "log.mcap", LogRecipe(mask_every=1)), options))
+    _, folder = captured(tmp_path, LogRecipe(mask_every=1), options=MASKED)
     (folder / "human/cam0/000001.png").write_bytes(b"no image")
     source = open_source(folder)
-    frames = [record for record in source.records() if isinstance(record, RgbdFrame)]
+    frames = frames_of(list(source.records()))
     assert [frame.human is not None for frame in frames] == [True, False, True, True, True]
     assert source.loss.damaged == 1
 

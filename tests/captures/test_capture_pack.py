@@ -16,8 +16,9 @@ from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.source import open_source
+from tests.captures.test_capture import frames_of
+from tests.containers.test_log_formats import assert_same
 from tests.logs.make_log import LogRecipe, camera_x, make_log
 
 RECIPE = LogRecipe(cameras=("cam0", "cam1"))
@@ -98,19 +99,12 @@ def test_a_foreign_reader_finds_standard_messages(tmp_path: Path) -> None:
 
 
 def test_a_packed_capture_is_a_log_with_the_same_frames(tmp_path: Path) -> None:
-    folder, packed = captured(tmp_path, replace(RECIPE, depth_counts=12500), SourceOptions(depth_scale=1e-4)), None
+    folder = captured(tmp_path, replace(RECIPE, depth_counts=12500), SourceOptions(depth_scale=1e-4))
     packed = tmp_path / "packed.mcap"
     pack_capture(folder, packed)
-    before, after = (
-        [record for record in open_source(path).records() if isinstance(record, RgbdFrame)]
-        for path in (folder, packed)
-    )
-    assert len(before) == len(after) == 10
-    for a, b in zip(before, after, strict=True):
-        assert (a.stamp_ns, a.camera, a.intrinsics) == (b.stamp_ns, b.camera, b.intrinsics)
-        assert np.array_equal(a.color, b.color)
-        assert np.array_equal(a.depth, b.depth)
-        assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
+    before, after = (frames_of(list(open_source(path).records())) for path in (folder, packed))
+    assert len(before) == 10
+    assert_same([*before], [*after])
 
 
 def test_a_damaged_capture_is_not_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

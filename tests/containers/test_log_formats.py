@@ -37,7 +37,7 @@ def assert_same(before: list[Record], after: list[Record]) -> None:
             assert isinstance(b, RgbdFrame)
             assert np.array_equal(a.color, b.color)
             assert np.array_equal(a.depth, b.depth)
-            assert np.array_equal(a.T_world_camera, b.T_world_camera)
+            assert b.T_world_camera == pytest.approx(a.T_world_camera, abs=1e-12)
             assert (a.camera, a.intrinsics) == (b.camera, b.intrinsics)
         else:
             assert isinstance(b, JointState)
