@@ -220,57 +220,6 @@ def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path:
     assert (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("recipe", "words"),
-    [
-        (LogRecipe(num_frames=0, has_tf=False), "holds no messages"),
-        (LogRecipe(has_depth=False), "no depth topic"),
-        (LogRecipe(has_info=False), "has no usable CameraInfo"),
-        (LogRecipe(has_tf=False), "no tf for frame"),
-        (LogRecipe(depth_encoding="32FC1", depth_m=1250.0), "implausible"),
-        (LogRecipe(depth_counts=1), "implausible"),
-        (LogRecipe(num_frames=0), "no image topics"),
-    ],
-)
-def test_a_log_that_cannot_be_reconstructed_is_one_line_and_leaves_nothing(
-    tmp_path: Path, recipe: LogRecipe, words: str
-) -> None:
-    log = make_log(tmp_path / "log.mcap", recipe)
-    assert_refused(here.splatctrl("reconstruct", log, *QUICK, "-o", tmp_path / "scene"), 4, "log.mcap", words, "; ")
-    assert [path.name for path in tmp_path.iterdir()] == ["log.mcap"]
-
-
-@pytest.mark.parametrize("command", ["reconstruct", "sdf-bake", "replay"])
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("<robot name='r'><link name='base'/></robot>", "expected movable joints, got none; an unexpanded xacro"),
-        ("<robot name='r'><link name='base'", "broken XML"),
-    ],
-)
-def test_a_robot_without_joints_is_refused(work: Work, tmp_path: Path, command: str, text: str, words: str) -> None:
-    (tmp_path / "bad.urdf").write_text(text)
-    arguments = [
-        tmp_path / "bad.urdf" if part == work.folder / "robot.urdf" else part
-        for part in work.arguments(command, tmp_path / "out")
-    ]
-    given = [] if command == "replay" else ["--urdf", tmp_path / "bad.urdf"]
-    assert_refused(here.splatctrl(*arguments, *given), 4, "bad.urdf", words)
-    assert [path.name for path in tmp_path.iterdir()] == ["bad.urdf"]
-
-
-@pytest.mark.parametrize("command", ["reconstruct", "replay"])
-def test_joints_that_are_not_in_the_log_are_named(work: Work, tmp_path: Path, command: str) -> None:
-    other = tmp_path / "other.urdf"
-    other.write_text(ARM.format("shoulder", "joint_b"))
-    arguments = [
-        other if part == work.folder / "robot.urdf" else part for part in work.arguments(command, tmp_path / "out")
-    ]
-    given = [] if command == "replay" else ["--urdf", other]
-    assert_refused(here.splatctrl(*arguments, *given), 4, "joints not in the log: shoulder", "; ", "joint_a")
-    assert [path.name for path in tmp_path.iterdir()] == ["other.urdf"]
-
-
 def test_an_interrupted_run_is_exit_130_and_leaves_only_what_is_partial(sample_data: Path, tmp_path: Path) -> None:
     # The handler is set by hand: a shell starts background jobs with SIGINT ignored, which a child inherits.
     program = """
@@ -355,13 +304,6 @@ def test_an_output_is_written_though_stdout_is_closed(log: Path, tmp_path: Path)
     done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 6 and "stdout: closed" in done.stderr
     assert (tmp_path / "out.mcap").read_bytes().startswith(b"\x89MCAP")
-
-
-@pytest.mark.parametrize("command", ["reconstruct", "ingest"])
-def test_an_output_that_cannot_be_written_is_refused_before_the_input_is_read(tmp_path: Path, command: str) -> None:
-    (tmp_path / "file").write_text("x")
-    done = here.splatctrl(command, tmp_path / "absent.mcap", "-o", tmp_path / "file" / "a" / "out")
-    assert_refused(done, 2, "file/a/out: cannot be written", "file is no folder; give another --out")
 
 
 def test_a_partial_that_is_an_input_is_not_replaced(log: Path, tmp_path: Path) -> None:

@@ -29,19 +29,6 @@ def test_ingest_writes_a_capture_that_reads_back(tmp_path: Path, capsys: pytest.
     assert not (tmp_path / "x.capture.partial").exists()
 
 
-def test_an_existing_capture_is_kept_without_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log, out = make_log(tmp_path / "log.mcap"), tmp_path / "x.capture"
-    out.mkdir()
-    (out / "precious").touch()
-    (out / "capture.json").touch()
-    code, _, error = run(capsys, "ingest", log, "-o", out)
-    assert code == 2
-    assert "already exists; give --force" in error
-    assert (out / "precious").exists()
-    assert run(capsys, "ingest", log, "-o", out, "--force")[0] == 0
-    assert not (out / "precious").exists()
-
-
 def test_spaces_around_names_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
     assert run(capsys, "ingest", log, "--cameras", "cam1, cam0", "-o", tmp_path / "x.capture")[0] == 0

@@ -32,9 +32,9 @@ REFUSED: dict[str, list[Refusal]] = {
     ],
     "simulate": [("--duration 0.1", 2, "argument --duration: expected 0.5 to 600 s, got '0.1'")],
     "ingest": [
+        ("none.mcap -o notes.txt/a/new", 2, "notes.txt is no folder; give another --out"),
         ("log.mcap --depth-scale -1", 2, "--depth-scale"),
         ("log.mcap --camera cam0", 2, "--camera cam0: expected NAME=COLOR,DEPTH"),
-        ("log.mcap --camera cam0=/a", 2, "--camera cam0=/a"),
         ("log.mcap --camera ../x=/a,/b", 2, "--camera ../x=/a,/b"),
         ("log.mcap --camera-pose cam0=1,2,3", 2, "--camera-pose cam0=1,2,3: expected NAME=X,Y,Z"),
         ("log.mcap --camera-pose cam0=0,0,0,0,0,0,0", 2, "with a unit quaternion, or NAME=identity"),
@@ -69,6 +69,15 @@ REFUSED: dict[str, list[Refusal]] = {
         ("", 2, "expected a SOURCE or --dtu ROOT, and not both"),
         ("log.mcap --device cuda", 2, "--device cuda: this build has no CUDA kernels; give --device cpu"),
         ("log.mcap --spheres x.yaml", 2, "give --urdf"),
+        ("log.mcap --urdf arm.urdf --spheres ball.yaml", 4, "joints not in the log: hinge; the log has: joint_a"),
+        (
+            "log.mcap --urdf still.urdf -o new",
+            4,
+            "still.urdf: expected movable joints, got none; an unexpanded xacro",
+        ),
+        ("log.mcap -o log.mcap --force", 2, "would replace the input"),
+        ("logs/log.mcap -o logs --force", 2, "would replace the input"),
+        ("none.mcap -o notes.txt/a/new", 2, "notes.txt is no folder; give another --out"),
         ("log.mcap --max-splats 0", 2, "--max-splats"),
         ("log.mcap --box 1,2,3", 2, "x0,y0,z0,x1,y1,z1"),
         ("log.mcap --box=0,0,0,1,1,-1", 2, "x0 < x1"),
@@ -81,10 +90,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("log.mcap --config odd.toml", 2, "did you mean control?"),
         ("log.mcap --config .", 4, "cannot be read: Is a directory; check the path"),
         ("log.mcap --set scene.max_splat=9", 2, "did you mean scene.max_splats?"),
-        ("log.mcap --set scene.max_splats=many", 2, "expected int, 1 to 10000000, got 'many'"),
-        ("log.mcap --set scene.max_splats=-5", 2, "scene.max_splats: expected 1 to 10000000, got -5"),
         ("log.mcap --seed=-1", 2, "argument --seed: expected a whole number, 0 to 2147483647"),
-        (f"log.mcap --seed {2**32}", 2, "2147483647, got '4294967296'"),
     ],
     GAUSSIANS: [
         ("--urdf robot.urdf", 2, "--urdf: does not apply"),
@@ -92,7 +98,6 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--points cloud.ply", 2, "--points: does not apply"),
         ("--box=50,50,50,51,51,51 -o new", 4, "no pixel of any view"),
         ("--require relocated>=1", 2, "unknown metric"),
-        ("--set gaussians.max_degree=4", 2, "gaussians.max_degree"),
     ],
     "reconstruct --method 3dgs": [("log.mcap", 2, "has a clock")],
     "sdf-bake": [
@@ -102,10 +107,9 @@ REFUSED: dict[str, list[Refusal]] = {
         ("a -o -x", 2, "expected one argument; write --out=VALUE"),
     ],
     BAKE: [
+        ("--urdf still.urdf", 4, "still.urdf: expected movable joints, got none"),
         ("--box=1,2", 2, "--box 1,2: expected finite x0,y0,z0,x1,y1,z1"),
-        ("--box=a,b,c,d,e,f", 2, "--box a,b,c,d,e,f: expected finite"),
         ("--box=0,0,0,1,1,0", 2, "--box 0,0,0,1,1,0: expected finite x0,y0,z0,x1,y1,z1 [m] with x0 < x1"),
-        ("--box=0,0,0,1,1,nan", 2, "--box 0,0,0,1,1,nan: expected finite"),
         ("--box=1e300,0,0,2e300,1,1", 2, "z0 < z1, within 1e6"),
         ("--require 'num_cell>1'", 2, "unknown metric; did you mean num_cells?"),
         ("--require 'seen.hard.0_2cm.rmse<1'", 2, "unknown metric; known here: num_splats"),
@@ -114,23 +118,18 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--channels sdf,colour", 2, "--channels sdf,colour: expected some of: sdf, gradient, bound"),
         ("--channels sdf --formats moveit", 2, "expected one of the channels bound, hard, got sdf"),
         ("--distance tsdf", 2, "invalid choice: 'tsdf' (choose from"),
-        ("--weights mean", 2, "invalid choice: 'mean' (choose from"),
-        ("--unknown wall", 2, "invalid choice: 'wall' (choose from"),
         ("--channels sdf --reference-mesh a.ply", 2, "--reference-mesh: needs the exact distance"),
         ("--previous-scene scene", 2, "belongs to --update"),
         ("--update nowhere", 4, "--update nowhere: no such folder"),
         ("--include cat", 2, "--include cat: expected some of: robot, human"),
         ("--voxel 0.00001", 2, "GiB of memory"),
         ("--voxel nan", 2, "argument --voxel: expected 1e-06 to 10 m, got 'nan'"),
-        ("--voxel 1e20", 2, "argument --voxel: expected 1e-06 to 10 m, got '1e20'"),
         ("--voxel 0.3", 2, "field.voxel: expected at most 0.023 m, which loses up to field.max_loss = 0.04"),
-        ("--voxel 0.0231", 2, "got 0.0231 m, which loses up to 0.04001 m; give --voxel 0.023 or less"),
         ("--voxel 0.06 --set field.max_loss=0.1", 2, "field.voxel: expected at most 0.0577 m"),
         ("--length-scale -1", 2, "argument --length-scale: expected 1e-10 to 1000 m, got '-1'"),
         ("--at inf", 2, "argument --at: expected -100000000 to 100000000 s, got 'inf'"),
         ("--at 3", 2, "is one splat set"),
         ("--truth truth.json", 2, "expected both or neither"),
-        ("--set field.distance=tsdf", 2, "field.distance: expected safe, safe_gpdf, hard, se or gpdf, got 'tsdf'"),
     ],
     "score": [
         ("a --reference b --thread 3", 2, "--thread 3; did you mean --threads?"),
@@ -150,7 +149,6 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--require sharpness>=1", 2, ", chamfer, accuracy_beyond, "),
         ("--require psnr_sen>=1", 2, "unknown metric; did you mean psnr_seen?"),
         ("--require psnr_seen", 2, "--require psnr_seen: expected METRIC>=NUMBER"),
-        ("--require psnr_seen>=nan", 2, "--require psnr_seen>=nan: expected METRIC>=NUMBER"),
         ("--scan scan1", 2, "--scan scan1: only with --dtu"),
         ("--dtu root", 2, "not allowed with argument"),
         ("--images all", 2, "--images all: expected a folder for them; give -o"),
@@ -168,6 +166,9 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--cloud .", 4, "expected the points of scan1, scan1.ply or stl001_total.ply, got neither"),
         ("--lpips x.npz", 4, "x.npz: cannot be read: No such file"),
         ("--set scene.nothing=1", 2, "scene.nothing"),
+    ],
+    "replay states.mcap --scene scene": [
+        ("--urdf still.urdf", 4, "still.urdf: expected movable joints, got none"),
     ],
     f"replay states.mcap {ROBOT}": [
         ("", 2, "one of the arguments --field --scene --lockstep is required"),
@@ -187,8 +188,6 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--follow", 2, "--follow: expected --mode open-loop or closed-loop, got audit"),
         ("--base nan,0,0,0,0,0,1", 2, "finite"),
         ("--set control.perod=1", 2, "did you mean control.period"),
-        ("--set control.margin=-0.05", 2, "control.margin: expected 0 to 1 m, got -0.05"),
-        ("--set control.max_detours=-1", 2, "control.max_detours: expected 0 to 1000, got -1"),
         ("--lock joint7", 2, "--lock joint7: expected JOINT=VALUE"),
         ("--lock nose=0", 4, "no joint 'nose' to lock"),
         ("--truth nowhere.json", 4, "nowhere.json"),
@@ -200,13 +199,10 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--worst-frames x", 2, "argument --worst-frames"),
         ("--max-map-age nan", 2, "argument --max-map-age: expected 0.001 to 100000000 s, got 'nan'"),
         ("--max-unknown nan", 2, "argument --max-unknown: expected 0 to 1, got 'nan'"),
-        ("--max-unknown inf", 2, "argument --max-unknown: expected 0 to 1, got 'inf'"),
         ("--golden nowhere.csv", 2, "--golden: an audit has no commands"),
         ("--twist-topic /cmd", 2, "an audit does not ask the controller"),
         ("--twist-frame link0", 2, "expected --twist-topic"),
         ("--evidence 1", 2, "--evidence 1: expected a camera or every how many frame sets, at least 2"),
-        ("--evidence 0", 2, "at least 2"),
-        ("--evidence=-3", 2, "at least 2"),
         ("--evidence cam0", 2, "the camera trained"),
         ("--evidence cam9 --set verdict.evidence_reach=nan", 2, "expected 0.001 to 10 m"),
         ("--baseline standstill", 2, "--baseline: expected --mode closed-loop"),
@@ -221,8 +217,8 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--goal 9,0,0,0,0,0,1", 4, "goal: expected within"),
         ("--goal=nan,0,0,0,0,0,1", 2, "expected finite numbers joined by commas"),
         ("--goal-joints 0,0", 4, "--goal-joints: expected 7 joints"),
+        ("--goal-joints=0,0,0,-2,0,2,9", 4, "goal: joint joint7: expected within ["),
         ("--start-time 60", 4, "give an earlier --start-time"),
-        ("--set control.period=0", 2, "control.period"),
         ("--frame nose", 4, "no frame 'nose'"),
         ("--golden nowhere.csv", 4, "nowhere.csv: cannot be read"),
         ("--re-anchor 0", 2, "argument --re-anchor: expected 0.001 to 100000000 s, got '0'"),
@@ -263,6 +259,8 @@ REFUSED: dict[str, list[Refusal]] = {
 }
 TEXTS = {
     "notes.txt": "notes",
+    "still.urdf": "<robot name='r'><link name='base'/></robot>",
+    "ball.yaml": "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.05}]}",
     "taken.ply": "taken",
     "bad.toml": "[scene\n",
     "odd.toml": "[contrl]\nmargin = 0.1\n",
@@ -283,8 +281,10 @@ def world(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
         (folder / Path(name).name).symlink_to(sample_data / name)
     for name, text in TEXTS.items():
         (folder / name).write_text(text)
-    (folder / "empty").mkdir()
+    for name in ("empty", "logs"):
+        (folder / name).mkdir()
     make_log(folder / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
+    make_log(folder / "logs" / "log.mcap", LogRecipe(num_frames=1))
     joints = tuple(f"joint{i}" for i in range(1, 8))
     write_mcap(folder / "states.mcap", states_of(np.tile(START, (11, 1)), joints))
     write_scene(folder / "scene", (START_NS, splats_of(BALL)))

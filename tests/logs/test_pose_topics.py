@@ -138,6 +138,15 @@ def test_topics_that_cannot_place_the_camera_are_refused_with_those_that_may(tmp
         open_source(path, SourceOptions(camera_pose_topics={"cam9": PoseTopic(topic="/pose")}))
 
 
+@pytest.mark.parametrize("text", ["cam0=/pose@", "=/pose", "cam0=/pose@@"])
+def test_a_pose_topic_on_the_command_line_has_a_name_and_a_topic(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    path = with_poses(tmp_path, ("/pose", POSE, "map", ""))
+    assert main(["ingest", str(path), "-o", str(tmp_path / "x.capture"), "--camera-pose", text]) in {2, 4}
+    assert "Traceback" not in capsys.readouterr().err
+
+
 def test_the_command_line_takes_a_pose_topic(tmp_path: Path) -> None:
     path = with_poses(tmp_path, ("/pose", POSE, "map", ""))
     out = tmp_path / "x.capture"

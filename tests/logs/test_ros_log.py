@@ -144,6 +144,13 @@ def test_rectified_images_take_the_projection_and_keep_their_pixels(tmp_path: Pa
     assert np.array_equal(frame.color, color_pixels(0))
 
 
+def test_a_fixed_pose_stands_in_for_tf(tmp_path: Path) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(has_tf=False))
+    frames = frames_of(log, SourceOptions(camera_poses={"cam0": (1, 2, 3, 0, 0, 0, 1)}))
+    assert len(frames) == 5
+    assert frames[4].T_world_camera[:3, 3] == pytest.approx([1, 2, 3])
+
+
 def test_one_camera_of_several_can_be_chosen(tmp_path: Path) -> None:
     log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1")))
     assert {f.camera for f in frames_of(log, SourceOptions(cameras=("cam1",)))} == {"cam1"}

@@ -331,6 +331,10 @@ def test_states_that_name_no_joints_are_none(tmp_path: Path) -> None:
     )
 
 
+def test_a_log_without_a_message_is_refused(tmp_path: Path) -> None:
+    assert "the log holds no messages" in refusal(write_mcap(tmp_path / "x.mcap", []))
+
+
 def test_a_joint_topic_that_is_none_lists_those_there(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "x.mcap", states_of(ramp(4), AB, topic="/js"))
     assert "use one of: /js" in refusal(path, joint_topic="/other")

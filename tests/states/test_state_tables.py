@@ -12,7 +12,6 @@ from splatctrl_cli.records import Float64, JointState, RecordSource
 from splatctrl_cli.states.state_source import open_states
 
 ARM = tuple(f"panda_joint{i}" for i in range(1, 8))
-SEVEN = range(7)
 
 
 def opened(path: Path, joints: tuple[str, ...] = ("a", "b")) -> RecordSource:
@@ -222,5 +221,9 @@ def test_an_npz_without_the_array_lists_those_there(tmp_path: Path) -> None:
     assert "'angles': expected an array of numbers, got none; arrays there: t, q" in refusal(path)
     np.savez(tmp_path / "run.npz", t=np.array([0.0, np.nan, 1.0]), q=np.zeros((3, 2)))
     assert "t: expected times, got NaN" in refusal(described(tmp_path, file="run.npz", position=["q"]))
+    np.savez(tmp_path / "run.npz", t=np.zeros(0), q=np.zeros((0, 2)))
+    assert "q: expected rows, got none; record it again" in refusal(
+        described(tmp_path, file="run.npz", position=["q"])
+    )
     (tmp_path / "run.npz").write_bytes(b"PK no")
     assert "cannot be read as NPZ" in refusal(path)
