@@ -53,8 +53,3 @@ def test_any_bytes_are_read_or_end_in_a_named_error(readers: dict[str, Reader], 
             reader.read(data)
 
     check()
-
-
-def test_an_error_that_is_named_is_raised(readers: dict[str, Reader]) -> None:
-    with pytest.raises(readers["rvl"].errors, match="0 bytes end after 0 of 48 pixels"):
-        readers["rvl"].read(b"")

@@ -1,12 +1,8 @@
 """The study of a shared workspace: its rows read back, its differences are paired, its baseline follows the path."""
 
-import csv
-from dataclasses import asdict, fields
-from pathlib import Path
-
 import numpy as np
 
-from benchmarks.workspace import METHODS, draw, read_rows, report
+from benchmarks.workspace import METHODS, report
 from benchmarks.workspace_trial import STOP_BOX, Drive, Row, TruthField, held
 from splatctrl_cli.config import Config
 from splatctrl_cli.simulate import shared_workspace as shared
@@ -26,16 +22,6 @@ def rows() -> list[Row]:
         for index, method in enumerate(("alone", *METHODS)):
             found.append(row(place, seed, method, 14.0 - index, 0.2 + 0.01 * index * (-1) ** seed))
     return found
-
-
-def test_rows_read_back_and_make_the_figure(tmp_path: Path) -> None:
-    with (tmp_path / "rows.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, [field.name for field in fields(Row)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows())
-    assert read_rows(tmp_path / "rows.csv") == rows()
-    draw(rows(), tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
 def test_differences_are_taken_within_a_trial() -> None:

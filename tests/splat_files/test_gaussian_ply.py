@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import GaussianSet, SplatSet
@@ -137,16 +136,6 @@ def test_a_compressed_ply_is_refused_by_name(tmp_path: Path) -> None:
     for read in (read_ply, read_gaussian_ply):
         with pytest.raises(InputError, match=r"compressed PLY of SuperSplat .*; export it there as an uncompr"):
             read(tmp_path / "a.ply")
-
-
-def test_other_readers_find_the_same_values(tmp_path: Path) -> None:
-    gaussians = gaussian_set(30)
-    write_gaussian_ply(tmp_path / "a.ply", gaussians, {})
-    rows = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
-    assert np.array_equal(np.column_stack([rows[name] for name in "xyz"]), gaussians.centers)
-    assert np.array_equal(np.column_stack([rows[f"rot_{i}"] for i in range(4)]), gaussians.quats_wxyz)
-    rest = np.column_stack([rows[f"f_rest_{i}"] for i in range(45)]).reshape(30, 3, 15)
-    assert np.array_equal(np.moveaxis(rest, 1, 2), gaussians.harmonics[:, 1:])
 
 
 def test_open3d_finds_the_same_values(tmp_path: Path) -> None:

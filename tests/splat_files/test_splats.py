@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Label, SplatSet
@@ -217,13 +216,3 @@ def test_ascii_with_a_line_missing_is_refused(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("element vertex 3", "element vertex 4"))
     with pytest.raises(InputError, match="expected 4 lines of data, got 3"):
         read_ply(path)
-
-
-def test_another_reader_finds_the_same_points_and_properties(tmp_path: Path) -> None:
-    splats = splat_set(30)
-    write_ply(tmp_path / "a.ply", splats, {})
-    cloud = trimesh.load(tmp_path / "a.ply")
-    assert np.array_equal(cloud.vertices, splats.centers)
-    vertices = cloud.metadata["_ply_raw"]["vertex"]["data"]
-    assert np.array_equal(vertices["label"], splats.labels)
-    assert np.array_equal(vertices["density"], splats.density)
