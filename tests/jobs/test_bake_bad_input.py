@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
-from splatctrl_cli.field.baker import CHANNELS
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bake import BakeResult
 from splatctrl_cli.records import Label, SplatSet
@@ -38,23 +37,6 @@ def test_an_empty_set_is_refused(tmp_path: Path) -> None:
         bake(spheres().select(np.zeros(5, bool)), tmp_path)
     with pytest.raises(NotEvaluableError, match="none of 5 is labelled object, human; give a scene that has some"):
         bake(replace(spheres(), labels=np.full(5, Label.ROBOT, np.uint8)), tmp_path)
-    assert left_nothing(tmp_path)
-
-
-def test_a_centre_that_is_no_number_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "splats.ply"
-    write_ply(path, spheres(), {})
-    content = path.read_bytes()
-    place = content.index(b"end_header\n") + len(b"end_header\n")
-    path.write_bytes(content[:place] + np.float32(np.nan).tobytes() + content[place + 4 :])
-    with pytest.raises(InputError, match=r"splats\.ply"):
-        baked(path, tmp_path / "field", voxel=0.05)
-    assert left_nothing(tmp_path)
-
-
-def test_a_channel_that_there_is_not_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=f"channels: expected sdf and some of {', '.join(CHANNELS)}, got .*colour"):
-        bake(spheres(), tmp_path, box=BOX, channels=("bound", "colour"))
     assert left_nothing(tmp_path)
 
 

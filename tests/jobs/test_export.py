@@ -135,8 +135,8 @@ def gaussians(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_isotropic_splats_go_to_every_format_and_from_there_back_to_ply(scene: Path, suffix: str) -> None:
+@pytest.mark.parametrize("suffix", [".spz", ".glb"])
+def test_isotropic_splats_go_to_another_format_and_from_there_back_to_ply(scene: Path, suffix: str) -> None:
     there = export(scene, f"there{suffix}")
     assert there.num_outside == 0
     assert not there.differences.beyond(there.allowed)

@@ -237,12 +237,6 @@ def test_a_run_goes_on_only_as_what_it_was(
     assert before == {p: p.read_bytes() for p in partial.rglob("*") if p.is_file()}
 
 
-def test_a_partial_scene_never_reads_as_whole(interrupted: list[str], tmp_path: Path) -> None:
-    assert interrupted
-    with pytest.raises(Exception, match="an interrupted run"):
-        open_scene(tmp_path / "scene.partial")
-
-
 def test_without_resume_a_run_starts_over_and_says_so(
     interrupted: list[str],
     whole: dict[str, dict[str, Any]],

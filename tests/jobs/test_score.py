@@ -107,20 +107,6 @@ def test_the_output_folder_holds_scores_rows_pictures_and_the_run(scored: Path) 
     assert set(run_json["inputs"]) == {"fake", "scene/splats.ply"}
 
 
-def test_an_output_that_exists_is_refused_before_anything_is_rendered(
-    scored: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(FakeScene, "splats_at", lambda scene, stamp_ns: pytest.fail("rendered"))
-    (scored / "score").mkdir()
-    with pytest.raises(UsageError, match="score: already exists; give --force"):
-        run(scored, out=scored / "score")
-
-
-def test_pictures_of_every_view_need_a_folder(scored: Path) -> None:
-    with pytest.raises(UsageError, match="--images all: expected a folder for them; give -o"):
-        run(scored, images="all")
-
-
 def test_a_view_whose_psnr_is_infinite_lets_no_gate_pass(scored: Path) -> None:
     result = run(scored, require=("psnr_all>=1",))
     assert result.report["views"][2]["psnr_all"] is None, "a black view of nothing, rendered black"

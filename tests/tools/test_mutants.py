@@ -32,16 +32,7 @@ def planted(root: Path, **changed: object) -> Mutant:
     return Mutant(room="data", name="a-bug", **entry)  # type: ignore[arg-type]
 
 
-def test_a_file_is_found_by_its_name_and_its_text(tmp_path: Path) -> None:
-    assert planted(tmp_path).place(tmp_path) == tmp_path / "splatctrl_cli" / "b" / "sums.py"
-
-
 @pytest.mark.parametrize("old", ["x + y", "x - y"])
 def test_text_that_does_not_stand_there_once_is_refused(tmp_path: Path, old: str) -> None:
     with pytest.raises(ValueError, match=r"a-bug: expected the text once in sums.py, got [02] times"):
         planted(tmp_path, old=old).place(tmp_path)
-
-
-def test_tests_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"a-bug: no test file test_sums.py"):
-        planted(tmp_path).test_files(tmp_path)

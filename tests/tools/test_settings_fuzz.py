@@ -48,31 +48,6 @@ def test_a_command_refuses_its_settings_before_it_reads_anything(
         assert done.stderr.count("\n") == 1 and done.stdout == ""
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
-        ("control.margin=-0.05", "control.margin: expected 0 to 1 m, got -0.05"),
-        ("control.max_linear_speed=-1", "control.max_linear_speed: expected 0.0001 to 20 m/s, got -1.0"),
-        ("control.goal_position=100", "control.goal_position: expected 1e-06 to 0.1 m, got 100.0"),
-        ("control.pose_gain=-1", "control.pose_gain: expected 0 to 1000 1/s, got -1.0"),
-        ("control.smoothness_weight=-1", "control.smoothness_weight: expected 0 to 1000, got -1.0"),
-        ("control.posture_gain=-1", "control.posture_gain: expected 0 to 1000 1/s, got -1.0"),
-        ("control.self_margin=-1", "control.self_margin: expected 0 to 0.5 m, got -1.0"),
-        ("control.period=1e-320", "control.period: expected 0.0001 to 0.1 s, got 1e-320"),
-        ("occupancy.rule=bogus", "occupancy.rule: expected observed or literal, got 'bogus'"),
-        ("occupancy.voxel=5", "occupancy.voxel: expected 0.001 to 0.5 m, got 5.0"),
-        ("scene.radius_per_edge=1e308", "scene.radius_per_edge: expected 0.05 to 5, got 1e+308"),
-    ],
-)
-def test_what_was_taken_without_a_word_is_one_line_and_leaves_nothing(
-    tmp_path: Path, setting: str, said: str
-) -> None:
-    done = here.splatctrl(*ABSENT["control"], "-o", tmp_path / "out", "--set", setting)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"splatctrl: {said}; see docs/config.md\n"
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("goal", ["--goal=nan,0,0,0,0,0,1", "--goal=0.4,0,inf,0,0,0,1", "--goal=1e300,0,0,0,0,0,1"])
 def test_a_goal_that_is_not_finite_is_one_line_and_leaves_nothing(tmp_path: Path, goal: str) -> None:
     done = here.splatctrl(*ABSENT["control"], "-o", tmp_path / "out", goal)
