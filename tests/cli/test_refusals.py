@@ -216,6 +216,7 @@ REFUSED: dict[str, list[Refusal]] = {
     DRIVE: [
         ("--goal 9,0,0,0,0,0,1", 4, "goal: expected within"),
         ("--goal=nan,0,0,0,0,0,1", 2, "expected finite numbers joined by commas"),
+        ("--goal=1e300,0,0,0,0,0,1", 2, "expected finite numbers joined by commas, up to 1e6, got"),
         ("--goal-joints 0,0", 4, "--goal-joints: expected 7 joints"),
         ("--goal-joints=0,0,0,-2,0,2,9", 4, "goal: joint joint7: expected within ["),
         ("--start-time 60", 4, "give an earlier --start-time"),

@@ -204,17 +204,6 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, name: str, conten
     assert caught.value.remedy
 
 
-def test_the_realsense_bag_says_why_it_cannot_be_reconstructed(real_data: Path) -> None:
-    summary = describe(real_data / "realsense_bag/single_depth_color_640x480.bag")
-    assert summary.facts["messages"] == 135
-    text = "\n".join(summary.missing)
-    assert "not registered" not in text  # its extrinsics join the two cameras
-    assert "never closer than 101.6 ms; give --pairing-tolerance 0.103" in text
-    assert "no tf for frame '0'" in text
-    topics = {str(row[0]): row for row in summary.grids[0].rows}
-    assert topics["/device_0/sensor_1/Color_0/image/data"][5] == "640x480 rgb8 in frame '0'"
-
-
 def test_the_sensor_message_logs_are_described_and_other_encodings_listed(real_data: Path) -> None:
     folder = real_data / "rosbag2_mcap_sensor_msgs"
     ros = describe(folder / "rosbag2_2025_09_10-13_03_56_0.mcap")

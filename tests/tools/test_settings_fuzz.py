@@ -48,14 +48,6 @@ def test_a_command_refuses_its_settings_before_it_reads_anything(
         assert done.stderr.count("\n") == 1 and done.stdout == ""
 
 
-@pytest.mark.parametrize("goal", ["--goal=nan,0,0,0,0,0,1", "--goal=0.4,0,inf,0,0,0,1", "--goal=1e300,0,0,0,0,0,1"])
-def test_a_goal_that_is_not_finite_is_one_line_and_leaves_nothing(tmp_path: Path, goal: str) -> None:
-    done = here.splatctrl(*ABSENT["control"], "-o", tmp_path / "out", goal)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert "argument --goal: expected finite numbers joined by commas, up to 1e6, got" in done.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("code", "said", "left", "fault"),
     [
