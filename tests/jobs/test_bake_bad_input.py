@@ -54,15 +54,6 @@ def test_odd_splats_are_baked(tmp_path: Path, name: str) -> None:
     assert (channels["sdf"] <= channels["hard"]).all()
 
 
-@pytest.mark.parametrize("length", [1e-10, 1e-4, 1.0, 1e2])
-@pytest.mark.parametrize("distance", ["safe", "safe_gpdf"])
-def test_any_length_scale_is_baked(tmp_path: Path, length: float, distance: str) -> None:
-    bake(spheres(50), tmp_path, box=BOX, channels=("hard",), field={"length_scale": length, "distance": distance})
-    channels = read_npz(tmp_path / "field" / "field.npz").channels
-    assert np.isfinite(channels["sdf"]).all()
-    assert (channels["sdf"] <= channels["hard"]).all()
-
-
 def test_a_box_without_a_splat_is_baked_with_a_note(tmp_path: Path) -> None:
     result = bake(spheres(), tmp_path, box=(5, 5, 5, 5.2, 5.2, 5.2))
     assert any("the box holds no splat: the nearest is" in reason.sentence for reason in result.verdict.said)

@@ -34,9 +34,10 @@ def test_a_moving_frame_is_interpolated_and_a_static_one_holds_always() -> None:
 def test_siblings_are_joined_through_their_common_ancestor() -> None:
     tree = moving_tree()
     tree.add("base", "lamp", 0, np.array([0.2, 0, 0]), IDENTITY, static=True)
-    T = tree.lookup("camera", "lamp", 777_000_000)
+    tree.add("base", "arm", 0, np.array([0, 0.3, 0.1]), QUARTER_TURN, static=True)
+    T = tree.lookup("arm", "lamp", 777_000_000)
     assert T is not None
-    assert pytest.approx(transform_from([0.2, 0, -0.5], IDENTITY), abs=1e-12) == T
+    assert pytest.approx(transform_from([-0.3, -0.2, -0.1], -QUARTER_TURN * [1, 1, 1, -1]), abs=1e-12) == T
 
 
 def test_outside_the_recorded_time_nothing_is_known_beyond_the_tolerance() -> None:
