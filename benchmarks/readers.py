@@ -31,8 +31,7 @@ from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.grid_files.nrrd import read_nrrd_head
 from splatctrl_cli.grid_files.vti import read_vti
 from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError
-from splatctrl_cli.logs.encodings import decode_rvl
-from splatctrl_cli.logs.messages import read_image
+from splatctrl_cli.logs.messages import decode_rvl, read_image
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.sphere_files import read_spheres
 from splatctrl_cli.robot.urdf import read_urdf

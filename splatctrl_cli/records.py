@@ -3,11 +3,13 @@
 Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixels.
 """
 
-from collections.abc import Iterator
+import heapq
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, Protocol, Self
+from operator import attrgetter
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +114,21 @@ class JointState:
 Record = RgbdFrame | JointState
 
 
+class Stamped(Protocol):
+    """What happened at a time."""
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+
+_Item = TypeVar("_Item", bound=Stamped)
+
+
+def by_stamp(*streams: Iterable[_Item]) -> Iterator[_Item]:
+    """The items of streams that are each by stamp, by stamp; of one stamp those of an earlier stream come first."""
+    return heapq.merge(*streams, key=attrgetter("stamp_ns"))
+
+
 @dataclass(kw_only=True)
 class LossReport:
     """What of an input did not become records: `damaged` sets exit code 3, the rest is only counted.
@@ -138,6 +155,12 @@ class LossReport:
     conflicting_states: int = 0
     state_gaps: int = 0
     notes: list[str] = field(default_factory=list)
+
+    def plus(self, other: "LossReport", notes: list[str], sign: int = 1) -> "LossReport":
+        """The counts of both together (-1: without those of the other), with these notes."""
+        names = [column.name for column in fields(self) if column.name != "notes"]
+        counts = {name: getattr(self, name) + sign * getattr(other, name) for name in names}
+        return LossReport(**counts, notes=notes)
 
 
 class RecordSource(Protocol):

@@ -9,23 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.captures.capture_header import AGAIN, read_capture_header
+from splatctrl_cli.captures.capture_header import read_capture_header
 from splatctrl_cli.captures.capture_index import COLUMNS, FileSums, FrameRows
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
+from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.npz_columns import NpzFile
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.logs.joint_topics import (
+    AGAIN,
     joints_again,
     read_topics,
     with_joints,
     without_joints,
 )
-from splatctrl_cli.logs.messages import decode_file, metres
+from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask, merged
+from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
+from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask
 from splatctrl_cli.records import (
     Bool,
     Float32,
@@ -34,8 +36,8 @@ from splatctrl_cli.records import (
     JointState,
     LossReport,
     Record,
-    RgbdFrame,
     UInt8,
+    by_stamp,
 )
 
 NEEDED = ("stamp_ns", "position", "velocity")
@@ -73,13 +75,13 @@ class CaptureSource:
         self._loss = LossReport(**header["loss"])
         described = header.get("joint_topics")
         self.joint_topics = None if described is None else read_topics(path, described, self._checked)
-        self._joints: Sequence[JointState] = []
+        self.states = NO_STATES
         if joints is None or self.joint_topics is None:
             options.refuse(("joint_topic",), "the states of one topic in a capture", path)
-            self._joints = _read_joints(path) if self.joint_names else []
+            self.states = _read_joints(path) if self.joint_names else NO_STATES
         else:
             kept = self.joint_topics
-            self.joint_names, self._joints, loss = joints_again(kept, options, joints)
+            self.joint_names, self.states, loss = joints_again(kept, options, joints)
             others = without_joints(self._loss, kept.loss, kept.first_note)
             self._loss = with_joints(others, loss, kept.first_note)
 
@@ -97,7 +99,7 @@ class CaptureSource:
     def stored(self) -> Iterator[StoredFrame | JointState]:
         """Joint states and stored frames by stamp."""
         self._damaged, self._damaged_before = [], max(self._damaged, self._damaged_before, key=len)
-        return merged(self._joints, self._stored_frames())
+        return by_stamp(self.states, self._stored_frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every row of frames.csv."""
@@ -118,10 +120,6 @@ class CaptureSource:
     def row(self, number: int) -> Mapping[str, str]:
         """What frames.csv says of a frame, by its number."""
         return self._rows[number]
-
-    def states(self) -> Sequence[JointState]:
-        """The joint states, by stamp."""
-        return self._joints
 
     def _stored_frames(self) -> Iterator[StoredFrame]:
         for row in self._rows:
@@ -146,17 +144,15 @@ class CaptureSource:
             self._damaged.append(f"{row['color']}, {row['depth']}: expected images of {size} as capture.json says")
             return None
         intrinsics = Intrinsics(**{f.name: camera[f.name] for f in dataclasses.fields(Intrinsics)})
-        return StoredFrame.of(
-            RgbdFrame(
-                stamp_ns=int(row["stamp_ns"]),
-                camera=row["camera"],
-                color=color,
-                depth=depth,
-                intrinsics=intrinsics,
-                T_world_camera=_pose(row),
-                human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
-                valid=valid,
-            ),
+        return StoredFrame(
+            stamp_ns=int(row["stamp_ns"]),
+            camera=row["camera"],
+            intrinsics=intrinsics,
+            T_world_camera=_pose(row),
+            read_color=lambda: color,
+            read_depth=lambda: depth,
+            human=None if human_bytes is None else self._human(row["human"], human_bytes, intrinsics),
+            valid=valid,
             color_file=color_bytes,
             depth_unit=camera["depth_scale"] if row["depth"].endswith(".png") else None,
             origin=row["source"],

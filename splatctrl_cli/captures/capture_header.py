@@ -11,10 +11,10 @@ from splatctrl_cli.captures.capture_index import FileSums
 from splatctrl_cli.captures.capture_writer import FORMAT, VERSION
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.logs.joint_topics import AGAIN
 from splatctrl_cli.records import LossReport
 
 INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
-AGAIN = "run `splatctrl ingest` again"
 _MOST = 1 << 16  # pixels of a side
 
 

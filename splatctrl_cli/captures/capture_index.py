@@ -13,6 +13,7 @@ import numpy as np
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import scratch_folder
+from splatctrl_cli.logs.joint_topics import AGAIN
 
 SUMS = "SHA256SUMS"
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
@@ -20,7 +21,6 @@ MASKS = ("human", "valid")  # further columns, where the recording has such mask
 _FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
 _MOST_ROW = 1 << 16  # bytes of a row
 IN_MEMORY = 1 << 16  # [bytes] of the lines of one folder
-_AGAIN = "run `splatctrl ingest` again"
 
 
 class FrameRows(Sequence[Mapping[str, str]]):
@@ -36,14 +36,14 @@ class FrameRows(Sequence[Mapping[str, str]]):
                 _, names = next(rows, (0, []))
                 self._names = tuple(names)
                 if self._names[: len(COLUMNS)] != COLUMNS or self._names[len(COLUMNS) :] not in _FURTHER:
-                    raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy=_AGAIN)
+                    raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
                 for offset, values in rows:
                     row = self._row(values)
                     _check(row)
                     if row["camera"] in cameras:
                         self._offsets.append(offset)
         except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
-            raise InputError(f"{file}: cannot be read: {error}", remedy=_AGAIN) from None
+            raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
 
     def __len__(self) -> int:
         return len(self._offsets)
@@ -99,7 +99,7 @@ class FileSums:
         """Raises InputError where there is none."""
         file = folder / SUMS
         if not file.is_file():
-            raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {_AGAIN}")
+            raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
         keys, sums = array("Q"), bytearray()
         with file.open("rb") as stream:
             while line := stream.readline(_MOST_ROW):

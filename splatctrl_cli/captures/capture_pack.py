@@ -17,7 +17,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from splatctrl_cli.captures.capture import CaptureSource
-from splatctrl_cli.captures.capture_header import AGAIN
 from splatctrl_cli.captures.capture_index import SUMS
 from splatctrl_cli.captures.capture_writer import VERSION
 from splatctrl_cli.containers.log_formats import open_raw_log
@@ -25,7 +24,9 @@ from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_records import ATTACHMENT, BadRecordError, Metadata, parse_record
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.image_file import PNG
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.logs.joint_topics import AGAIN
 from splatctrl_cli.logs.mcap_writer import MILLIMETRES, McapLog, mcap_log
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame
@@ -87,7 +88,7 @@ def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | Non
     source = CaptureSource(capture, SourceOptions())
     with mcap_log(out) as log:
         log.describe(MARK, {"version": str(VERSION), "name": capture.name})
-        states = iter(source.states())
+        states = iter(source.states)
         state = next(states, None)
         for number in range(len(source)):
             row, stored = source.row(number), source.stored_at(number)
@@ -161,7 +162,7 @@ def _add_frame(
     for kind in ("color", "depth"):
         log.add_camera_info(f"/{camera}/{kind}/camera_info", stamp, frame_id, frame.intrinsics)
     color = files["color"].read_bytes()
-    form = "png" if color.startswith(b"\x89PNG") else "jpeg"
+    form = "png" if color.startswith(PNG) else "jpeg"
     log.add_image_file(f"/{camera}/color/image/compressed", stamp, frame_id, form, color)
     if unit == 1.0 / MILLIMETRES:
         pixels: Any = np.rint(frame.depth.astype(np.float64) * MILLIMETRES).astype("<u2")

@@ -23,7 +23,7 @@ from splatctrl_cli.geometry import quat_from_rotation
 from splatctrl_cli.logs.joint_topics import FOLDER, JointTopics, write_topics
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
-from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, is_png
 from splatctrl_cli.records import Float32, JointState, LossReport
 
 FORMAT, VERSION = "splatctrl-capture", 1
@@ -167,8 +167,7 @@ def _write_frame(folder: Path, stored: StoredFrame, row: dict[str, str], camera:
     color = stored.color_file
     if color is None:
         color = encoded(cv2.cvtColor(stored.color, cv2.COLOR_RGB2BGR))
-    is_png = color.startswith(b"\x89PNG")
-    color_name = f"color/{stored.camera}/{stem}.{'png' if is_png else 'jpg'}"
+    color_name = f"color/{stored.camera}/{stem}.{'png' if is_png(color) else 'jpg'}"
     kind, depth = _depth_file(stored, unit)
     depth_name = f"depth/{stored.camera}/{stem}.{kind}"
     files = {color_name: color, depth_name: depth}

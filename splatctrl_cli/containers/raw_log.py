@@ -28,7 +28,7 @@ class Topic:
 
 @dataclass(frozen=True, kw_only=True)
 class RawMessage:
-    """One message: its topic, the time it was logged [ns] and its bytes.
+    """One message: its topic, the time it was logged [ns] and its bytes, the same for every container.
 
     file and offset say where it was read: the byte at which its record, or that of its chunk, begins; -1 where the
     container has no such place.

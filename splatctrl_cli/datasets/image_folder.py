@@ -2,7 +2,7 @@
 
 import heapq
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,14 @@ from splatctrl_cli.datasets.folder_views import HOLDOUT, View, find_files, views
 from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
+from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.logs.messages import decode_file, metres, num_invalid
+from splatctrl_cli.logs.messages import measured, metres, num_invalid
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion
 from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.state_columns import NO_STATES
 from splatctrl_cli.logs.stored_frame import StoredFrame, check_depth, decoded, human_mask, is_kept, is_png
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, RgbdFrame, UInt8
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, JointState, LossReport, Record, UInt8, by_stamp
 
 __all__ = ["HOLDOUT", "ImageFolderSource"]
 _NOT_FOR_FOLDERS = (
@@ -43,6 +45,7 @@ class ImageFolderSource:
     """Records of an image folder; no joint states."""
 
     joint_names: tuple[str, ...] = ()
+    states = NO_STATES
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions, description: Description | None = None) -> None:
@@ -144,17 +147,15 @@ class ImageFolderSource:
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
         is_counts = lens.registration is None and not _is_float(self._description.depth.encoding, view.depth)
         is_plain = lens.undistortion is None
-        return StoredFrame.of(
-            RgbdFrame(
-                stamp_ns=view.stamp_ns,
-                camera=view.camera,
-                color=np.asarray(color, dtype=np.uint8),
-                depth=np.asarray(depth, dtype=np.float32),
-                intrinsics=lens.intrinsics,
-                T_world_camera=view.T_world_camera,
-                human=human,
-                valid=valid,
-            ),
+        return StoredFrame(
+            stamp_ns=view.stamp_ns,
+            camera=view.camera,
+            intrinsics=lens.intrinsics,
+            T_world_camera=view.T_world_camera,
+            read_color=lambda: np.asarray(color, dtype=np.uint8),
+            read_depth=lambda: np.asarray(depth, dtype=np.float32),
+            human=human,
+            valid=valid,
             color_file=color_bytes if is_plain and is_kept(color_bytes) else None,
             depth_unit=view.depth_scale if is_counts else None,
             depth_file=self._depth_file(view) if is_counts and is_plain and valid is None else None,
@@ -212,8 +213,7 @@ class ImageFolderSource:
             if pixels is None:
                 return None
             self._num_invalid += num_invalid(pixels)
-            depth = pixels * np.float32(view.depth_scale)
-            return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+            return measured(pixels, view.depth_scale)
         counts = decode_file(path.read_bytes(), color=False)
         if counts is None:
             return None
@@ -271,6 +271,7 @@ class RigFolderSource:
     """Records of several cameras by stamp, each camera an image folder of its own; no joint states."""
 
     joint_names: tuple[str, ...] = ()
+    states = NO_STATES
     world_frame = "world"
 
     def __init__(self, path: Path, options: SourceOptions) -> None:
@@ -296,11 +297,10 @@ class RigFolderSource:
     @property
     def loss(self) -> LossReport:
         """That of all cameras together."""
-        losses = [part.loss for part in self._parts]
-        counts = {
-            f.name: sum(getattr(loss, f.name) for loss in losses) for f in fields(LossReport) if f.name != "notes"
-        }
-        return LossReport(**counts, notes=[note for loss in losses for note in loss.notes])
+        total = LossReport()
+        for loss in (part.loss for part in self._parts):
+            total = total.plus(loss, [*total.notes, *loss.notes])
+        return total
 
     def records(self) -> Iterator[Record]:
         """Frames by stamp."""
@@ -308,7 +308,7 @@ class RigFolderSource:
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
         """Stored frames by stamp, of the same stamp by camera."""
-        return heapq.merge(*(part.stored() for part in self._parts), key=_stamp_ns)
+        return by_stamp(*(part.stored() for part in self._parts))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every view."""
@@ -321,7 +321,3 @@ class RigFolderSource:
     def digests(self) -> dict[str, str]:
         """sha256 of the description, the pose files and the images, by path below the root."""
         return {name: digest for part in self._parts for name, digest in part.digests().items()}
-
-
-def _stamp_ns(item: StoredFrame | JointState) -> int:
-    return item.stamp_ns

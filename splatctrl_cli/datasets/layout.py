@@ -20,13 +20,12 @@ from splatctrl_cli.datasets.folder_description import (
 )
 from splatctrl_cli.datasets.poses import read_matrix_file, read_numbers
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.logs.image_stamps import pair_by_stamp
-from splatctrl_cli.logs.messages import decode_file
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 CAMERA = "camera"  # the name of a layout's only lens
-MILLIMETRE = 1e-3
 SAME = 1e-6  # largest entry of a matrix that is the identity
 Key = TypeVar("Key", int, str)
 _WHOLE = "check that the folder is whole"

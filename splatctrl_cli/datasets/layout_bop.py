@@ -13,7 +13,6 @@ import numpy as np
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
 from splatctrl_cli.datasets.layout import (
     CAMERA,
-    MILLIMETRE,
     Layout,
     Lenses,
     Pairs,
@@ -23,6 +22,7 @@ from splatctrl_cli.datasets.layout import (
     read_json,
 )
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 

@@ -17,7 +17,6 @@ import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
 from splatctrl_cli.datasets.layout import (
-    MILLIMETRE,
     Layout,
     by_numbers,
     described,
@@ -31,6 +30,7 @@ from splatctrl_cli.datasets.layout import (
 from splatctrl_cli.datasets.layout_scannet import find_info, read_info
 from splatctrl_cli.datasets.poses import rigid
 from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 

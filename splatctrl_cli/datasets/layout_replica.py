@@ -13,7 +13,6 @@ from typing import Any
 
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
 from splatctrl_cli.datasets.layout import (
-    MILLIMETRE,
     Layout,
     by_numbers,
     described,
@@ -25,6 +24,7 @@ from splatctrl_cli.datasets.layout import (
 )
 from splatctrl_cli.datasets.poses import read_matrix_lines
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
 
 PARAMETERS = "cam_params.json"

@@ -16,7 +16,6 @@ import numpy as np
 
 from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
 from splatctrl_cli.datasets.layout import (
-    MILLIMETRE,
     Layout,
     described,
     given_lens,
@@ -29,6 +28,7 @@ from splatctrl_cli.datasets.layout import (
 from splatctrl_cli.datasets.poses import read_matrix_file, rigid
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 

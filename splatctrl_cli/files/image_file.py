@@ -1,8 +1,13 @@
-"""What a JPEG or PNG file says of itself, and whether it is whole, without decoding it."""
+"""Image files: what a JPEG or PNG says of itself and whether it is whole, without decoding it; and their pixels."""
 
 import struct
 import zlib
 from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 TAIL = 64  # bytes in which the closing mark of a file stands; some encoders pad
@@ -10,6 +15,10 @@ MOST_PIXELS = 1 << 27  # of an image that is left undecoded; OpenCV's own bound 
 _JPEG_FRAMES = frozenset({0xC0, 0xC1, 0xC2})  # baseline, extended, progressive; Huffman coded
 _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
 _PNG_CHANNELS = {0: 1, 2: 3}  # by colour type: grey, RGB
+_CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
+_PNG_HEAD = struct.Struct(">16xIIB")
+_PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
+_MOST_EXPANSION = 1100  # deflate's is 1032
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,3 +95,43 @@ def _png_head(data: bytes) -> ImageHead | None:
             return head if has_pixels else None
         at = end
     return None
+
+
+def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
+    """Pixels of a JPEG, PNG, WebP, ... file, its orientation tag ignored: RGB of eight bits, or (not color) as OpenCV
+    has them, of three channels in its order BGR.
+
+    None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
+    """
+    if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
+        return None
+    if data.startswith(PNG) and _says_more_than_it_holds(data):
+        return None
+    if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
+        return None
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if color else cv2.IMREAD_UNCHANGED
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    if buffer.size == 0:
+        return None
+    try:
+        pixels = cv2.imdecode(buffer, flags)
+    except cv2.error:
+        return None
+    return None if pixels is None else np.asarray(pixels)
+
+
+def _says_more_than_it_holds(png: bytes) -> bool:
+    """Whether a PNG announces an image, or a chunk, that its bytes do not hold: OpenCV takes memory for either.
+
+    So it does for one without pixels, or with a chunk that must be understood and that no PNG has.
+    """
+    if len(png) < _PNG_HEAD.size:
+        return True
+    width, height, bits = _PNG_HEAD.unpack_from(png)
+    at, end, has_pixels = len(PNG), len(png), False
+    while at < end and (kind := png[at + 4 : at + 8]) != b"IEND":
+        has_pixels |= kind == b"IDAT"
+        if kind[:1].isupper() and kind not in _PNG_CHUNKS:
+            return True
+        at += 12 + int.from_bytes(png[at : at + 4], "big")
+    return bool(not has_pixels or at + 12 > end or width * height * bits // 8 > _MOST_EXPANSION * end)

@@ -6,7 +6,7 @@ The plan takes some fifty bytes of memory a frame.
 import tempfile
 import weakref
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, scratch_folder
-from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
-from splatctrl_cli.logs.messages import ImageMessage, read_image
 from splatctrl_cli.logs.rig import Camera
-from splatctrl_cli.logs.stored_frame import Place
 from splatctrl_cli.records import Float64
 
 Index = NDArray[np.int64]
@@ -167,7 +164,7 @@ class HeldMessages:
 
 
 class PlannedImages:
-    """The images of the frames of a plan."""
+    """The messages of the frames of a plan, which a log may hold in another order."""
 
     def __init__(self, log: RawLog, plan: FramePlan) -> None:
         self._log = log
@@ -175,15 +172,11 @@ class PlannedImages:
         self._held = HeldMessages()
         self._uses = plan.uses()
 
-    def of_frames(
-        self, damage: Damage, decodes: Callable[[Camera], bool]
-    ) -> Iterator[tuple[Planned, list[ImageMessage], tuple[Place, ...]]]:
-        """Yield each planned frame with its colour, depth and mask, and their places; what fails goes to `damage`.
-
-        decodes: whether all of a camera's images are decoded, and not only those that a capture cannot keep.
+    def of_frames(self, damage: Damage) -> Iterator[tuple[Planned, list[RawMessage]]]:
+        """Yield each planned frame with the messages of its colour, depth and mask; frames that are gone go to
+        `damage`.
         """
         numbers = dict.fromkeys(self._uses, 0)
-        decoder = MessageDecoder()
         position, num = 0, len(self._plan)
         planned = self._plan[0]
         for message in self._log.messages(Damage(), set(self._uses)):  # the survey has counted this damage
@@ -193,13 +186,7 @@ class PlannedImages:
                 continue
             self._held.add((topic, number), message)
             while position < num and all(key in self._held for key in planned.keys):
-                taken = [self._take(key) for key in planned.keys]
-                try:
-                    images = _read(decoder, planned.camera, taken, is_whole=decodes(planned.camera))
-                except UndecodableMessageError as error:
-                    damage.add(f"camera {planned.camera.name} at {planned.stamp_ns} ns: {error}")
-                else:
-                    yield planned, images, tuple(_place(message) for message in taken)
+                yield planned, [self._take(key) for key in planned.keys]
                 position += 1
                 if position < num:
                     planned = self._plan[position]
@@ -211,32 +198,3 @@ class PlannedImages:
         topic, number = key
         self._uses[topic][number] -= 1
         return self._held.get(key) if self._uses[topic][number] else self._held.pop(key)
-
-
-def keeps_files(camera: Camera) -> tuple[bool, bool, bool]:
-    """Whether image files of colour, depth and masks go into a capture as they are."""
-    is_plain = camera.undistortion is None
-    return is_plain, is_plain and camera.depth_to_color is None, False
-
-
-def _read(
-    decoder: MessageDecoder, camera: Camera, messages: list[RawMessage], *, is_whole: bool
-) -> list[ImageMessage]:
-    """Colour, depth and mask; is_whole: all of them decoded. Raises UndecodableMessageError."""
-    kept = (False,) * 3 if is_whole else keeps_files(camera)
-    images = [
-        read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
-        for message, lazily in zip(messages, kept, strict=False)
-    ]
-    depth = camera.depth_to_color
-    expected = (camera.intrinsics, camera.intrinsics if depth is None else depth.depth_intrinsics)
-    for image, k in zip(images, expected, strict=False):
-        if (image.width, image.height) != (k.width, k.height):
-            raise UndecodableMessageError(
-                f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}"
-            )
-    return images
-
-
-def _place(message: RawMessage) -> Place:
-    return Place(file=message.file, offset=message.offset, log_time_ns=message.log_time_ns)

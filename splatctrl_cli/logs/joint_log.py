@@ -4,14 +4,12 @@ from array import array
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.files.spilled_rows import Rows
 from splatctrl_cli.logs.state_columns import ColumnWriter
 from splatctrl_cli.logs.state_messages import RawJoints
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 
-Stamps = NDArray[np.int64]
 COLUMNS = ("position", "velocity", "commanded_velocity", "T_base_ee")
 
 

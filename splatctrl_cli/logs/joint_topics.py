@@ -5,7 +5,7 @@ commanded_velocity.npy (T, J), T_base_ee.npy (T, 4, 4) float64; what K is stands
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,14 @@ from splatctrl_cli.files.arrays import npy_head, npy_of
 from splatctrl_cli.files.spilled_rows import Rows, blocks_of, ranges
 from splatctrl_cli.logs.joint_log import JointLog, JointStream
 from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
-from splatctrl_cli.records import Float64, JointState, LossReport
+from splatctrl_cli.records import Float64, LossReport
 
 FOLDER = "joint_topics"
-_AGAIN = "run `splatctrl ingest` again"
+AGAIN = "run `splatctrl ingest` again"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +48,12 @@ def topics_of(found: Survey, loss: LossReport, first_note: int, options: SourceO
 
 def with_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
     """A report with that of the joint states, its notes from number `at` on."""
-    return _combined(loss, joints, 1, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
+    return loss.plus(joints, [*loss.notes[:at], *joints.notes, *loss.notes[at:]])
 
 
 def without_joints(loss: LossReport, joints: LossReport, at: int) -> LossReport:
     """The reverse of `with_joints`."""
-    return _combined(loss, joints, -1, [*loss.notes[:at], *loss.notes[at + len(joints.notes) :]])
+    return loss.plus(joints, [*loss.notes[:at], *loss.notes[at + len(joints.notes) :]], sign=-1)
 
 
 def write_topics(folder: Path, kept: JointTopics, wrote: Callable[[str], None]) -> dict[str, Any]:
@@ -97,13 +98,13 @@ def read_topics(folder: Path, described: Mapping[str, Any], checked: Callable[[s
         loss = LossReport(**described["loss"]["counts"])
         first_note, chosen = int(described["loss"]["first_note"]), described["chosen"]
     except (KeyError, TypeError, ValueError, OSError, EOFError) as error:
-        raise InputError(f"{folder / FOLDER}: cannot be read: {error}", remedy=_AGAIN) from None
+        raise InputError(f"{folder / FOLDER}: cannot be read: {error}", remedy=AGAIN) from None
     return JointTopics(topics=topics, loss=loss, first_note=first_note, chosen=chosen)
 
 
 def joints_again(
     kept: JointTopics, options: SourceOptions, wanted: Sequence[str]
-) -> tuple[tuple[str, ...], Sequence[JointState], LossReport]:
+) -> tuple[tuple[str, ...], StateColumns, LossReport]:
     """Names and states of a robot's joints as the log itself would give them, and what became of the others."""
     loss = LossReport()
     found = Survey(topics={topic.topic.name: topic for topic in kept.topics})
@@ -150,8 +151,3 @@ def _blocks(path: Path) -> Iterator[Float64]:
             if values.size != size:
                 raise ValueError(f"{path.name}: ends after {first + values.size} of {shape[0]} rows")
             yield values.reshape(last - first, *shape[1:])
-
-
-def _combined(loss: LossReport, other: LossReport, sign: int, notes: list[str]) -> LossReport:
-    counts = [field.name for field in fields(LossReport) if field.name != "notes"]
-    return LossReport(**{name: getattr(loss, name) + sign * getattr(other, name) for name in counts}, notes=notes)

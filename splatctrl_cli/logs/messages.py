@@ -1,4 +1,7 @@
-"""Images of sensor_msgs messages as arrays: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m]."""
+"""Images of sensor_msgs messages as arrays: colour (H, W, 3) uint8 RGB, depth (H, W) float32 [m]; RVL.
+
+The encodings are those of sensor_msgs/image_encodings.hpp.
+"""
 
 import struct
 from collections.abc import Callable
@@ -10,42 +13,66 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.files.image_file import JPEG, PNG, TAIL, image_head
+from splatctrl_cli.files.image_file import JPEG, decode_file, image_head
 from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError, stamp_ns
-from splatctrl_cli.logs.encodings import (
-    BAYER,
-    BAYER_16,
-    COLOR_CONVERSIONS,
-    DEPTH_ENCODINGS,
-    decode_rvl,
-    raw_pixels,
-    to_rgb,
-)
 from splatctrl_cli.records import Float32, UInt8
 
-__all__ = [
-    "COLOR_CONVERSIONS",
-    "DEPTH_ENCODINGS",
-    "ImageMessage",
-    "color_of",
-    "decode_file",
-    "depth_of",
-    "read_image",
-]
-
+DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+BAYER = {  # OpenCV names a pattern by the second row's second and third pixel
+    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
+    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
+    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+}
+BAYER_16 = {f"{name[:-1]}16": code for name, code in BAYER.items()}
+_DEEP = {  # sixteen bits a channel
+    "rgb16": None,
+    "bgr16": cv2.COLOR_BGR2RGB,
+    "16UC3": cv2.COLOR_BGR2RGB,
+    "rgba16": cv2.COLOR_RGBA2RGB,
+    "bgra16": cv2.COLOR_BGRA2RGB,
+    "16UC4": cv2.COLOR_BGRA2RGB,
+    **BAYER_16,
+}
+_NV24 = "nv24"  # a plane of Y, then as many pairs of U and V
+_PLANAR = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_YUV2RGB_NV21}  # rows of Y, then half as many of UV
+COLOR_CONVERSIONS = {
+    "rgb8": None,
+    "8UC3": cv2.COLOR_BGR2RGB,  # OpenCV's order
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+    "8UC4": cv2.COLOR_BGRA2RGB,
+    "mono8": cv2.COLOR_GRAY2RGB,
+    "8UC1": cv2.COLOR_GRAY2RGB,
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
+    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
+    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+    **BAYER,
+    **_DEEP,
+    **dict.fromkeys([*_PLANAR, _NV24]),  # converted as they are read
+}
+_LAYOUT = {  # channels and dtype by encoding
+    **dict.fromkeys(["rgb8", "bgr8", "8UC3"], (3, "u1")),
+    **dict.fromkeys(["rgba8", "bgra8", "8UC4"], (4, "u1")),
+    **dict.fromkeys(["mono8", "8UC1", *BAYER, *_PLANAR, _NV24], (1, "u1")),
+    **dict.fromkeys(["rgb16", "bgr16", "16UC3"], (3, "u2")),
+    **dict.fromkeys(["rgba16", "bgra16", "16UC4"], (4, "u2")),
+    **dict.fromkeys(BAYER_16, (1, "u2")),
+    **dict.fromkeys(["yuv422", "uyvy", "yuv422_yuy2", "yuyv"], (2, "u1")),
+    **dict.fromkeys(["16UC1", "mono16"], (1, "u2")),
+    "32FC1": (1, "f4"),
+}
 MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
-_CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
-_PNG_HEAD = struct.Struct(">16xIIB")
-_PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
-_MOST_EXPANSION = 1100  # deflate's is 1032
 _MOSAICS = frozenset({*BAYER, *BAYER_16})
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMessage:
-    """An image as recorded.
+    """An image as recorded, of any type and encoding; only who asks for its pixels has a JPEG or PNG decoded.
 
     width, height [px]; decode gives pixels (H, W[, channels]) in `encoding`, or raises UndecodableMessageError;
     compressed is the image file's bytes where the message held one (JPEG, PNG) that decodes to `pixels`.
@@ -80,6 +107,10 @@ class ImageMessage:
     def is_gray(self) -> bool:
         """Whether a colour image has one channel only."""
         return self.encoding in {"mono8", "8UC1"}
+
+    def unit(self, scale: float | None) -> float:
+        """[m] that a depth of 1 is: `scale` where that is given, else 1 mm of counts and 1 m of floats (REP 118)."""
+        return scale if scale is not None else MILLIMETRE if self.is_counts else 1.0
 
 
 def read_image(message: Any, type_name: str, *, lazily: bool = False) -> ImageMessage:
@@ -136,20 +167,73 @@ def _decoded(form: str, data: bytes, *, color: bool) -> NDArray[Any]:
     return pixels
 
 
+def to_rgb(pixels: NDArray[Any], encoding: str) -> UInt8:
+    """Colour (H, W, 3) uint8 of pixels as `raw_pixels` gives them; a Bayer mosaic is interpolated linearly.
+
+    Of sixteen bits, 65535 becomes 255, as in cv_bridge (src/cv_bridge.cpp), whatever the sensor's own depth.
+    """
+    code = COLOR_CONVERSIONS[encoding]
+    converted = pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
+    if converted.dtype == np.uint16:
+        converted = (converted.astype(np.uint32) + 128) // 257
+    return np.ascontiguousarray(converted, dtype=np.uint8)
+
+
+def raw_pixels(message: Any) -> NDArray[Any]:
+    """The pixels (H, W[, channels]) of a decoded sensor_msgs/Image, of no channel where the encoding is not known.
+
+    Bytes between rows and behind the last are passed over, in either byte order. Raises UndecodableMessageError where
+    the data do not hold the image.
+    """
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    name = f"image {width}x{height} {message.encoding}"
+    if message.encoding not in _LAYOUT and width * height > 1 << 31:
+        raise UndecodableMessageError(f"{name}: too large for an image")
+    if message.encoding not in _LAYOUT:
+        return np.zeros((height, width, 0), dtype=np.uint8)  # kind "other": described, never used
+    if message.encoding == _NV24:
+        return _nv24(message, name)
+    channels, code = _LAYOUT[message.encoding]
+    is_planar = message.encoding in _PLANAR
+    if is_planar and (width % 2 or height % 2):
+        raise UndecodableMessageError(f"{name}: expected even sizes")
+    num_rows = height * 3 // 2 if is_planar else height
+    dtype = np.dtype((">" if message.is_bigendian else "<") + code)
+    row = width * channels * dtype.itemsize
+    data = np.asarray(message.data, dtype=np.uint8)
+    if width == 0 or height == 0 or step < row or data.size < step * (num_rows - 1) + row:
+        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    step = row if num_rows == 1 else step  # a single row may announce any step: nothing follows it
+    padded = np.zeros(step * num_rows, dtype=np.uint8)
+    padded[: min(data.size, padded.size)] = data[: padded.size]
+    rows = np.ascontiguousarray(padded.reshape(num_rows, step)[:, :row])
+    if is_planar:
+        return np.asarray(cv2.cvtColor(rows, _PLANAR[message.encoding]))
+    pixels = rows.view(dtype).astype(dtype.newbyteorder("="), copy=False)
+    return pixels.reshape(height, width) if channels == 1 else pixels.reshape(height, width, channels)
+
+
+def _nv24(message: Any, name: str) -> UInt8:
+    """RGB (H, W, 3); BT.601 of limited range, as OpenCV takes nv12."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    data = np.asarray(message.data, dtype=np.uint8)
+    if not 0 < width * height * 3 == data.size or step not in {width, 2 * width, 3 * width}:
+        raise UndecodableMessageError(f"{name}: {data.size} bytes with a row step of {step} do not hold it")
+    y = data[: width * height].reshape(height, width).astype(np.float32)
+    u, v = np.moveaxis(data[width * height :].reshape(height, width, 2).astype(np.float32) - 128.0, 2, 0)
+    luma = 1.164 * (y - 16.0)
+    rgb = np.stack([luma + 1.596 * v, luma - 0.813 * v - 0.391 * u, luma + 2.018 * u], axis=2)
+    return np.asarray(np.clip(np.rint(rgb), 0, 255), dtype=np.uint8)
+
+
 def color_of(image: ImageMessage) -> UInt8:
     """Colour (H, W, 3) uint8 RGB."""
     return to_rgb(image.pixels, image.encoding)
 
 
 def depth_of(image: ImageMessage, scale: float | None) -> Float32:
-    """Depth (H, W) float32 [m]; 0, negative and non-finite values (REP 118: no measurement) become 0 = none.
-
-    `scale` [m per count]: default 1 mm for integers, 1 for floats.
-    """
-    if image.is_counts:
-        return metres(image.pixels, MILLIMETRE if scale is None else scale)
-    values = image.pixels * np.float32(1.0 if scale is None else scale)
-    return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+    """Depth (H, W) float32 [m] in the `unit` of `scale`, 0 = none."""
+    return (metres if image.is_counts else measured)(image.pixels, image.unit(scale))
 
 
 def num_invalid(depth: NDArray[Any]) -> int:
@@ -157,51 +241,17 @@ def num_invalid(depth: NDArray[Any]) -> int:
     return 0 if depth.dtype.kind == "u" else int((~np.isfinite(depth) | (depth < 0)).sum())
 
 
+def measured(depth: NDArray[Any], scale: float) -> Float32:
+    """Float depth (H, W) as float32 [m]; 0, negative and non-finite values (REP 118: no measurement) become 0."""
+    values = depth * np.float32(scale)
+    return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+
+
 def metres(counts: NDArray[Any], scale: float) -> Float32:
     """Integer depth counts (H, W) as float32 [m]; the one formula, so that re-reading gives the same bits."""
     depth = counts.astype(np.float32)
     depth *= np.float32(scale)
     return depth
-
-
-def decode_file(data: bytes, *, color: bool) -> NDArray[Any] | None:
-    """Pixels of a JPEG, PNG, WebP, ... file, its orientation tag ignored: RGB of eight bits, or (not color) as OpenCV
-    has them, of three channels in its order BGR.
-
-    None if it is none, or was cut: OpenCV would fill the missing rows of a JPEG with grey.
-    """
-    if any(data.startswith(start) and end not in data[-TAIL:] for start, end in _CLOSING_MARKS):
-        return None
-    if data.startswith(PNG) and _says_more_than_it_holds(data):
-        return None
-    if data[:4] == b"RIFF" and len(data) < 8 + int.from_bytes(data[4:8], "little"):  # a WebP, and its length
-        return None
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if color else cv2.IMREAD_UNCHANGED
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    if buffer.size == 0:
-        return None
-    try:
-        pixels = cv2.imdecode(buffer, flags)
-    except cv2.error:
-        return None
-    return None if pixels is None else np.asarray(pixels)
-
-
-def _says_more_than_it_holds(png: bytes) -> bool:
-    """Whether a PNG announces an image, or a chunk, that its bytes do not hold: OpenCV takes memory for either.
-
-    So it does for one without pixels, or with a chunk that must be understood and that no PNG has.
-    """
-    if len(png) < _PNG_HEAD.size:
-        return True
-    width, height, bits = _PNG_HEAD.unpack_from(png)
-    at, end, has_pixels = len(PNG), len(png), False
-    while at < end and (kind := png[at + 4 : at + 8]) != b"IEND":
-        has_pixels |= kind == b"IDAT"
-        if kind[:1].isupper() and kind not in _PNG_CHUNKS:
-            return True
-        at += 12 + int.from_bytes(png[at : at + 4], "big")
-    return bool(not has_pixels or at + 12 > end or width * height * bits // 8 > _MOST_EXPANSION * end)
 
 
 def _compressed_pixels(form: str, data: bytes) -> tuple[NDArray[Any], str, bytes | None]:
@@ -250,3 +300,52 @@ def _rvl_counts(data: bytes) -> NDArray[np.uint16]:
         return decode_rvl(data[8:], width * height).reshape(height, width)
     except (ValueError, struct.error) as error:
         raise UndecodableMessageError(f"compressed depth: {error}") from None
+
+
+def decode_rvl(data: bytes, num_pixels: int) -> NDArray[np.uint16]:
+    """The pixels (num_pixels,) of an RVL stream of little-endian words, of compressed_depth_image_transport.
+
+    A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017 (its listing is the definition): the image is runs
+    of zeros and of values in turn, each value the zigzag-coded difference to the last one that was not zero; every
+    number is written in groups of three bits, low ones first, in four-bit nibbles whose high bit says that another
+    follows; nibbles fill 32-bit words from the top.
+
+    Raises ValueError where it holds no such image. Memory is that of the image and a few times that of `data`.
+    """
+    numbers = _numbers(data)
+    runs: list[tuple[int, int, int]] = []  # first pixel, first number, length
+    pixel = position = 0
+    while pixel < num_pixels:
+        if position + 1 >= len(numbers):
+            raise ValueError(f"RVL: {len(data)} bytes end after {pixel} of {num_pixels} pixels")
+        zeros, values = int(numbers[position]), int(numbers[position + 1])
+        pixel += zeros
+        runs.append((pixel, position + 2, values))
+        pixel, position = pixel + values, position + 2 + values
+        if pixel > num_pixels or position > len(numbers) or zeros + values == 0:
+            raise ValueError(f"RVL: runs of {len(data)} bytes do not fit {num_pixels} pixels")
+    image = np.zeros(num_pixels, dtype=np.uint16)
+    coded = np.concatenate([numbers[first : first + length] for _, first, length in runs] or [numbers[:0]])
+    depth = np.cumsum((coded >> 1) ^ -(coded & 1))
+    if depth.size and not (depth.min() >= 0 and depth.max() <= 65535):
+        raise ValueError("RVL: values outside 0 to 65535")
+    start = 0
+    for first_pixel, _, length in runs:
+        image[first_pixel : first_pixel + length] = depth[start : start + length]
+        start += length
+    return image
+
+
+def _numbers(data: bytes) -> NDArray[np.int64]:
+    """All numbers of a stream, those of the filling at its end too."""
+    words = np.frombuffer(data, dtype="<u4", count=len(data) // 4)
+    nibbles = ((words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32)) & 15).astype(np.int64).ravel()
+    ends = np.flatnonzero(nibbles < 8)
+    if not ends.size:
+        return np.zeros(0, dtype=np.int64)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
+    if place.max() > 10:  # a number of more than 33 bits
+        raise ValueError("RVL: a number of more than 33 bits")
+    result: NDArray[np.int64] = np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << (3 * place), starts)
+    return result

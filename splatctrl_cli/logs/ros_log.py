@@ -11,28 +11,27 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from splatctrl_cli.containers.raw_log import Damage, RawLog
+from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.logs.frame_plan import FramePlan, Index, Planned, PlannedImages, keeps_files
+from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
+from splatctrl_cli.logs.frame_plan import FramePlan, Index, Planned, PlannedImages
 from splatctrl_cli.logs.image_stamps import dropped, first_of_each, pair_by_stamp, paired
 from splatctrl_cli.logs.joint_topics import topics_of, with_joints
-from splatctrl_cli.logs.messages import MILLIMETRE, ImageMessage, color_of, depth_of, num_invalid
+from splatctrl_cli.logs.messages import ImageMessage, color_of, depth_of, num_invalid, read_image
 from splatctrl_cli.logs.rig import Camera, build_cameras, nearest_gap_ns
 from splatctrl_cli.logs.source_options import SourceOptions, still_note
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.stored_frame import (
-    Place,
     StoredFrame,
     check_depth,
     decoded,
     human_mask,
     is_kept,
     is_png,
-    merged,
 )
 from splatctrl_cli.logs.survey import Survey, survey
-from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8
+from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8, by_stamp
 
 _SECOND = 1_000_000_000
 
@@ -63,7 +62,7 @@ class RosLogSource:
         self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
         self.world_frame = self._rig[0].world_frame
         loss, first_note = LossReport(), len(self._loss.notes)
-        self.joint_names, self._joints = joint_records(found, options, loss, joints)
+        self.joint_names, self.states = joint_records(found, options, loss, joints)
         self.joint_topics = topics_of(found, loss, first_note, options)
         self._loss = with_joints(self._loss, loss, first_note)
         self._plan = self._planned(found)
@@ -82,11 +81,11 @@ class RosLogSource:
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
-        return decoded(merged(self._joints, self._stored_frames(lazily=False)))
+        return decoded(by_stamp(self.states, self._stored_frames(lazily=False)))
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
         """Joint states and stored frames by stamp; image files that need no change are only decoded on demand."""
-        return merged(self._joints, self._stored_frames(lazily=True))
+        return by_stamp(self.states, self._stored_frames(lazily=True))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every planned frame."""
@@ -161,21 +160,22 @@ class RosLogSource:
         self._loss.without_pose += len(color) - num
 
     def _stored_frames(self, *, lazily: bool) -> Iterator[StoredFrame]:
-        images, lost = PlannedImages(self._log, self._plan), _Pass()
+        lost, decoder, checked = _Pass(), MessageDecoder(), set[str]()
         self._passes.append(lost)
-        checked: set[str] = set()
-
-        def decodes(camera: Camera) -> bool:
-            return not lazily or camera.name not in checked  # the first depth is looked at
-
-        for planned, (color, depth, *masks), places in images.of_frames(lost.damage, decodes):
-            human = self._human(planned.camera, masks[0]) if masks else None
+        for planned, messages in PlannedImages(self._log, self._plan).of_frames(lost.damage):
+            camera = planned.camera
+            is_whole = not lazily or camera.name not in checked  # the first depth is looked at
+            try:
+                color, depth, *masks = _images(decoder, camera, messages, is_whole=is_whole)
+            except UndecodableMessageError as error:
+                lost.damage.add(f"camera {camera.name} at {planned.stamp_ns} ns: {error}")
+                continue
+            human = self._human(camera, masks[0]) if masks else None
             if not depth.is_counts:
                 lost.num_invalid += num_invalid(depth.pixels)
-            stored = _stored_frame(planned, color, depth, human, places)
-            camera = planned.camera
+            stored = _stored_frame(planned, color, depth, human, messages)
             if camera.name not in checked:
-                scale = _scale(depth, camera.depth_scale)
+                scale = depth.unit(camera.depth_scale)
                 if check_depth(stored.depth, f"{self._log.path}: topic {camera.depth_topic}", scale):
                     checked.add(camera.name)
             yield stored
@@ -185,12 +185,39 @@ class RosLogSource:
         return human if camera.undistortion is None else camera.undistortion.labels(human)
 
 
+def _images(
+    decoder: MessageDecoder, camera: Camera, messages: Sequence[RawMessage], *, is_whole: bool
+) -> list[ImageMessage]:
+    """Colour, depth and mask; is_whole: all decoded, not only what a capture cannot keep. Raises
+    UndecodableMessageError.
+    """
+    kept = (False,) * 3 if is_whole else (*_keeps_files(camera), False)
+    images = [
+        read_image(decoder.decode(message), message.topic.type_name, lazily=lazily)
+        for message, lazily in zip(messages, kept, strict=False)
+    ]
+    depth = camera.depth_to_color
+    expected = (camera.intrinsics, camera.intrinsics if depth is None else depth.depth_intrinsics)
+    for image, k in zip(images, expected, strict=False):
+        if (image.width, image.height) != (k.width, k.height):
+            raise UndecodableMessageError(
+                f"expected an image of {k.width}x{k.height}, got {image.width}x{image.height}"
+            )
+    return images
+
+
+def _keeps_files(camera: Camera) -> tuple[bool, bool]:
+    """Whether image files of colour and depth go into a capture as they are."""
+    is_plain = camera.undistortion is None
+    return is_plain, is_plain and camera.depth_to_color is None
+
+
 def _stored_frame(
-    planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, places: tuple[Place, ...]
+    planned: Planned, color: ImageMessage, depth: ImageMessage, human: UInt8 | None, messages: Sequence[RawMessage]
 ) -> StoredFrame:
     camera = planned.camera
     is_counts = depth.is_counts and camera.depth_to_color is None
-    keeps_color, keeps_depth, _ = keeps_files(camera)
+    keeps_color, keeps_depth = _keeps_files(camera)
     return StoredFrame(
         stamp_ns=planned.stamp_ns,
         camera=camera.name,
@@ -202,9 +229,9 @@ def _stored_frame(
         valid=None if camera.undistortion is None else camera.undistortion.valid,
         color_file=color.compressed if keeps_color and is_kept(color.compressed) else None,
         depth_file=depth.compressed if keeps_depth and depth.is_counts and is_png(depth.compressed) else None,
-        depth_unit=_scale(depth, camera.depth_scale) if is_counts else None,
+        depth_unit=depth.unit(camera.depth_scale) if is_counts else None,
         origin=f"{camera.color_topic}#{planned.color_index} {camera.depth_topic}#{planned.depth_index}",
-        places=places,
+        places=tuple(replace(message, data=b"") for message in messages),
     )
 
 
@@ -218,12 +245,6 @@ def _depth(camera: Camera, image: ImageMessage) -> Float32:
     if camera.depth_to_color is not None:
         return camera.depth_to_color.warp(metres)
     return metres if camera.undistortion is None else camera.undistortion.depth(metres)
-
-
-def _scale(depth: ImageMessage, scale: float | None) -> float:
-    if scale is not None:
-        return scale
-    return MILLIMETRE if depth.is_counts else 1.0
 
 
 def _rig(log: RawLog, found: Survey, options: SourceOptions) -> tuple[Camera, ...]:

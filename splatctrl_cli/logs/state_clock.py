@@ -1,13 +1,11 @@
 """Two clocks of one log: what stamped the messages, and what logged them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import ranges
-from splatctrl_cli.records import Float64, LossReport
+from splatctrl_cli.records import Float64, LossReport, Stamps
 
-Stamps = NDArray[np.int64]
 OTHER_CLOCK = 1.0  # [s] between stamp and logging above which they are two clocks
 STEP = 1.0  # [s] by which a clock was set
 MIXED = 60.0  # [s] a step beyond which states of two clocks were joined

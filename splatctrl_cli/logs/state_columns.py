@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, of_columns, ranges, selected
-from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.records import Float64, JointState, Stamps
 
-Stamps = NDArray[np.int64]
 OF_JOINTS = ("position", "velocity", "commanded_velocity")
 COLUMNS = (*OF_JOINTS, "T_base_ee", "T_world_ee")
 
@@ -81,6 +80,9 @@ class StateColumns(Sequence[JointState]):
     def _each(self, change: Callable[[Table], Table], names: Iterable[str]) -> dict[str, Any]:
         """What becomes of those columns that there are."""
         return {name: change(table) for name in names if (table := getattr(self, name)) is not None}
+
+
+NO_STATES = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0)), velocity=np.zeros((0, 0)))
 
 
 class ColumnWriter:

@@ -12,7 +12,7 @@ from splatctrl_cli.logs.decoder import JOINT_STATE
 from splatctrl_cli.logs.joint_log import JointStream
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_clock import checked_stamps
-from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TYPES, TRAJECTORY
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
@@ -20,7 +20,6 @@ from splatctrl_cli.records import Bool, LossReport
 
 BRIDGED = 0.5  # [s] at most between the states of another topic that a position is interpolated over
 STILL = 1e-3  # [rad or m] by which a joint may differ across a longer gap
-_NOTHING = StateColumns(stamp_ns=np.zeros(0, np.int64), position=np.zeros((0, 0)), velocity=np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +45,10 @@ def joint_records(
     """
     topics = state_topics(survey, options, loss)
     if not topics:
-        return (), _NOTHING
+        return (), NO_STATES
     raw = track_of_topic(main_topic(topics, loss), loss) if wanted is None else track_of_joints(topics, wanted, loss)
     states = cleaned(raw, loss)
-    return (raw.names, states) if len(states) else ((), _NOTHING)
+    return (raw.names, states) if len(states) else ((), NO_STATES)
 
 
 def state_topics(survey: Survey, options: SourceOptions, loss: LossReport) -> list[TopicSurvey]:

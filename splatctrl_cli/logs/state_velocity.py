@@ -8,9 +8,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from splatctrl_cli.files.spilled_rows import Table, ranges
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 
-Stamps = NDArray[np.int64]
 GAP_PERIODS = 5.0  # a step of the stamps this many times the usual one is a gap
 GAP_SECONDS = 0.1  # and of at least this length
 PERIOD_SAMPLES = 20  # states over which the period is measured

@@ -1,6 +1,6 @@
 """A frame together with how its source stored it, so that `ingest` can keep what is lossless without decoding it."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,8 +9,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.image_file import JPEG, PNG
 from splatctrl_cli.logs.decoder import UndecodableMessageError
+from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import (
     Bool,
     Float32,
@@ -27,26 +30,15 @@ PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
-    """Where an image was recorded.
-
-    offset: the byte of the file at which its record, or that of its chunk, begins; -1 where there is no such place.
-    """
-
-    file: str
-    offset: int
-    log_time_ns: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class StoredFrame:
-    """A frame whose images are decoded when they are asked for, and how its source stored them.
+    """A frame whose images are decoded when they are asked for, and how its source stored them: `ingest` keeps files.
 
     read_color, read_depth: give the frame's color and depth, or raise UndecodableMessageError;
     color_file: the bytes of a JPEG or PNG that decode to exactly the frame's color, None where there are none;
     depth_file: those of a 16-bit PNG of which the depth is exactly ``counts * float32(depth_unit)``, or None;
     depth_unit: [m] of which every depth is a uint16 multiple (``counts * float32(unit)``), None if there is none.
-    origin: where it came from, in words; places: of the colour and the depth message, empty where there are none.
+    origin: where it came from, in words; places: the colour and the depth message without their bytes, empty where
+    there are none.
     """
 
     stamp_ns: int
@@ -60,23 +52,8 @@ class StoredFrame:
     origin: str
     human: UInt8 | None = None
     valid: Bool | None = None
-    places: tuple[Place, ...] = ()
+    places: tuple[RawMessage, ...] = ()
     depth_file: bytes | None = None
-
-    @classmethod
-    def of(cls, frame: RgbdFrame, **stored: Any) -> "StoredFrame":
-        """A stored frame of one that is decoded already."""
-        return cls(
-            stamp_ns=frame.stamp_ns,
-            camera=frame.camera,
-            intrinsics=frame.intrinsics,
-            T_world_camera=frame.T_world_camera,
-            read_color=lambda: frame.color,
-            read_depth=lambda: frame.depth,
-            human=frame.human,
-            valid=frame.valid,
-            **stored,
-        )
 
     @cached_property
     def color(self) -> UInt8:
@@ -120,6 +97,11 @@ class FrameSource(RecordSource, Protocol):
         """The frame of poses, as the source names it."""
         ...
 
+    @property
+    def states(self) -> StateColumns:
+        """The joint states, by stamp, without a pass over the frames."""
+        ...
+
     def stored(self) -> Iterator[StoredFrame | JointState]:
         """As `records`, with the frames as they are stored."""
         ...
@@ -131,31 +113,17 @@ class FrameSource(RecordSource, Protocol):
 
 def is_kept(data: bytes | None) -> bool:
     """Whether an image file's bytes are of a kind that captures hold: JPEG or PNG."""
-    return data is not None and data.startswith((b"\x89PNG\r\n", b"\xff\xd8\xff"))
+    return data is not None and data.startswith((JPEG, PNG))
 
 
 def is_png(data: bytes | None) -> bool:
     """Whether these are the bytes of a PNG file."""
-    return data is not None and data.startswith(b"\x89PNG\r\n")
+    return data is not None and data.startswith(PNG)
 
 
 def decoded(items: Iterable[StoredFrame | JointState]) -> Iterator[Record]:
     """The same records, their frames decoded."""
     return (item.frame if isinstance(item, StoredFrame) else item for item in items)
-
-
-def merged(joints: Sequence[JointState], frames: Iterator[StoredFrame]) -> Iterator[StoredFrame | JointState]:
-    """Joint states (sorted) and frames (sorted) by stamp, joint states first."""
-    states = iter(joints)  # a file's, a block at a time
-    state = next(states, None)
-    for stored in frames:
-        while state is not None and state.stamp_ns <= stored.stamp_ns:
-            yield state
-            state = next(states, None)
-        yield stored
-    if state is not None:
-        yield state
-    yield from states
 
 
 def human_mask(pixels: NDArray[Any], camera: Intrinsics, where: str) -> UInt8:

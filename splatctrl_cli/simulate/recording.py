@@ -8,7 +8,7 @@ import numpy as np
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8
+from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8, by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import shared_workspace, tabletop
 from splatctrl_cli.simulate.motion import Motion
@@ -122,16 +122,7 @@ class Recording:
 
     def records(self) -> Iterator[Record]:
         """Joint states and images by stamp; joint states come before images of the same stamp."""
-        states, frames = self.joint_states(), self.frames()
-        state = next(states, None)
-        for frame in frames:
-            while state is not None and state.stamp_ns <= frame.stamp_ns:
-                yield state
-                state = next(states, None)
-            yield frame
-        if state is not None:
-            yield state
-        yield from states
+        return by_stamp(self.joint_states(), self.frames())
 
     def link_poses(self, q: Float64) -> dict[str, Float64]:
         """T_world_link (4, 4) of every link at joint positions q (J,)."""

@@ -16,9 +16,9 @@ from defusedxml.common import DefusedXmlException
 from splatctrl_cli.containers.log_formats import SUFFIXES
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_head, read_arrays
+from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
-from splatctrl_cli.logs.messages import decode_file
 from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.splat_files.splat_formats import describe_splats
 

@@ -13,7 +13,7 @@ from splatctrl_cli.datasets.poses import read_tum
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_of, read_arrays, savez
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.logs.encodings import decode_rvl
+from splatctrl_cli.logs.messages import decode_rvl
 from splatctrl_cli.logs.tf_tree import MAX_GAP_NS, TfTree
 from tests.logs.test_rvl import encoded_rvl
 from tests.properties import few

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.files.image_file import ImageHead, image_head
-from splatctrl_cli.logs.messages import decode_file
+from splatctrl_cli.files.image_file import ImageHead, decode_file, image_head
 
 RNG = np.random.default_rng(3)
 COLOR = RNG.integers(0, 256, (7, 11, 3), dtype=np.uint8)

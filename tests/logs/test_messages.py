@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE, IMAGE, UndecodableMessageError
-from splatctrl_cli.logs.messages import color_of, decode_file, depth_of, read_image
+from splatctrl_cli.logs.messages import color_of, depth_of, read_image
 from tests.logs.make_log import header
 
 RGB = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)

@@ -77,5 +77,5 @@ def test_images_that_no_frame_needs_any_more_are_let_go(tmp_path: Path) -> None:
     source = open_source(make_log(tmp_path / "log.mcap", LogRecipe(cameras=("cam0", "cam1"))))
     assert isinstance(source, RosLogSource)
     images = PlannedImages(source._log, source._plan)
-    most = [len(images._held._messages) for _ in images.of_frames(Damage(), lambda _: True)]
+    most = [len(images._held._messages) for _ in images.of_frames(Damage())]
     assert len(most) == 10 and max(most) <= 4 and most[-1] == 0

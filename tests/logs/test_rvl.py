@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE, UndecodableMessageError
-from splatctrl_cli.logs.encodings import decode_rvl
-from splatctrl_cli.logs.messages import depth_of, read_image
+from splatctrl_cli.logs.messages import decode_rvl, depth_of, read_image
 from tests.logs.make_log import header
 
 COUNTS = np.array([[0, 1, 500], [1000, 40000, 65535]], dtype=np.uint16)
