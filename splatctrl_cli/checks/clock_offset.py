@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.checks.check_images import thumbnail_lens
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RgbdFrame, UInt8
+from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RgbdFrame, Stamps, UInt8
 
 DEPTH_STEP = 0.05  # [m] at which the change of a pixel's depth counts in full
 COLOR_STEP = 64.0  # [grey levels] likewise
@@ -32,7 +32,6 @@ PIXEL_ERROR = 0.15  # of the time between frames: found on the simulated log, pe
 SUM_ERROR = 1.0  # likewise
 Score = Callable[[float], float]
 FEW = 1000  # states by which a joint is seen to move
-Stamps = NDArray[np.int64]
 Index = NDArray[np.int64]
 
 

@@ -18,6 +18,7 @@ from splatctrl_cli.containers.mcap_records import (
     DATA_END,
     FIRST_OPCODE,
     FOOTER,
+    HEAD,
     MAGIC,
     BadRecordError,
     ChunkIndex,
@@ -30,11 +31,10 @@ from splatctrl_cli.files.unpacking import MAX_BLOCK
 
 MAX_SUMMARY = 64 << 20  # bytes of a summary that are read
 _PIECE = 1 << 20
-_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _ATTACHMENT_HEAD = 1 << 16  # bytes in which name and media type of an attachment must end
-_FOOTER_SIZE = _HEAD.size + 20
+_FOOTER_SIZE = HEAD.size + 20
 
 
 class Part(NamedTuple):
@@ -76,12 +76,12 @@ class McapFile:
             stream.seek(footer.summary_start)
             content = stream.read(min(self.size - footer.summary_start, MAX_SUMMARY))
         found, at = [], 0
-        while at + _HEAD.size <= len(content):
-            opcode, length = _HEAD.unpack_from(content, at)
-            start, at = at + _HEAD.size, at + _HEAD.size + length
+        while at + HEAD.size <= len(content):
+            opcode, length = HEAD.unpack_from(content, at)
+            start, at = at + HEAD.size, at + HEAD.size + length
             if opcode < FIRST_OPCODE or at > len(content) or opcode == FOOTER:
                 break
-            found.append(Part(footer.summary_start + start - _HEAD.size, opcode, content[start:at]))
+            found.append(Part(footer.summary_start + start - HEAD.size, opcode, content[start:at]))
         return found
 
     def chunk_indexes(self) -> list[ChunkIndex]:
@@ -92,7 +92,7 @@ class McapFile:
         """The content of a chunk's record; what is left of it where the file is shorter."""
         with self.path.open("rb") as stream:
             stream.seek(min(index.chunk_start_offset, self.size))
-            opcode, length = _HEAD.unpack((stream.read(_HEAD.size) + bytes(_HEAD.size))[: _HEAD.size])
+            opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
             return stream.read(min(length, MAX_BLOCK + _PIECE)) if opcode == CHUNK else b""
 
     def _places(self) -> list[int]:
@@ -119,9 +119,9 @@ class _Walk:
         is_data = True
         while True:
             offset = self._stream.tell()
-            head = self._stream.read(_HEAD.size)
-            opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-            end = offset + _HEAD.size + length
+            head = self._stream.read(HEAD.size)
+            opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+            end = offset + HEAD.size + length
             if opcode < FIRST_OPCODE or end > self._size:
                 if not head:
                     self._add("ends without a footer: cut, or still being written")
@@ -166,7 +166,7 @@ class _Walk:
             self._crc = None
             return None
         self._add(f"cut or damaged after byte {offset}")
-        self._stream.seek(min(offset + _HEAD.size, self._size))
+        self._stream.seek(min(offset + HEAD.size, self._size))
         if opcode == CHUNK:
             return Part(offset, opcode, self._stream.read(MAX_BLOCK), True)
         self._stream.seek(self._size)
@@ -174,7 +174,7 @@ class _Walk:
 
     def _next_place(self, offset: int) -> int | None:
         position = bisect.bisect_right(self._places, offset)
-        if position < len(self._places) and self._places[position] + _HEAD.size <= self._size:
+        if position < len(self._places) and self._places[position] + HEAD.size <= self._size:
             return self._places[position]
         before = _CHUNK_HEAD.size
         self._stream.seek(offset + 1)
@@ -197,7 +197,7 @@ class _Walk:
                 if start >= 0 and tail + 8 <= len(block):
                     opcode, length, first, last, *_ = _CHUNK_HEAD.unpack_from(block, start)
                     stored = int.from_bytes(block[tail : tail + 8], "little")
-                    agrees = length >= _CHUNK_HEAD.size - _HEAD.size + len(name) + 8 + stored
+                    agrees = length >= _CHUNK_HEAD.size - HEAD.size + len(name) + 8 + stored
                     if opcode == CHUNK and agrees and first <= last and base + start + 9 + length <= self._size:
                         yield start
                 at = block.find(name, at + 1)
@@ -248,7 +248,7 @@ class _Walk:
         elif after + len(MAGIC) < self._size:
             self._add(f"{self._size - after - len(MAGIC)} bytes after its end were left out")
         start = footer.summary_start or part.offset
-        end = part.offset + _HEAD.size + 16
+        end = part.offset + HEAD.size + 16
         is_inside = len(MAGIC) <= start <= part.offset
         if footer.summary_crc and not (is_inside and self._crc_of(start, end) == footer.summary_crc):
             self._add("checksum of the summary differs")
@@ -296,10 +296,10 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
         return None
     stream.seek(size - len(MAGIC) - _FOOTER_SIZE)
     content = stream.read(_FOOTER_SIZE + len(MAGIC))
-    opcode, length = _HEAD.unpack_from(content)
+    opcode, length = HEAD.unpack_from(content)
     if opcode != FOOTER or length != 20 or not content.endswith(MAGIC):
         return None
-    footer = parse_record(FOOTER, content[_HEAD.size : _FOOTER_SIZE])
+    footer = parse_record(FOOTER, content[HEAD.size : _FOOTER_SIZE])
     assert isinstance(footer, Footer)
     return footer
 

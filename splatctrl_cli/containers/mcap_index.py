@@ -8,6 +8,7 @@ from splatctrl_cli.containers.mcap_records import (
     CHUNK,
     FIRST_OPCODE,
     FOOTER,
+    HEAD,
     MAGIC,
     MESSAGE,
     MESSAGE_INDEX,
@@ -18,7 +19,6 @@ from splatctrl_cli.containers.mcap_records import (
 )
 
 MOST_HEADS = 100_000  # records that are visited: a second or so
-_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = 64  # bytes that hold the fields of a chunk before its records
 
 
@@ -40,13 +40,13 @@ def index_by_heads(file: McapFile) -> LogIndex:
     stamps: list[int] = []
     offset, num_heads = len(MAGIC), 0
     with file.path.open("rb") as stream:
-        while offset + _HEAD.size <= file.size and num_heads < MOST_HEADS:
+        while offset + HEAD.size <= file.size and num_heads < MOST_HEADS:
             stream.seek(offset)
-            head = stream.read(_HEAD.size + _CHUNK_HEAD)
-            opcode, length = _HEAD.unpack_from(head)
-            if opcode < FIRST_OPCODE or opcode == FOOTER or offset + _HEAD.size + length > file.size:
+            head = stream.read(HEAD.size + _CHUNK_HEAD)
+            opcode, length = HEAD.unpack_from(head)
+            if opcode < FIRST_OPCODE or opcode == FOOTER or offset + HEAD.size + length > file.size:
                 break
-            content = head[_HEAD.size :]
+            content = head[HEAD.size :]
             if opcode == CHUNK:
                 chunk = _chunk_index(content, offset, length)
                 if chunk is not None:
@@ -60,10 +60,10 @@ def index_by_heads(file: McapFile) -> LogIndex:
                 channel, _, stamp, _ = struct.unpack_from("<HIQQ", content)
                 counts[channel] = counts.get(channel, 0) + 1
                 stamps.append(stamp)
-            offset += _HEAD.size + length
+            offset += HEAD.size + length
             num_heads += 1
     stamps += [stamp for c in chunks for stamp in (c.message_start_time, c.message_end_time)]
-    notes = [] if offset + _HEAD.size >= file.size else [f"counted up to byte {offset} of {file.size}"]
+    notes = [] if offset + HEAD.size >= file.size else [f"counted up to byte {offset} of {file.size}"]
     return LogIndex(
         counts=counts,
         first_ns=min(stamps, default=0),
@@ -83,7 +83,7 @@ def _chunk_index(content: bytes, offset: int, length: int) -> ChunkIndex | None:
         message_start_time=chunk.message_start_time,
         message_end_time=chunk.message_end_time,
         chunk_start_offset=offset,
-        chunk_length=length + _HEAD.size,
+        chunk_length=length + HEAD.size,
         message_index_offsets={},
         message_index_length=0,
         compression=chunk.compression,

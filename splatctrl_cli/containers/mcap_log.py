@@ -16,6 +16,7 @@ from splatctrl_cli.containers.mcap_records import (
     CHANNEL,
     CHUNK,
     FIRST_OPCODE,
+    HEAD,
     MESSAGE,
     SCHEMA,
     STATISTICS,
@@ -30,7 +31,6 @@ from splatctrl_cli.containers.mcap_records import (
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.files.unpacking import BadBlockError, Budget, unpacked_start
 
-_HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 
 
@@ -113,9 +113,9 @@ class McapLog:
     ) -> Iterator[RawMessage]:
         records = self._records_in(content, offset, damage, is_cut=is_cut)
         at, end = 0, len(records)
-        while at + _HEAD.size <= end:
-            opcode, length = _HEAD.unpack_from(records, at)
-            start, at = at + _HEAD.size, at + _HEAD.size + length
+        while at + HEAD.size <= end:
+            opcode, length = HEAD.unpack_from(records, at)
+            start, at = at + HEAD.size, at + HEAD.size + length
             if at > end or opcode < FIRST_OPCODE:
                 if not is_cut:
                     damage.add(f"{self.path.name}: the chunk at byte {offset} holds bytes that are not a record")

@@ -12,6 +12,7 @@ MAGIC = b"\x89MCAP0\r\n"
 MESSAGE, CHUNK, ATTACHMENT, SCHEMA, CHANNEL = 0x05, 0x06, 0x09, 0x03, 0x04
 DATA_END, FOOTER, CHUNK_INDEX, STATISTICS, MESSAGE_INDEX = 0x0F, 0x02, 0x08, 0x0B, 0x07
 FIRST_OPCODE = 0x01
+HEAD = struct.Struct("<BQ")  # opcode and length of what follows
 
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 

@@ -1,7 +1,7 @@
 """The arrays of an NPZ file as columns, read a block of rows at a time."""
 
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from math import prod
 from pathlib import Path
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_head
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows
+from splatctrl_cli.records import Float64, Stamps
 
-Stamps = NDArray[np.int64]
 FREE_BYTES = 1 << 30  # of an array, unpacked, and beside it:
 MOST_RATIO = 100  # times the file's size; joint states as recorded compress 2 to 20 times
 _MOST_BY_COLUMNS = 1 << 28  # bytes, as they are in memory at once
@@ -46,6 +46,18 @@ class NpzFile:
         for blocks in zip(*(self._blocks(name) for name in names), strict=True):
             file.append(np.hstack([block.reshape(len(block), -1).astype(np.float64) for block in blocks]))
         return Rows(file)
+
+    def read(
+        self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
+    ) -> tuple[Stamps, dict[str, Rows]]:
+        """`stamps`, and of each group of names its `columns`."""
+        found = {key: self.columns(names) for key, names in groups.items()}
+        return self.stamps(time, unit_ns, epoch_ns), found
+
+    def numbers(self, names: Sequence[str]) -> Float64:
+        """`columns`, all rows at once."""
+        rows = self.columns(names)
+        return rows[: len(rows)]
 
     def rows(self, name: str) -> Rows:
         """An array (T, ...), each row in its shape; T may be 0. Raises InputError where it holds no numbers."""

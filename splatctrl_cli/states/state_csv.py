@@ -14,8 +14,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, absent, blocks_of
 from splatctrl_cli.logs.state_messages import NAMELESS, pose_of_columns
 from splatctrl_cli.logs.state_track import RawTrack
-from splatctrl_cli.logs.state_velocity import Stamps
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 
 _MILLISECOND_NS = 1_000_000
 _DESCRIBE = "describe the columns in a .toml (docs/replay.md, Logs)"
@@ -28,32 +27,40 @@ class CsvTable:
     path: Path
     names: list[str]
 
-    def index(self, name: str) -> int:
-        """The first column of that name. Raises InputError."""
+    def index(self, name: str | int) -> int:
+        """The first column of that name; a number is one already. Raises InputError."""
+        if isinstance(name, int):
+            return name
         if name not in self.names:
             raise InputError(f"{self.path}: no column {name!r}", remedy=f"columns there: {', '.join(self.names)}")
         return self.names.index(name)
 
     def read(
-        self, time: int, unit_ns: int, groups: Mapping[str, Sequence[int]], epoch_ns: int = 0
+        self, time: str | int, unit_ns: int, groups: Mapping[str, Sequence[str | int]], epoch_ns: int = 0
     ) -> tuple[Stamps, dict[str, Rows]]:
         """Stamps (T,) [ns] of a column of times in units of `unit_ns`, every digit kept, and of each group of columns
-        their numbers (T, K), NaN for an empty cell.
+        their numbers (T, K), NaN for an empty cell; columns by name or number.
 
         Raises InputError naming line and column, for a line of another length than the first, and without any.
         """
-        stamps = array("q")
+        chosen = {name: [self.index(column) for column in columns] for name, columns in groups.items()}
+        at, stamps = self.index(time), array("q")
         files = {name: RowFile((len(columns),)) for name, columns in groups.items()}
         for number, rows in self._blocks():
-            stamps.extend(self._stamp(row, number + i, time, unit_ns) + epoch_ns for i, row in enumerate(rows))
-            for name, columns in groups.items():
+            stamps.extend(self._stamp(row, number + i, at, unit_ns) + epoch_ns for i, row in enumerate(rows))
+            for name, columns in chosen.items():
                 files[name].append(self._numbers(rows, number, columns))
         if not stamps:
             raise InputError(f"{self.path}: expected joint states, got none", remedy="record them again")
         return np.array(stamps, dtype=np.int64), {name: Rows(file) for name, file in files.items()}
 
-    def numbers(self, columns: Sequence[int]) -> Float64:
-        """(T, len(columns)) float64, all at once, as `read` has them."""
+    def stamps(self, name: str, unit_ns: int, epoch_ns: int) -> Stamps:
+        """Those of `read` alone."""
+        return self.read(name, unit_ns, {}, epoch_ns)[0]
+
+    def numbers(self, names: Sequence[str]) -> Float64:
+        """(T, K) float64 of the columns, all at once, as `read` has them."""
+        columns = [self.index(name) for name in names]
         return np.vstack([self._numbers(rows, number, columns) for number, rows in self._blocks()])
 
     def _blocks(self) -> Iterator[tuple[int, list[list[str]]]]:

@@ -16,8 +16,9 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_topics import joint_records, with_prefix
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
+from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.logs.survey import survey
-from splatctrl_cli.records import LossReport, Record, RecordSource
+from splatctrl_cli.records import LossReport, Record
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.state_csv import is_libfranka, libfranka_track, read_csv
 from splatctrl_cli.states.state_table import described_track
@@ -58,7 +59,7 @@ class StateSource:
         return {file.name: sha256(file) for file in self._files}
 
 
-def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> RecordSource:
+def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
     """A recorded input with the states of `joints` (a robot's), as far as it has them, and its frames if it has any.
 
     Raises InputError where there is nothing, or nothing with joint states that can be used.
@@ -79,7 +80,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Re
     return _of_log(path, open_raw_log(path), options, joints)
 
 
-def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> RecordSource:
+def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> RosLogSource | StateSource:
     """With frames where the log's cameras can be used; else the states alone, with a note that says why."""
     default = SourceOptions()
     try:

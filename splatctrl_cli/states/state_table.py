@@ -12,8 +12,6 @@ from splatctrl_cli.files.npz_columns import NpzFile
 from splatctrl_cli.files.spilled_rows import Rows, absent, scaled
 from splatctrl_cli.logs.state_messages import pose_of_columns, pose_of_quat, rigid_or_none
 from splatctrl_cli.logs.state_track import RawTrack
-from splatctrl_cli.logs.state_velocity import Stamps
-from splatctrl_cli.records import Float64
 from splatctrl_cli.states.state_csv import CsvTable, poses_of, read_csv
 
 UNITS = {"rad": 1.0, "deg": float(np.pi / 180.0)}
@@ -67,15 +65,15 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
     return _track(table, columns_of(path, "states", table.file), path), path.parent / table.file
 
 
-def columns_of(path: Path, table: str, name: str) -> "_Columns":
+def columns_of(path: Path, table: str, name: str) -> CsvTable | NpzFile:
     """The columns of a CSV or NPZ file that a table of the TOML file `path` names. Raises InputError."""
     file = path.parent / name
     if not file.is_file():
         raise InputError(f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml")
-    return _NpzColumns(file) if file.suffix == ".npz" else _CsvColumns(read_csv(file))
+    return NpzFile(file) if file.suffix == ".npz" else read_csv(file)
 
 
-def _track(table: StatesTable, columns: "_Columns", path: Path) -> RawTrack:
+def _track(table: StatesTable, columns: CsvTable | NpzFile, path: Path) -> RawTrack:
     factor, num = UNITS[table.unit], len(table.joints)
     wanted = {"position": table.position, "velocity": table.velocity}
     wanted |= {"commanded_velocity": table.commanded_velocity, "pose": table.pose}
@@ -119,41 +117,3 @@ def _poses(table: StatesTable, rows: Rows | None, path: Path, num_states: int) -
     if table.pose_order == "columns":
         return poses_of(rows, pose_of_columns)
     return poses_of(rows, lambda row: rigid_or_none(row.reshape(4, 4)))
-
-
-class _CsvColumns:
-    def __init__(self, table: CsvTable) -> None:
-        self._table = table
-
-    def read(
-        self, time: str, unit_ns: int, groups: Mapping[str, list[str]], epoch_ns: int
-    ) -> tuple[Stamps, dict[str, Rows]]:
-        columns = {key: [self._table.index(name) for name in names] for key, names in groups.items()}
-        return self._table.read(self._table.index(time), unit_ns, columns, epoch_ns)
-
-    def stamps(self, name: str, unit_ns: int, epoch_ns: int) -> Stamps:
-        return self._table.read(self._table.index(name), unit_ns, {}, epoch_ns)[0]
-
-    def numbers(self, names: list[str]) -> Float64:
-        return self._table.numbers([self._table.index(name) for name in names])
-
-
-class _NpzColumns:
-    def __init__(self, path: Path) -> None:
-        self._file = NpzFile(path)
-
-    def read(
-        self, time: str, unit_ns: int, groups: Mapping[str, list[str]], epoch_ns: int
-    ) -> tuple[Stamps, dict[str, Rows]]:
-        found = {key: self._file.columns(names) for key, names in groups.items()}
-        return self._file.stamps(time, unit_ns, epoch_ns), found
-
-    def stamps(self, name: str, unit_ns: int, epoch_ns: int) -> Stamps:
-        return self._file.stamps(name, unit_ns, epoch_ns)
-
-    def numbers(self, names: list[str]) -> Float64:
-        rows = self._file.columns(names)
-        return rows[: len(rows)]
-
-
-_Columns = _CsvColumns | _NpzColumns

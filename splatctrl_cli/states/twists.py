@@ -10,8 +10,7 @@ from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.datasets.folder_description import has_table, read_table
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError, is_ros, stamp_ns
-from splatctrl_cli.logs.state_velocity import Stamps
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.states.state_table import TIME_UNITS_NS, columns_of
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"

@@ -15,7 +15,7 @@ from splatctrl_cli.control.open_loop import OpenLoopTrace, is_shaped
 from splatctrl_cli.control.step import ControlStep, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.files.spilled_rows import IN_MEMORY, RowFile, Rows, scratch_folder
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import Float64, Stamps
 
 BLOCK = 1024  # states that are replayed at once
 RUNGS = tuple(Rung)
@@ -24,7 +24,6 @@ STEP_FIGURES = (
     *(f"shaped {kind}" for kind in RowKind),
 )
 STEP_BLANK = (np.nan,) * len(STEP_FIGURES)
-Stamps = NDArray[np.int64]
 T = TypeVar("T")
 
 
