@@ -147,7 +147,7 @@ def trial_of(seed: int) -> Trial | None:
             log=folder / "log.mcap", urdf=urdf, spheres=spheres, out=folder, config=config, options=options, threads=1
         )
         states = read_states(request, model)
-        scene = from_log(request, config, model, folder, SILENT)
+        scene = from_log(request, model, folder, SILENT)
         inputs = ReplayInputs(
             source=states.source, states=states.states, model=model, scene=scene, truth=None, digests={}
         )

@@ -42,8 +42,8 @@ def views_to_score(
     stamp counts); without one, every training frame of the recording, which is then read twice.
     """
     if not has_clock:
-        known = tuple(frame for frame in _frames(source) if frame.camera in training)
-        for number, frame in enumerate(_frames(source)):
+        known = tuple(frame for frame in frames_of(source) if frame.camera in training)
+        for number, frame in enumerate(frames_of(source)):
             if frame.camera in scoring:
                 name = _name(frame.camera, frame.stamp_ns if numbered_by_stamp else number)
                 yield View(name=name, frame=frame, training=known)
@@ -64,14 +64,15 @@ def _name(camera: str, number: int) -> str:
     return f"{camera.strip('/').replace('/', '_')}-{number:04d}"
 
 
-def _frames(source: RecordSource) -> Iterator[RgbdFrame]:
+def frames_of(source: RecordSource) -> Iterator[RgbdFrame]:
+    """The frames among a source's records."""
     return (record for record in source.records() if isinstance(record, RgbdFrame))
 
 
 def _moments(source: RecordSource) -> Iterator[list[RgbdFrame]]:
     """Frames of the same stamp, together."""
     moment: list[RgbdFrame] = []
-    for frame in _frames(source):
+    for frame in frames_of(source):
         if moment and frame.stamp_ns != moment[0].stamp_ns:
             yield moment
             moment = []

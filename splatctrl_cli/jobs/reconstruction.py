@@ -1,7 +1,7 @@
 """The fitter over a source's time steps, with what is written on the way and the checkpoints to go on from."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -12,8 +12,9 @@ from tqdm import tqdm
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
+from splatctrl_cli.jobs.open_recording import observed
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.records import Box, JointState, RecordSource
+from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.audit_row import AuditRow
@@ -79,7 +80,7 @@ class Reconstruction:
     """One run of a request into `folder`; with `checkpoint` it goes on where that was written.
 
     declared: what the robot carries. identity: plain values that a run which goes on must have in common with this
-    one.
+    one. observe: is shown every frame of the source on its way into time steps.
     """
 
     def __init__(
@@ -91,7 +92,9 @@ class Reconstruction:
         identity: Mapping[str, Any],
         declared: Declarations | None = None,
         checkpoint: Checkpoint | None = None,
+        observe: Callable[[RgbdFrame], None] | None = None,
     ) -> None:
+        self.observe = observe
         self.request, self.source, self.config = request, request.source, request.config
         self.robot = robot
         self.cloud = None if request.points is None else read_points(request.points)  # instead of depth
@@ -331,8 +334,16 @@ class Reconstruction:
 
     def time_steps(self) -> Iterator[TimeStep]:
         """Those of the source, from its beginning."""
-        steps = time_steps(self.source.records(), self.cameras, has_clock=self.source.has_clock)
+        records = observed(self.source.records(), self._see)
+        steps = time_steps(records, self.cameras, has_clock=self.source.has_clock)
         return steps if self.cloud is None else (step.without_depth() for step in steps)
+
+    def _see(self, record: Record) -> None:
+        if isinstance(record, RgbdFrame):
+            if self.observe is not None:
+                self.observe(record)
+        elif self._first_state_ns is None:
+            self._first_state_ns = record.stamp_ns
 
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else replace(self.config.scene, fill=1.0)
@@ -364,10 +375,8 @@ class Reconstruction:
         return posture_of(self.robot, step.position[order], at_frames, carried)
 
     def _seconds(self, stamp_ns: int) -> float:
-        """Since the first joint state."""
-        if self._first_state_ns is None:
-            states = (record for record in self.source.records() if isinstance(record, JointState))
-            self._first_state_ns = next(states).stamp_ns
+        """Since the first joint state, which time steps with a posture come after."""
+        assert self._first_state_ns is not None
         return (stamp_ns - self._first_state_ns) * 1e-9
 
     def _count_carried(self, step: TimeStep, posture: RobotPosture | None) -> None:

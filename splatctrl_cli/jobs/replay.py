@@ -1,12 +1,17 @@
 """A replay from its request to its result: read, replay, measure, write."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.evaluate.views import frames_of
+from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
+from splatctrl_cli.jobs.open_recording import observed
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import declarations_of
 from splatctrl_cli.jobs.replays.criteria_input import Judged
@@ -14,17 +19,25 @@ from splatctrl_cli.jobs.replays.evidence import Evidence, check_evidence, map_er
 from splatctrl_cli.jobs.replays.files import write_replay
 from splatctrl_cli.jobs.replays.goal import check_goal, check_twists
 from splatctrl_cli.jobs.replays.golden import read_golden
-from splatctrl_cli.jobs.replays.inputs import LoggedStates, coverage_words, doubts_of, read_robot, read_states
-from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene
+from splatctrl_cli.jobs.replays.inputs import (
+    LoggedStates,
+    clock_of,
+    coverage_words,
+    doubts_of,
+    read_robot,
+    read_states,
+)
+from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene, reads_whole_log
 from splatctrl_cli.jobs.replays.metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replays.modes import replayed
-from splatctrl_cli.jobs.replays.pictures import draw_worst_frames
+from splatctrl_cli.jobs.replays.pictures import draw_worst_frames, worst_sights
 from splatctrl_cli.jobs.replays.provenance import Mismatch, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replays.request import MODES, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone
-from splatctrl_cli.jobs.replays.truth import with_truth
+from splatctrl_cli.jobs.replays.truth import with_agreement, with_truth
 from splatctrl_cli.jobs.replays.verdict import ASKED, replay_verdict
+from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.simulate.truth import load_truth
@@ -58,24 +71,26 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
     config, stopwatch = request.config, Stopwatch()
     golden = read_golden(request)
     with output_path(request.out, force=request.force, is_folder=True) as folder:
+        motion = ImageMotion()
         with stopwatch.stage("read"):
-            inputs, logged, evidence = _read(request, folder, progress)
+            inputs, logged, evidence = _read(request, folder, progress, motion)
         for doubt in doubts_of(request, inputs.model, config.control):
             progress.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
             found = replayed(request, inputs, config, progress)
+        inputs.scene.finish()
+        logged = replace(logged, clock=clock_of(inputs.model, logged, motion))
         with stopwatch.stage("truth"):
-            found = with_truth(inputs, found)
+            found, sights = _seen_by_cameras(request, inputs, found)
         if evidence is not None:
             with stopwatch.stage("evidence"):
                 found = replace(found, map_error=map_error(evidence, inputs, found.audit, config.verdict))
-        inputs.scene.finish()
         metrics = metrics_of(found) | logged.metrics()
         with stopwatch.stage("verdict"):
             judged = Judged(request=request, inputs=inputs, logged=logged, replay=found, metrics=metrics)
             verdict = replay_verdict(judged, golden)
         with stopwatch.stage("worst_frames"):
-            unseen = draw_worst_frames(folder, inputs, found, request.worst_frames)
+            unseen = draw_worst_frames(folder, found, sights)
         write_json(folder / "states.json", logged.as_dict())
         write_replay(folder, found, metrics, verdict, config=config, inputs=inputs.digests, stopwatch=stopwatch)
     return ReplayResult(
@@ -107,9 +122,26 @@ def check_request(request: ReplayRequest) -> None:
     check_goal(request)
 
 
+def _seen_by_cameras(
+    request: ReplayRequest, inputs: ReplayInputs, replay: Replay
+) -> tuple[Replay, list[Sight | None]]:
+    """With the truth, and images of the worst moments: one pass over the frames for both."""
+    frames: Iterator[RgbdFrame] = frames_of(inputs.source) if inputs.source.cameras else iter(())
+    replay, surfaces = with_truth(inputs, replay)
+    if surfaces is not None:
+        frames = observed(frames, surfaces.see)
+    sights = worst_sights(inputs, replay, request.worst_frames, frames)
+    if surfaces is not None:
+        for _ in frames:  # those that no moment needs
+            pass
+        replay = with_agreement(replay, surfaces)
+    return replay, sights
+
+
 def _read(
-    request: ReplayRequest, folder: Path, progress: Progress
+    request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
 ) -> tuple[ReplayInputs, LoggedStates, Evidence | None]:
+    """What the replay needs; `motion` is shown all frames of the log now, or as a lockstep takes them in."""
     model = read_robot(request, request.config.control)
     truth = None if request.truth is None else load_truth(request.truth)
     logged = read_states(request, model)
@@ -118,7 +150,11 @@ def _read(
     declared = declarations_of(request.declare, model)
     evidence = open_evidence(request, model)
     source = logged.source
-    scene = opened_scene(request, model, declared, folder, progress, source)
+    observe = motion.add if reads_whole_log(request, source) else None
+    if source.cameras and observe is None:
+        for frame in frames_of(source):
+            motion.add(frame)
+    scene = opened_scene(request, model, declared, folder, progress, source, observe)
     given = (request.urdf, request.spheres, request.srdf, request.truth, request.declare)
     files = [path for path in given if path is not None]
     digests = {**source.digests(), **scene.digests, **{path.name: sha256(path) for path in files}}

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.files.output import part_digests
+from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
 from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
@@ -34,11 +35,23 @@ class FakeSource:
     has_clock: bool = True
     loss: LossReport = field(default_factory=LossReport)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """States are kept as columns, as logs have them."""
+        object.__setattr__(self, name, columns_of(value) if name == "states" else value)
+
     def records(self) -> Iterator[Record]:
         yield from self.states
 
     def digests(self) -> dict[str, str]:
         return {"fake.mcap": "0" * 64}
+
+
+def columns_of(states: Sequence[JointState]) -> StateColumns:
+    """Joint states as columns."""
+    collector = StateCollector(len(states[0].position) if states else 0)
+    for state in states:
+        collector.add(state)
+    return collector.columns()
 
 
 def logged(end: Float64 = START, num: int = 11, start_ns: int = 0) -> list[JointState]:

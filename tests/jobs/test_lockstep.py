@@ -2,16 +2,20 @@
 
 import csv
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.containers.mcap_log import McapLog
+from splatctrl_cli.containers.raw_log import Damage, RawMessage
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.jobs import replay as job
 from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.replays import known_scene
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, from_splats
@@ -102,6 +106,34 @@ def test_frame_sets_are_taken_in_only_when_the_clock_has_passed_them(
     }
 
 
+def test_the_log_is_read_three_times(
+    replayed: Callable[..., list[dict[str, str]]], recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For its survey, in lockstep with the clock's estimate, and for the truth with the worst frames."""
+    passes: list[object] = []
+    messages = McapLog.messages
+
+    def counted(log: McapLog, damage: Damage, names: Collection[str] | None = None) -> Iterator[RawMessage]:
+        passes.append(names)
+        return messages(log, damage, names)
+
+    monkeypatch.setattr(McapLog, "messages", counted)
+    assert replayed("--truth", str(recording / "truth.json"))
+    assert len(passes) == 3 and passes[0] is None
+
+
+def test_the_clock_is_estimated_from_every_frame_also_where_the_arm_stops_before(
+    replayed: Callable[..., list[dict[str, str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[ImageMotion] = []
+    monkeypatch.setattr(job, "clock_of", lambda _model, _logged, motion: seen.append(motion))
+    for drive in ([], ["--mode", "closed-loop", "--set", "control.max_time=0.1"]):
+        replayed(*drive)
+        replayed(*drive, has_folder=True)
+    stamps = [{name: camera.stamps_ns for name, camera in motion.cameras.items()} for motion in seen]
+    assert all(found == stamps[0] for found in stamps) and {len(s) for s in stamps[0].values()} == {5}
+
+
 def opened(recording: Path, folder: Path, arm: RobotModel, *, latency: float) -> known_scene.KnownScene:
     request = ReplayRequest(
         log=recording / "log.mcap",
@@ -112,8 +144,9 @@ def opened(recording: Path, folder: Path, arm: RobotModel, *, latency: float) ->
         latency=latency,
         mode="closed-loop",
         threads=1,
+        config=load_config(None, SETTINGS),
     )
-    return from_log(request, load_config(None, SETTINGS), arm, folder, SILENT)
+    return from_log(request, arm, folder, SILENT)
 
 
 def test_a_map_is_known_only_after_the_latency(desk: Desk, arm: RobotModel) -> None:

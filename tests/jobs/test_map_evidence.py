@@ -266,7 +266,14 @@ def request(recording: Path, out: Path, **given: Any) -> ReplayRequest:
     options = SourceOptions(cameras=given.pop("cameras", ("cam0", "cam1")))
     urdf = recording / "robot.urdf"
     return ReplayRequest(
-        log=recording / "log.mcap", urdf=urdf, out=out, options=options, lockstep=True, threads=1, **given
+        log=recording / "log.mcap",
+        urdf=urdf,
+        out=out,
+        options=options,
+        config=load_config(None, SETTINGS),
+        lockstep=True,
+        threads=1,
+        **given,
     )
 
 
@@ -277,7 +284,7 @@ def test_frame_sets_that_are_evidence_are_not_fed_to_the_fitter(
     evidence = open_evidence(asked, arm)
     assert evidence is not None
     shown = [step.stamp_ns for step in evidence.frame_sets()]
-    scene = from_log(asked, load_config(None, SETTINGS), arm, tmp_path, SILENT)
+    scene = from_log(asked, arm, tmp_path, SILENT)
     scene.at(2**62)
     stamps = {round((stamp - scene.stamps_ns[0]) / 1e9 * 8) for stamp in scene.stamps_ns}
     assert stamps == {0, 1, 3, 4, 6, 7}

@@ -335,8 +335,7 @@ def test_clocks_that_disagree_turn_the_verdict_alone(
     stage: Stage, monkeypatch: pytest.MonkeyPatch, offset: float, uncertainty: float, code: int
 ) -> None:
     clock = ClockOffset(offset_s=offset, uncertainty_s=uncertainty, correlation=0.9, runner_up=0.2, num_intervals=50)
-    read = job.read_states
-    monkeypatch.setattr(job, "read_states", lambda *given: replace(read(*given), clock=clock))
+    monkeypatch.setattr(job, "clock_of", lambda *given: clock)
     found, verdict = stage.judged()
     assert (found, decisive(verdict)) == (code, {"clocks": "not evaluable"} if code else {})
     assert not code or ("ahead of" if offset > 0 else "behind") in verdict["sentence"]

@@ -19,13 +19,13 @@ from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
-from splatctrl_cli.records import Box, Float64, JointState, RecordSource, RgbdFrame
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.records import Box, Float64, RecordSource
 from splatctrl_cli.robot.coverage import LinkCoverage, coverage_deficit
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import never_apart, without_disabled
 from splatctrl_cli.robot.srdf import read_srdf
-from splatctrl_cli.states.state_source import StateSource, open_states
+from splatctrl_cli.states.state_source import open_states
 
 MAX_NOTES = 10  # printed
 LOG_FIGURES = (
@@ -139,7 +139,7 @@ class LoggedStates:
     source: RecordSource
     states: StateColumns
     poses: PoseAgreement | None
-    clock: ClockOffset | None
+    clock: ClockOffset | None = None
 
     def as_dict(self) -> Mapping[str, Any]:
         """For states.json."""
@@ -181,25 +181,19 @@ class LoggedStates:
 
 
 def read_states(request: ReplayRequest, model: RobotModel) -> LoggedStates:
-    """The states of the robot's joints in a log. Raises InputError where there are none, or none that can be its."""
+    """The states of the robot's joints in a log, whose frames are not read yet: `clock_of` is known after them.
+
+    Raises InputError where there are no states, or none that can be the robot's.
+    """
     source = open_states(request.log, request.options, model.joint_names)
     if not source.joint_names:
         raise InputError(
             f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
         )
-    order = model.joint_order(source.joint_names)
-    collector, motion = StateCollector(len(source.joint_names)), ImageMotion()
-    for record in () if isinstance(source, StateSource) else source.records():
-        if isinstance(record, JointState):
-            collector.add(record)
-        elif isinstance(record, RgbdFrame):
-            motion.add(record)
-    logged = source.states if isinstance(source, StateSource) else collector.columns()
-    states = logged.of_joints(order)
+    states = source.states.of_joints(model.joint_order(source.joint_names))
     check_states(states, model.joint_names)
     check_angles(model, states, source.name)
-    clock = _clock(model, states, motion) if motion.cameras and source.has_clock and len(states) else None
-    return LoggedStates(source=source, states=states, poses=pose_agreement(model, states), clock=clock)
+    return LoggedStates(source=source, states=states, poses=pose_agreement(model, states))
 
 
 def check_inside(model: RobotModel, q: Float64, box: Box) -> None:
@@ -216,8 +210,11 @@ def check_inside(model: RobotModel, q: Float64, box: Box) -> None:
     )
 
 
-def _clock(model: RobotModel, states: StateColumns, motion: ImageMotion) -> ClockOffset:
-    """Of the states that it looks at."""
+def clock_of(model: RobotModel, logged: LoggedStates, motion: ImageMotion) -> ClockOffset | None:
+    """The offset of the cameras' clock, by how the log's images change; None without images, times or states."""
+    states = logged.states
+    if not motion.cameras or not logged.source.has_clock or not len(states):
+        return None
     asked = states.select(states_asked(states.stamp_ns, motion))
     centers = model.sphere_centers_batch(asked.position[: len(asked)])
     moving = model.moving_spheres

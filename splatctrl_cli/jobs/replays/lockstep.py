@@ -1,6 +1,7 @@
 """A log's reconstruction in lockstep with its replay: frame sets are taken in as the replay's clock passes them."""
 
 from bisect import bisect_right
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from splatctrl_cli.jobs.replays.known_scene import (
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.stored_frame import FrameSource
-from splatctrl_cli.records import Float64, RecordSource, UInt8
+from splatctrl_cli.records import Float64, RecordSource, RgbdFrame, UInt8
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
@@ -53,9 +54,10 @@ def opened_scene(
     folder: Path,
     console: Progress,
     source: RecordSource,
+    observe: Callable[[RgbdFrame], None] | None = None,
 ) -> KnownScene:
     """The scene that the options of a replay name; what --lockstep reconstructs, of the log `source`, goes into
-    `folder`.
+    `folder`, and `observe` is shown every frame of it.
     """
     if request.field is not None:
         if request.config.control.human_margin > request.config.control.margin:
@@ -65,26 +67,33 @@ def opened_scene(
         return from_grid(request.field)
     if request.scene is not None:
         return from_splats(request.scene, request.config, request.threads, latency_ns=_latency_ns(request))
-    return from_log(request, request.config, model, folder, console, declared, source)
+    return from_log(request, model, folder, console, declared, source, observe)
 
 
 def _latency_ns(request: ReplayRequest) -> int:
     return int(request.latency * 1e9 + 0.5)
 
 
+def reads_whole_log(request: ReplayRequest, source: RecordSource) -> bool:
+    """Whether the scene is made of all frames of the log as it was opened: none is left out as evidence."""
+    return request.lockstep and request.evidence not in source.cameras
+
+
 def from_log(
     request: ReplayRequest,
-    config: Config,
     model: RobotModel,
     folder: Path,
     console: Progress,
     declared: Declarations | None = None,
     source: RecordSource | None = None,
+    observe: Callable[[RgbdFrame], None] | None = None,
 ) -> KnownScene:
     """The scene that a log's own cameras give as it goes; what is reconstructed is left in `folder`/scene.
 
-    source: the log, where it is open already. Raises InputError for a log without frames or a clock.
+    source: the log, where it is open already. observe: is shown every frame of it, those behind the replay's end when
+    that is done. Raises InputError for a log without frames or a clock.
     """
+    config = request.config
     source = _training_source(request, model, source)
     check_pose_jumps(source, request.max_pose_jump)
     place = folder / FOLDER
@@ -97,7 +106,9 @@ def from_log(
         threads=request.threads,
         allow_disagreement=request.allow_disagreement,
     )
-    fitted = Reconstruction(asked, model, place, identity={"command": "replay --lockstep"}, declared=declared)
+    fitted = Reconstruction(
+        asked, model, place, identity={"command": "replay --lockstep"}, declared=declared, observe=observe
+    )
     lockstep = Lockstep(
         fitted,
         config,
@@ -204,8 +215,14 @@ class Lockstep:
         return known(points)
 
     def _finish(self) -> None:
-        """Leave a scene folder as `reconstruct` writes it, of the frame sets that were taken in."""
+        """Leave a scene folder as `reconstruct` writes it, of the frame sets that were taken in; the others are only
+        shown to who observes.
+        """
         fitted = self._fitted
+        if fitted.observe is not None:
+            with self._stopwatch.stage("read"):
+                for _ in self._steps:
+                    pass
         with self._stopwatch.stage("write"):
             fitted.finish()
         write_run(

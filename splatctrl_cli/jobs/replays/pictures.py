@@ -1,6 +1,6 @@
 """The plots of a replay's output folder, and pictures of the moments at which it was nearest to the scene."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,9 +77,9 @@ def _intervals(
     return found
 
 
-def draw_worst_frames(folder: Path, inputs: ReplayInputs, replay: Replay, num: int) -> list[str]:
-    """Write worst_1.png (the least clearance, by the truth where that is known), worst_2.png ...; what there is to
-    say of it.
+def worst_sights(inputs: ReplayInputs, replay: Replay, num: int, frames: Iterable[RgbdFrame]) -> list[Sight | None]:
+    """The images of the moments of least clearance, by the truth where that is known, the least first; None where no
+    camera has one. Frames behind the last moment are not read.
     """
     audit = replay.audit
     least = audit.clearance["exact"].distance
@@ -88,19 +88,17 @@ def draw_worst_frames(folder: Path, inputs: ReplayInputs, replay: Replay, num: i
     states = worst_moments(audit.stamp_ns, least, num)
     if not states or not inputs.source.has_clock:
         return []
-    moments = [_moment(inputs, replay, state) for state in states]
-    sights = sights_of(moments, _frames(inputs))
+    return sights_of([_moment(inputs, replay, state) for state in states], frames)
+
+
+def draw_worst_frames(folder: Path, replay: Replay, sights: Sequence[Sight | None]) -> list[str]:
+    """Write worst_1.png, worst_2.png ...; what there is to say of it."""
     seen = [sight for sight in sights if sight is not None]
     for number, sight in enumerate(seen, start=1):
         draw_sight(folder / f"worst_{number}.png", _explained(sight, number, replay))
-    if len(seen) < len(states):
-        return [f"worst frames: no camera image at or before {len(states) - len(seen)} of {len(states)} moments"]
+    if len(seen) < len(sights):
+        return [f"worst frames: no camera image at or before {len(sights) - len(seen)} of {len(sights)} moments"]
     return []
-
-
-def _frames(inputs: ReplayInputs) -> Iterator[RgbdFrame]:
-    records = inputs.source.records() if inputs.source.cameras else ()
-    return (record for record in records if isinstance(record, RgbdFrame))
 
 
 def _moment(inputs: ReplayInputs, replay: Replay, state: int) -> Moment:

@@ -12,14 +12,28 @@ from splatctrl_cli.evaluate.clearance_agreement import clearance_agreement, mark
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
 from splatctrl_cli.jobs.replays.request import ReplayInputs
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.records import Float64, RgbdFrame, Stamps
 from splatctrl_cli.simulate.truth import distance_to
 
 
-def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
-    """The true clearance of every state, and how an audit agrees with it near surfaces that a camera saw."""
+class TrueSurfaces:
+    """The true surface points (T, 3) [m] nearest to each state's spheres, and which of them a camera saw by then."""
+
+    def __init__(self, points: Rows, stamp_ns: Stamps, inputs: ReplayInputs) -> None:
+        self._points, self._stamp_ns = points, stamp_ns
+        self._cameras, self._has_clock = inputs.scene.cameras, inputs.source.has_clock
+        self.seen = np.zeros(len(stamp_ns), dtype=np.bool_)
+
+    def see(self, frame: RgbdFrame) -> None:
+        """Take the next frame, of a camera that made the scene."""
+        if self._cameras is None or frame.camera in self._cameras:
+            mark_seen(self.seen, self._points, self._stamp_ns, frame, has_clock=self._has_clock)
+
+
+def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
+    """With the true clearance of every state and its events, and the surfaces that it is to; None without a truth."""
     if inputs.truth is None:
-        return replay
+        return replay, None
     model, trace = inputs.model, replay.audit
     moving = np.flatnonzero(model.moving_spheres)
     radii = model.sphere_set.radii[moving]
@@ -37,17 +51,21 @@ def with_truth(inputs: ReplayInputs, replay: Replay) -> Replay:
         clearances.append(clearance)
         nearest_spheres.append(spheres)
         surfaces.append(surface)
-    truth, seen = Rows(clearances), np.zeros(len(clearances), dtype=np.bool_)
+    truth = Rows(clearances)
     events = _true_events(inputs, replay, np.asarray(truth), Rows(nearest_spheres))
-    for record in inputs.source.records() if inputs.source.cameras else ():
-        if isinstance(record, RgbdFrame) and (inputs.scene.cameras is None or record.camera in inputs.scene.cameras):
-            mark_seen(seen, Rows(surfaces), trace.stamp_ns, record, has_clock=inputs.source.has_clock)
-    agreement = {
-        name: clearance_agreement(of.distance, np.asarray(truth), seen, replay.median_radius)
-        for name, of in trace.clearance.items()
-    }
     merged = tuple(sorted((*replay.events, *events), key=lambda event: (event.first_ns, -event.last_ns)))
-    return replace(replay, true_clearance=truth, agreement=agreement, events=merged)
+    found = replace(replay, true_clearance=truth, events=merged)
+    return found, TrueSurfaces(Rows(surfaces), trace.stamp_ns, inputs)
+
+
+def with_agreement(replay: Replay, surfaces: TrueSurfaces) -> Replay:
+    """With how an audit agrees with the truth near surfaces that a camera saw, once all frames have been seen."""
+    truth = np.asarray(replay.true_clearance)
+    agreement = {
+        name: clearance_agreement(of.distance, truth, surfaces.seen, replay.median_radius)
+        for name, of in replay.audit.clearance.items()
+    }
+    return replace(replay, agreement=agreement)
 
 
 def _unexpected(
