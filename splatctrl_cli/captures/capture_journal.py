@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from splatctrl_cli.captures.capture_index import MASKS
 from splatctrl_cli.errors import InputError, UsageError
 
 JOURNAL = "ingest.jsonl"  # in the folder while it is partial
@@ -78,7 +79,7 @@ class Journal:
 
     def _count(self, entry: Entry) -> None:
         self.num_entries += 1
-        self.masks |= {"human", "valid"} & entry.row.keys()
+        self.masks |= set(MASKS) & entry.row.keys()
         self.has_provenance |= bool(entry.provenance)
 
     def _cut(self) -> None:

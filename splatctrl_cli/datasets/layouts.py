@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from splatctrl_cli.captures.capture_journal import check_not_partial
+from splatctrl_cli.containers.log_formats import SUFFIXES
 from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.errors import InputError
@@ -10,7 +11,6 @@ from splatctrl_cli.files.listing import names_in
 from splatctrl_cli.files.registry import entries_of
 from splatctrl_cli.logs.source_options import SourceOptions
 
-_LOGS = (".mcap", ".bag", ".db3")
 _MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is not itself one
 
 LAYOUTS = entries_of(__package__, Layout)
@@ -43,7 +43,7 @@ def readable_in(folder: Path) -> str:
     found = []
     for name in names_in(folder)[:_MOST_LOOKED_AT]:
         path = folder / name
-        if path.is_file() and path.suffix in _LOGS:
+        if path.is_file() and path.suffix in SUFFIXES:
             found.append(path.name)
         elif path.is_dir() and (layout := layout_of(path)) is not None:
             found.append(f"{path.name} ({layout.name})")

@@ -159,11 +159,13 @@ class Trajectory:
         return self._tree.lookup("world", "camera", stamp_ns, POSE_TOLERANCE_NS)
 
 
-def stamp_of_text(text: str) -> int | None:
-    """Nanoseconds of seconds as written, without the rounding of floats; None where the text is not a time."""
+def stamp_of_text(text: str, unit_ns: int = 1_000_000_000) -> int | None:
+    """Nanoseconds of a time as written in units of so many (default: seconds), without the rounding of floats; None
+    where the text is not a time.
+    """
     try:
-        stamp_ns = round(Decimal(text) * 1_000_000_000)
-        return stamp_ns if abs(stamp_ns) < _MOST_NS else None
+        stamp_ns = Decimal(text) * unit_ns
+        return round(stamp_ns) if abs(stamp_ns) < _MOST_NS else None  # rounding 1e999 writes out its digits
     except (InvalidOperation, ValueError, OverflowError):
         return None
 

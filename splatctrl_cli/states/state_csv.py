@@ -4,12 +4,12 @@ import csv
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.datasets.poses import stamp_of_text
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, absent, blocks_of
 from splatctrl_cli.logs.state_messages import NAMELESS, pose_of_columns
@@ -97,13 +97,10 @@ class CsvTable:
         return values
 
     def _stamp(self, row: list[str], number: int, column: int, unit_ns: int) -> int:
-        try:
-            stamp = Decimal(row[column].strip()) * unit_ns
-            if abs(stamp) < 1 << 62:  # rounding a large exponent would write out its digits
-                return round(stamp)
-        except (InvalidOperation, ValueError, OverflowError):
-            pass
-        raise self._no_number(row, number, column)
+        stamp_ns = stamp_of_text(row[column].strip(), unit_ns)
+        if stamp_ns is None:
+            raise self._no_number(row, number, column)
+        return stamp_ns
 
     def _no_number(self, row: list[str], number: int, column: int) -> InputError:
         return InputError(
