@@ -1,9 +1,7 @@
 """Which recording a job trains on or compares with, and how it is opened."""
 
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
 
 from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.containers.log_formats import is_bag_folder
@@ -17,14 +15,6 @@ from splatctrl_cli.scene.recording_consistency import largest_jump
 from splatctrl_cli.sources.source import open_source
 
 DEFAULT_POSE_JUMP = 1.0  # [m]
-_Item = TypeVar("_Item")
-
-
-def observed(items: Iterable[_Item], observe: Callable[[_Item], None]) -> Iterator[_Item]:
-    """The same items, each shown to `observe` on its way, so that one pass serves both."""
-    for item in items:
-        observe(item)
-        yield item
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,6 @@ from tqdm import tqdm
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
-from splatctrl_cli.jobs.open_recording import observed
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
@@ -334,8 +333,8 @@ class Reconstruction:
 
     def time_steps(self) -> Iterator[TimeStep]:
         """Those of the source, from its beginning."""
-        records = observed(self.source.records(), self._see)
-        steps = time_steps(records, self.cameras, has_clock=self.source.has_clock)
+        records, has_clock = self.source.records(), self.source.has_clock
+        steps = time_steps(records, self.cameras, has_clock=has_clock, observe=self._see)
         return steps if self.cloud is None else (step.without_depth() for step in steps)
 
     def _see(self, record: Record) -> None:

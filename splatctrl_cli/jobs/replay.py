@@ -11,7 +11,6 @@ from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.evaluate.views import frames_of
 from splatctrl_cli.evaluate.worst_frames import Sight
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json
-from splatctrl_cli.jobs.open_recording import observed
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import declarations_of
 from splatctrl_cli.jobs.replays.criteria_input import Judged
@@ -129,7 +128,7 @@ def _seen_by_cameras(
     frames: Iterator[RgbdFrame] = frames_of(inputs.source) if inputs.source.cameras else iter(())
     replay, surfaces = with_truth(inputs, replay)
     if surfaces is not None:
-        frames = observed(frames, surfaces.see)
+        frames = surfaces.watching(frames)
     sights = worst_sights(inputs, replay, request.worst_frames, frames)
     if surfaces is not None:
         for _ in frames:  # those that no moment needs

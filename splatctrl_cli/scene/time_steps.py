@@ -1,6 +1,6 @@
 """Groups a stream of records into time steps, and finds the workspace."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,13 +52,22 @@ class TimeStep:
 
 
 def time_steps(
-    records: Iterator[Record], cameras: Collection[str], *, has_clock: bool, tolerance_ns: int = 20_000_000
+    records: Iterator[Record],
+    cameras: Collection[str],
+    *,
+    has_clock: bool,
+    tolerance_ns: int = 20_000_000,
+    observe: Callable[[Record], None] = lambda record: None,
 ) -> Iterator[TimeStep]:
-    """Group the frames of `cameras`: with a clock by stamp, else up to 128 views at a time."""
+    """Group the frames of `cameras`: with a clock by stamp, else up to 128 views at a time.
+
+    observe: is shown every record on its way, of whatever camera, so that one pass serves both.
+    """
     frames: list[RgbdFrame] = []
     newest: JointState | None = None
     at_frames: JointState | None = None
     for record in records:
+        observe(record)
         if isinstance(record, JointState):
             newest = record
             continue

@@ -1,5 +1,6 @@
 """The true clearance of a replay's states, where the log was simulated."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -24,10 +25,12 @@ class TrueSurfaces:
         self._cameras, self._has_clock = inputs.scene.cameras, inputs.source.has_clock
         self.seen = np.zeros(len(stamp_ns), dtype=np.bool_)
 
-    def see(self, frame: RgbdFrame) -> None:
-        """Take the next frame, of a camera that made the scene."""
-        if self._cameras is None or frame.camera in self._cameras:
-            mark_seen(self.seen, self._points, self._stamp_ns, frame, has_clock=self._has_clock)
+    def watching(self, frames: Iterable[RgbdFrame]) -> Iterator[RgbdFrame]:
+        """The same frames; those of a camera that made the scene are taken in on their way."""
+        for frame in frames:
+            if self._cameras is None or frame.camera in self._cameras:
+                mark_seen(self.seen, self._points, self._stamp_ns, frame, has_clock=self._has_clock)
+            yield frame
 
 
 def with_truth(inputs: ReplayInputs, replay: Replay) -> tuple[Replay, TrueSurfaces | None]:
