@@ -9,15 +9,15 @@ import pytest
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Capsule
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive, Texture, signed_distance
-from splatctrl_cli.simulate.tabletop import Motion
 from splatctrl_cli.sources.source import open_source
 from tools.hunt.clearance import TrueArm, interpolated, least_clearance
 from tools.hunt.families import CAMERAS, FAMILIES, Draft
 from tools.hunt.faults import Fault
 from tools.hunt.observability import observable
 from tools.hunt.recording import Recorder, Shown
-from tools.hunt.table import Row, border_of, upper_limit
+from tools.hunt.table import Row, append_rows, border_of, read_rows, report, upper_limit
 from tools.hunt.trial import Trial, draw, record, run, true_robot
 from tools.hunt.world import DURATION_S, World, at_s, draw_cameras, during, moving, positions_of, table
 
@@ -334,9 +334,24 @@ def test_a_false_green_is_safe_in_contact_or_five_millimetres_under_the_margin()
     assert not row(clearance=-0.001, outcome="not evaluable").is_false_green
 
 
+def test_rows_come_back_from_the_table_as_they_were(tmp_path: Path) -> None:
+    rows = [row(), row(index=2, outcome="contact", reason="a, b", clearance=-0.0125, observable=False)]
+    append_rows(tmp_path / "t.csv", rows[:1])
+    append_rows(tmp_path / "t.csv", rows[1:])
+    assert read_rows(tmp_path / "t.csv") == rows
+
+
 def test_the_upper_limit_of_no_failure_in_two_thousand_is_fifteen_in_ten_thousand() -> None:
     assert abs(upper_limit(0, 2000) - 0.0015) < 1e-5
     assert upper_limit(5, 5) == 1.0
+
+
+def test_the_report_names_false_greens_and_counts_the_benign() -> None:
+    rows = [row(), row(index=2, clearance=-0.01), row(index=3, outcome="contact", reason="clearance 0.001 m")]
+    text = "\n".join(report(rows))
+    assert "false green, contact, observable: 1 of 3 runs" in text
+    assert "0/2 benign" in text
+    assert "1 of 2 safe (50.0 %)" in text
 
 
 def test_the_border_is_safe_by_least_and_broken_by_least() -> None:
@@ -375,3 +390,8 @@ def test_what_was_once_a_false_green_is_none(seed: int, index: int) -> None:
 def test_no_run_near_the_border_is_a_false_green(seed: int, index: int) -> None:
     found = run(seed, index)
     assert not (found.is_false_green and found.observable), found
+
+
+def test_a_run_is_the_same_twice() -> None:
+    seed, index = border()[0]
+    assert run(seed, index) == run(seed, index)

@@ -22,9 +22,9 @@ from splatctrl_cli.robot.coverage import CoverageReport, coverage_deficit
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive, Track
 from splatctrl_cli.simulate.render import Camera
-from splatctrl_cli.simulate.tabletop import Motion
 from splatctrl_cli.sources.source import open_source
 from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, least_clearance
 from tools.hunt.families import FAMILIES, ORDER, Draft

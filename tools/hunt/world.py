@@ -9,10 +9,11 @@ from splatctrl_cli.geometry import invert_transform, look_at, project, transform
 from splatctrl_cli.records import Box, Float64, Intrinsics
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Capsule
+from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture, Track
 from splatctrl_cli.simulate.recording import START_NS
 from splatctrl_cli.simulate.render import Camera
-from splatctrl_cli.simulate.tabletop import PALETTE, Motion
+from splatctrl_cli.simulate.tabletop import PALETTE
 from tools.hunt.clearance import Stamps, TrueArm
 
 BOX = Box(lower=np.array([-0.30, -0.70, -0.06]), upper=np.array([0.95, 0.70, 1.00]))
