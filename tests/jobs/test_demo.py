@@ -23,8 +23,8 @@ def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
         return Summary(path="x", kind="y", damaged=num_damaged)
 
     def steps(request: DemoRequest, folder: Path, progress: object) -> list[Step]:
-        good = Step(words=["info", f"{folder}/a"], run=lambda: described(0))
-        return [good, Step(words=["info", "b"], run=lambda: described(damaged))]
+        good = Step(words=["info", f"{folder}/a"], run=lambda: described(0), expected="done")
+        return [good, Step(words=["info", "b"], run=lambda: described(damaged), expected="done")]
 
     monkeypatch.setattr(module, "_steps", steps)
     monkeypatch.setattr(module, "_draw", lambda *_: None)
