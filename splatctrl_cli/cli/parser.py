@@ -152,6 +152,7 @@ class Options:
             meaning += " (repeatable)"
         elif default is not None:
             more["default"] = default
+        if default is not None and default != [] and more.get("action") != "count":
             meaning += f" (default: {default:g})" if isinstance(default, int | float) else f" (default: {default})"
         names = [flags.lower()] if is_place else flags.split("/")
         self._container.add_argument(*names, help=meaning.replace("%", "%%"), **more)

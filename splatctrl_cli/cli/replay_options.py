@@ -66,7 +66,7 @@ def _add_goal(add: Options) -> None:
     goal("--follow", "the logged pose of each time is the goal (the default of --mode open-loop)")
     twists = "reach for the twists of this topic of LOG (Twist, TwistStamped), or of a .toml's table: twists"
     goal("--twist-topic NAME", twists)
-    add("--twist-frame LINK", "whose axes they are in: world or a link (default: as the log says)")
+    add("--twist-frame LINK", "axes of the twists: world or those of a link (default: as the log says)")
     back = "put the arm back into the logged configuration every S seconds"
     add("--re-anchor S", back, real(1e-3, MAX_SECONDS, "s"))
 
@@ -78,8 +78,8 @@ def _add_evidence(add: Options) -> None:
     add("--latency S", late, real(0, MAX_SECONDS, "s"), 0.0)
     add(
         "--evidence CAMERA|K",
-        "bound the map's error by the depth of a camera of LOG that did not train it, or (--lockstep) of every K-th"
-        " frame set, which then does not",
+        "bound the map's error by depth that is kept out of the map: of a camera of LOG that did not train it, or"
+        " (--lockstep) of every K-th frame set",
     )
     add("--require-evidence", "a replay whose map error nothing bounds cannot be evaluated (exit 5)")
     add_disagreement(add)
@@ -104,7 +104,7 @@ def _add_comparison(add: Options) -> None:
     add("--zone STOP,RESUME", "distances [m] of that zone", str, "0.5,0.6")
     add(
         f"--zone-box {BOX}",
-        "a box [m] instead: stop while a person is in it, until nobody is within RESUME - STOP of it",
+        "a box [m] instead: stop while a person is in it, go on when nobody is within RESUME - STOP of it",
     )
     person = "a primitive of --truth that counts as a person; default: human*, person*"
     add("--human NAME ...", person)

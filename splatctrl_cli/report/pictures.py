@@ -1,4 +1,4 @@
-"""Pictures a person can look at: renders beside photos, slices of a distance field, clearance over time.
+"""Pictures a person can look at: renders beside photos and slices of a distance field; what all pictures share.
 
 Drawn through Matplotlib's Figure: nothing global is touched. Colours are those of Okabe and Ito or maps that stay
 readable without red and green.
