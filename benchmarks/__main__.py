@@ -17,7 +17,7 @@ NAMES = (
     "iteration",
     "streaming",
     "occupancy",
-    "sufficiency",
+    "eviction_cost",
     "field",
     "control",
     "cli",

@@ -28,7 +28,7 @@ def run(options: Options) -> Result:
         rows.append([str(budget), *(f"{spent[name]:.2f}" for name in (*PARTS, "steps")), f"{100 * share:.1f}"])
         figures[f"budget_{budget}_share"] = share
     return Result(
-        title="sufficiency: the sample log, seconds of the whole run",
+        title="eviction_cost: the sample log, seconds of the whole run",
         columns=("splats", *PARTS, "time steps", "share [%]"),
         rows=rows,
         figures=figures,
