@@ -343,13 +343,14 @@ class Balls:
 class SeenVoxels:
     """When cameras last saw each voxel: its centre is `origin` [m] + its index times the edge `voxel` [m].
 
-    last_seen (X, Y, Z) uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which a camera
-    returned depth through or on the voxel, 0 never, `UNANSWERED` never although one looked at it.
+    last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which
+    a camera returned depth through or on the voxel, 0 never, the type's largest number (`UNANSWERED` in uint16) never
+    although one looked at it.
     """
 
     origin: Float64
     voxel: float
-    last_seen: NDArray[np.uint16]
+    last_seen: NDArray[np.uint8] | NDArray[np.uint16]
     step_stamps_ns: NDArray[np.int64]
 
     def last_seen_ns(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -358,14 +359,18 @@ class SeenVoxels:
         is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
         i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
         step = np.where(is_inside, self.last_seen[i, j, k], 0).astype(np.int64)
-        return np.concatenate([[-1], self.step_stamps_ns])[np.where(step == UNANSWERED, 0, step)]
+        return np.concatenate([[-1], self.step_stamps_ns])[np.where(step == self._unanswered, 0, step)]
 
     @cached_property
     def unanswered(self) -> Float64:
         """Centres (K, 3) [m], world, of the voxels that a camera looked at and that never returned depth."""
-        flat = np.flatnonzero(self.last_seen == UNANSWERED)  # ten times as fast as argwhere
+        flat = np.flatnonzero(self.last_seen == self._unanswered)  # ten times as fast as argwhere
         cells = np.stack(np.unravel_index(flat, self.last_seen.shape), axis=1)
         return np.asarray(self.origin + self.voxel * cells)
+
+    @property
+    def _unanswered(self) -> int:
+        return int(np.iinfo(self.last_seen.dtype).max)
 
 
 @dataclass(frozen=True, kw_only=True)

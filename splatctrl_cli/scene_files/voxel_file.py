@@ -168,7 +168,7 @@ def _read_known(
         arrays = read_arrays(path, (*names, *_EVIDENCE), most=22 * MOST_VOXELS)
         grid = grid_of(arrays, header)
         stamps_ns = np.array(header["step_stamps_ns"], np.int64)
-        last_seen = _last_seen(arrays["last_seen"], header, len(stamps_ns))
+        last_seen = _widened(_last_seen(arrays["last_seen"], header, len(stamps_ns)))
         balls = _balls(arrays, grid.voxel)
         return KnownVoxels(grid=grid, last_seen=last_seen, step_stamps_ns=stamps_ns, unrepresented=balls)
 
@@ -186,21 +186,28 @@ def _grid_of_states(arrays: Arrays, header: Mapping[str, Any]) -> OccupancyGrid:
     return OccupancyGrid.from_states(np.array(header["origin"], np.float64), float(header["voxel"]), states)
 
 
-def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[np.uint16]:
-    """In two bytes, whichever it was stored in. Raises ValueError for another shape, or steps that there are not."""
+def _last_seen(stored: NDArray[Any], header: Mapping[str, Any], num_steps: int) -> NDArray[Any]:
+    """As it was stored, in one byte or two, of which the largest number says that a camera looked in vain.
+
+    Raises ValueError for another shape, or time steps that there are not.
+    """
     is_short = stored.dtype == np.uint8
     stored = _voxels(stored, "last_seen", np.uint8 if is_short else np.uint16, header)
-    is_unanswered = stored == (_SHORT if is_short else UNANSWERED)
-    if is_short and num_steps >= _SHORT:
-        is_unanswered[:] = False
-    is_late = stored > num_steps
+    if is_short and num_steps >= _SHORT:  # as older versions wrote it: the largest number is a time step too
+        stored = stored.astype(np.uint16)
+    is_late, is_unanswered = stored > num_steps, stored == np.iinfo(stored.dtype).max
     if np.count_nonzero(is_late) > np.count_nonzero(is_unanswered):
         latest = stored[is_late & ~is_unanswered].max()
         raise ValueError(f"last_seen: expected at most {num_steps} time steps, got {latest}")
-    last_seen = stored.astype(np.uint16)
-    if is_short:
-        last_seen[is_unanswered] = UNANSWERED
-    return last_seen
+    return stored
+
+
+def _widened(last_seen: NDArray[Any]) -> NDArray[np.uint16]:
+    """In two bytes."""
+    wide = last_seen.astype(np.uint16)
+    if last_seen.dtype == np.uint8:
+        wide[last_seen == _SHORT] = UNANSWERED
+    return wide
 
 
 def _balls(arrays: Arrays, voxel: float) -> Balls:
