@@ -35,7 +35,7 @@ EDGE_STEP = 0.03  # of its depth: a pixel that differs more from a neighbour may
 FREE_TOLERANCE = 0.005  # [m] behind the measured depth that still counts as seen free: the noise of a depth camera
 PROBES = (0.3, 0.6, 0.9)  # of the ball's radius; an object thinner than the gaps between them may be missed
 NUM_DIRECTIONS = 96  # of each
-ROBOT_MARGIN = 0.03  # [m] about the robot's spheres in which a pixel does not count
+ROBOT_MARGIN = 0.03  # [m] about the robot's spheres in which a measured point may be the robot itself
 
 
 @dataclass(frozen=True, kw_only=True)

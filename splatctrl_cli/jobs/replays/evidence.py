@@ -18,7 +18,7 @@ from splatctrl_cli.config.motion import VerdictConfig
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
-from splatctrl_cli.evaluate.held_out_depth import depth_edges
+from splatctrl_cli.evaluate.held_out_depth import ROBOT_MARGIN, depth_edges
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.files.spilled_rows import ranges
 from splatctrl_cli.geometry import back_project, transform_points
@@ -34,7 +34,6 @@ from splatctrl_cli.states.state_source import open_states
 
 EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
 CELL = 0.02  # [m] to which the places of spheres are rounded
-ROBOT_MARGIN = 0.03  # [m] about the robot's spheres in which a point may be the robot itself
 
 
 @dataclass(frozen=True, kw_only=True)
