@@ -10,8 +10,9 @@ from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.files.output import write_json
 from splatctrl_cli.geometry import look_at
-from splatctrl_cli.records import Intrinsics, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Intrinsics, SplatSet
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
+from splatctrl_cli.voxels import OccupancyGrid
 from tests.datasets.make_layout import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
 from tests.known_voxels import known
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatctrl_cli.records import Balls, KnownVoxels, OccupancyGrid
+from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid
 
 
 def known(grid: OccupancyGrid, stamp_ns: int = 0, unrepresented: ArrayLike = (), label: int = 0) -> KnownVoxels:

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatctrl_cli.records import Float64, Intrinsics, OccupancyGrid, RgbdFrame, SplatSet
+from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame, SplatSet
+from splatctrl_cli.voxels import OccupancyGrid
 
 
 def plain_frame(

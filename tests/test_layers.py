@@ -5,7 +5,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parent.parent / "splatctrl_cli"
 ROOMS = [  # a room imports those of the rows above its own
-    ["records", "geometry", "config", "errors", "kernels", "libraries", "mesh_distance"],
+    ["records", "geometry", "config", "errors", "kernels", "libraries", "mesh_distance", "voxels"],
     ["robot", "files"],
     ["containers", "splat_files", "grid_files", "report"],
     ["logs", "scene_files"],

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, filled, psnr, published_ssim, ssim_map
-from splatctrl_cli.records import Bool, Float32, Float64, Label, OccupancyGrid, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, SplatSet
+from splatctrl_cli.voxels import OccupancyGrid
 
 Perceptual = Callable[[Float64, Float64], float]
 """Render and photo (H, W, 3) in [0, 1] -> LPIPS."""

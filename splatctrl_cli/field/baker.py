@@ -14,7 +14,8 @@ from splatctrl_cli.field.grid_cells import HALF_DIAGONAL, RESOLUTION, GridLayout
 from splatctrl_cli.field.probability import make_probability
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import BLOCK, GridSpan
-from splatctrl_cli.records import Bool, Float32, OccupancyGrid, SplatSet, UInt8
+from splatctrl_cli.records import Bool, Float32, SplatSet, UInt8
+from splatctrl_cli.voxels import OccupancyGrid
 
 CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
     "sdf": ("<f4", 1),

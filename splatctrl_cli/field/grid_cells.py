@@ -8,7 +8,8 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Box, Float64, OccupancyGrid, SplatSet, UInt8, VoxelState
+from splatctrl_cli.records import Box, Float64, SplatSet, UInt8
+from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 PROC, CGROUP = Path("/proc"), Path("/sys/fs/cgroup")
 

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.records import Balls, Label, SplatSet
+from splatctrl_cli.records import Label, SplatSet
+from splatctrl_cli.voxels import Balls
 
 DEFAULT_LABELS = frozenset({Label.OBJECT, Label.HUMAN})
 NO_SPLAT = -1

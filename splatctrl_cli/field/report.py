@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.grid_cells import RESOLUTION
 from splatctrl_cli.field.grid_field import exact_channel
-from splatctrl_cli.records import DistanceGrid, Float32, VoxelState
+from splatctrl_cli.records import DistanceGrid, Float32
+from splatctrl_cli.voxels import VoxelState
 
 CHUNK_CELLS = 1 << 20  # that are looked at together
 BIN = 0.05  # of the histogram of the gradient's length: bin k is about k times this

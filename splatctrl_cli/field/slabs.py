@@ -13,7 +13,8 @@ from splatctrl_cli.field.header import field_header
 from splatctrl_cli.field.obstacles import DEFAULT_LABELS, field_splats
 from splatctrl_cli.field.unknown import BOUND, Cubes, apply_unknown, blank
 from splatctrl_cli.kernels.field import BLOCK
-from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, OccupancyGrid, SplatSet, UInt8, VoxelState
+from splatctrl_cli.records import Bool, Box, DistanceGrid, Label, SplatSet, UInt8
+from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 
 SLAB_BYTES = 48 << 20  # of the channels of a slab, or what a block's planes take
 _CUBES = 64  # bytes of a cell that finding the nearest never-seen one takes, of the whole grid

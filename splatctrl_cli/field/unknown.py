@@ -11,7 +11,8 @@ from splatctrl_cli.config import FieldConfig
 from splatctrl_cli.config.ranges import check
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.field.grid_cells import HALF_DIAGONAL
-from splatctrl_cli.records import Bool, DistanceGrid, Float32, VoxelState
+from splatctrl_cli.records import Bool, DistanceGrid, Float32
+from splatctrl_cli.voxels import VoxelState
 
 BLANKED = ("sdf", "gradient", "probability")  # by nan
 ROUNDING = 1e-6  # [m] and of a distance: what float32 may raise it by

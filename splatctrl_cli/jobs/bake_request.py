@@ -16,9 +16,10 @@ from splatctrl_cli.field.obstacles import DEFAULT_LABELS
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.records import Balls, Box, DistanceGrid, Label, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
 from splatctrl_cli.splat_files.splats import read_world_splats
+from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.libraries import mpl
-from splatctrl_cli.records import DistanceGrid, Float64, VoxelState
+from splatctrl_cli.records import DistanceGrid, Float64
 from splatctrl_cli.report.pictures import (
     CONTOURS,
     INK,
@@ -21,6 +21,7 @@ from splatctrl_cli.report.pictures import (
     extent_of,
     save_figure,
 )
+from splatctrl_cli.voxels import VoxelState
 
 LONGEST_SIDE = 600  # cells of a slice that are drawn along a side: a larger one is thinned out
 MAX_LENGTH = 1.5  # of a gradient, top of its colour bar

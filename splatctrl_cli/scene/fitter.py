@@ -9,18 +9,7 @@ import numpy as np
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.raster import LossTerms
-from splatctrl_cli.records import (
-    Balls,
-    Bool,
-    Box,
-    Float32,
-    KnownVoxels,
-    Label,
-    OccupancyGrid,
-    PointCloud,
-    RgbdFrame,
-    SplatSet,
-)
+from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet
 from splatctrl_cli.scene.audit_row import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
@@ -56,6 +45,7 @@ from splatctrl_cli.scene.self_mask import (
     without_mixed,
 )
 from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
+from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid
 
 MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
 NOT_COVERED = 0.05  # accumulated opacity below which the background shows

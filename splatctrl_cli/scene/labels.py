@@ -6,11 +6,12 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.geometry import invert_transform, project, transform_points
-from splatctrl_cli.records import SOLID, Bool, Float32, Label, RgbdFrame, UInt8
+from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, tolerance_at
+from splatctrl_cli.voxels import SOLID
 
 Seen = Sequence[tuple[RgbdFrame, SelfMask]]
 WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be an object there is the robot's own

@@ -9,20 +9,8 @@ from scipy.ndimage import label
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
-from splatctrl_cli.records import (
-    SOLID,
-    SWEPT,
-    UNANSWERED,
-    Balls,
-    Bool,
-    Box,
-    Float32,
-    Float64,
-    KnownVoxels,
-    Label,
-    OccupancyGrid,
-    RgbdFrame,
-)
+from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
+from splatctrl_cli.voxels import SOLID, SWEPT, UNANSWERED, Balls, KnownVoxels, OccupancyGrid
 
 MAX_VOXELS = 400_000_000
 MAX_STEPS = 65_534  # time steps that `last_seen` tells apart

@@ -6,9 +6,10 @@ import math
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.records import Balls, Bool, Box, Float32, Label, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Label, SplatSet
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.seeding import SplatTree
+from splatctrl_cli.voxels import Balls
 
 
 def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: SceneConfig) -> Balls:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import PARTIAL
-from splatctrl_cli.records import Balls, GaussianSet, KnownVoxels, OccupancyGrid, SeenVoxels, SplatSet
+from splatctrl_cli.records import GaussianSet, SplatSet
 from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,
     read_known_states,
@@ -26,6 +26,7 @@ from splatctrl_cli.scene_files.voxel_file import (
 )
 from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply
 from splatctrl_cli.splat_files.splats import read_world_splats
+from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid, SeenVoxels
 
 FORMAT = "splatctrl-scene 1"
 

@@ -14,10 +14,11 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import flush, sha256, write_durably
-from splatctrl_cli.records import KnownVoxels, SplatSet, UInt8
+from splatctrl_cli.records import SplatSet, UInt8
 from splatctrl_cli.scene_files.scene_folder import Snapshot
 from splatctrl_cli.scene_files.voxel_file import write_occupancy, write_states
 from splatctrl_cli.splat_files.splats import write_ply
+from splatctrl_cli.voxels import KnownVoxels
 
 CHECKPOINT = "checkpoint/state.npz"
 AUDIT = "audit.jsonl"

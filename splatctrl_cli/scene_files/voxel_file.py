@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
-from splatctrl_cli.records import UNANSWERED, Balls, KnownVoxels, Label, OccupancyGrid, SeenVoxels, UInt8, VoxelState
+from splatctrl_cli.records import Label, UInt8
+from splatctrl_cli.voxels import UNANSWERED, Balls, KnownVoxels, OccupancyGrid, SeenVoxels, VoxelState
 
 MOST_VOXELS = 400_000_000  # as many as reconstruct makes
 _HEADER = 1 << 22  # bytes

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
-from splatctrl_cli.records import Float64, JointState, LossReport, OccupancyGrid, Record, SplatSet
+from splatctrl_cli.records import Float64, JointState, LossReport, Record, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
+from splatctrl_cli.voxels import OccupancyGrid
 from tests.known_voxels import known
 from tests.plain import plain_grid, plain_splats
 

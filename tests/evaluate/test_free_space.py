@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.evaluate.score import free_mass, in_front
-from splatctrl_cli.records import Label, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Label, SplatSet
+from splatctrl_cli.voxels import OccupancyGrid
 from tests.plain import plain_grid, plain_splats
 
 FREE, FULL = -2.0, 2.0

@@ -12,7 +12,8 @@ from splatctrl_cli.field.distance import GpdfField, SeField, SphereField
 from splatctrl_cli.field.grid_cells import GridLayout, bounding_box
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.grid_files.npz_grid import write_npz
-from splatctrl_cli.records import SWEPT, Box, DistanceGrid, Float64, Label, OccupancyGrid
+from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
+from splatctrl_cli.voxels import SWEPT, OccupancyGrid
 from tests.field.scenes import cloud, splat_set
 from tests.reference import field as reference
 

@@ -5,7 +5,8 @@ import pytest
 
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.field.obstacles import NO_SPLAT, obstacle_spheres
-from splatctrl_cli.records import Balls, Label
+from splatctrl_cli.records import Label
+from splatctrl_cli.voxels import Balls
 from tests.field.scenes import splat_set
 
 CENTERS = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])

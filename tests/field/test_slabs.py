@@ -12,7 +12,8 @@ from splatctrl_cli.field.grid_cells import GridLayout
 from splatctrl_cli.field.report import grid_statistics
 from splatctrl_cli.field.slabs import UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.field.unknown import apply_unknown
-from splatctrl_cli.records import DistanceGrid, OccupancyGrid
+from splatctrl_cli.records import DistanceGrid
+from splatctrl_cli.voxels import OccupancyGrid
 from tests.field.scenes import cloud, splat_set
 
 LAYOUT = GridLayout(origin=np.array([-0.5, -0.5, -0.2]), voxel=0.02, shape=(51, 40, 21))

@@ -9,7 +9,8 @@ from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.field.unknown import Cubes, apply_unknown
-from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, OccupancyGrid, VoxelState
+from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64
+from splatctrl_cli.voxels import OccupancyGrid, VoxelState
 from tests.field.scenes import cloud, queries, splat_set
 
 BOX = Box(lower=np.full(3, -0.4), upper=np.full(3, 0.4))

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from splatctrl_cli.records import UNANSWERED, Float64, LossReport
+from splatctrl_cli.records import Float64, LossReport
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.voxels import UNANSWERED
 from tests.cli.replay_desk import SECOND, START
 from tests.jobs.stage import FAR, QUARTER, Stage, ball_beside, passing, resting, states_on, voxels
 

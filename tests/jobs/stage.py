@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.files.output import part_digests, write_json
-from splatctrl_cli.records import Balls, Float64, JointState, KnownVoxels, Label, SplatSet
+from splatctrl_cli.records import Float64, JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import Truth, truth_document
+from splatctrl_cli.voxels import Balls, KnownVoxels
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.known_voxels import known
 

@@ -5,7 +5,7 @@ import pytest
 
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.jobs.replays.known_scene import KnownScene, fields_at, known_space
-from splatctrl_cli.records import SWEPT, OccupancyGrid
+from splatctrl_cli.voxels import SWEPT, OccupancyGrid
 
 SECOND = 1_000_000_000
 

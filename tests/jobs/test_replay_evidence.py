@@ -11,9 +11,10 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.files.output import part_digests, write_json
-from splatctrl_cli.records import SplatSet, VoxelState
+from splatctrl_cli.records import SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.splat_files.splats import read_ply, write_ply
+from splatctrl_cli.voxels import VoxelState
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.jobs.stage import FAR, Stage, decisive, states_on
 from tests.known_voxels import known

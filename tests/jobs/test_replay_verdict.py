@@ -13,8 +13,9 @@ from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs import replay as job
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
-from splatctrl_cli.records import Box, VoxelState
+from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.voxels import VoxelState
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
 from tests.jobs.broken import (
     ALONE,

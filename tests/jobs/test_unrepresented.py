@@ -12,8 +12,9 @@ from splatctrl_cli.config import Config, ControlConfig
 from splatctrl_cli.control.events import UNREPRESENTED
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.replays.known_scene import from_splats, splat_fields
-from splatctrl_cli.records import Balls, Float64, KnownVoxels, Label
+from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.voxels import Balls, KnownVoxels
 from tests.cli.replay_desk import SECOND, splats_of, write_scene
 from tests.reference.unrepresented import unrepresented
 

@@ -10,9 +10,10 @@ import pytest
 
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs import score, score_reference
-from splatctrl_cli.records import Float64, Intrinsics, LossReport, OccupancyGrid, Record, RgbdFrame, SplatSet
+from splatctrl_cli.records import Float64, Intrinsics, LossReport, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
 from splatctrl_cli.splat_files.splats import write_ply
+from splatctrl_cli.voxels import OccupancyGrid
 from tests.plain import plain_frame, plain_grid, plain_splats
 
 INTRINSICS = Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)

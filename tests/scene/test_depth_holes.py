@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.records import UNANSWERED, Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.depth_holes import unanswered_points
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
+from splatctrl_cli.voxels import UNANSWERED
 from tests.scene.wall import HEIGHT, INTRINSICS, WORKSPACE, frame
 
 CONFIG = OccupancyConfig()

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.records import SWEPT, Box, Label, SplatSet
+from splatctrl_cli.records import Box, Label, SplatSet
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.eviction import NEARER, distance_to_box, far_away, redundant, room_for
 from splatctrl_cli.scene.fitter import EVICT_EVERY, SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
+from splatctrl_cli.voxels import SWEPT
 from tests.reference.unrepresented import unrepresented
 from tests.scene.test_unrepresented import splats_at
 from tests.scene.wall import WORKSPACE, frame

@@ -6,7 +6,7 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.records import SOLID, SWEPT, Label, RgbdFrame, SplatSet, UInt8
+from splatctrl_cli.records import Label, RgbdFrame, SplatSet, UInt8
 from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
@@ -15,6 +15,7 @@ from splatctrl_cli.scene.labels import human_splats, relabel, shown_kinds
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
+from splatctrl_cli.voxels import SOLID, SWEPT
 from tests.scene.wall import WORKSPACE, frame
 
 VISITOR = 0.2  # [m] height of the block that stands for a person

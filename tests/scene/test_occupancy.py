@@ -9,8 +9,9 @@ from scipy.ndimage import binary_erosion
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.geometry import back_project, invert_transform, look_at, transform_points
-from splatctrl_cli.records import SWEPT, Box, Intrinsics, Label, RgbdFrame
+from splatctrl_cli.records import Box, Intrinsics, Label, RgbdFrame
 from splatctrl_cli.scene.occupancy import OccupancyMap
+from splatctrl_cli.voxels import SWEPT
 from tests.reference.occupancy import ray_walk
 from tests.scene.wall import WORKSPACE, frame
 

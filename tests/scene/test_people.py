@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig
-from splatctrl_cli.records import Label, RgbdFrame, VoxelState
+from splatctrl_cli.records import Label, RgbdFrame
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
+from splatctrl_cli.voxels import VoxelState
 from tests.scene.test_labels import VISITOR, blind, humans, masked
 from tests.scene.wall import WORKSPACE, frame
 

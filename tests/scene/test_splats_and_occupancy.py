@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.records import KnownVoxels, SplatSet
+from splatctrl_cli.records import SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.splats_and_occupancy import GridAgreement, agreement_with_grid
+from splatctrl_cli.voxels import KnownVoxels
 from tests.scene.wall import WORKSPACE, frame
 
 SCENE, OCCUPANCY = SceneConfig(max_splats=600, first_iterations=20, iterations_per_step=5), OccupancyConfig()

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.records import SWEPT, Balls, Box, Label, SplatSet
+from splatctrl_cli.records import Box, Label, SplatSet
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.scene.unrepresented import bare_voxels, representing_reach, unrepresented_voxels
+from splatctrl_cli.voxels import SWEPT, Balls
 from tests.reference.unrepresented import unrepresented
 from tests.scene.wall import WORKSPACE, frame
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.output import write_json
-from splatctrl_cli.records import SWEPT, UNANSWERED, Label, OccupancyGrid, SplatSet
+from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, SceneWriter, read_checkpoint
 from splatctrl_cli.scene_files.voxel_file import (
@@ -25,6 +25,7 @@ from splatctrl_cli.scene_files.voxel_file import (
     write_states,
 )
 from splatctrl_cli.sources.describe import describe
+from splatctrl_cli.voxels import SWEPT, UNANSWERED, OccupancyGrid
 from tests.known_voxels import known
 
 

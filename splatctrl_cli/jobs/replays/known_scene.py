@@ -24,20 +24,9 @@ from splatctrl_cli.field.obstacles import NO_SPLAT, ObstacleSpheres, obstacle_sp
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
-from splatctrl_cli.records import (
-    SWEPT,
-    Balls,
-    Box,
-    DistanceField,
-    DistanceGrid,
-    Float64,
-    Label,
-    OccupancyGrid,
-    SeenVoxels,
-    SplatSet,
-    VoxelState,
-)
+from splatctrl_cli.records import Box, DistanceField, DistanceGrid, Float64, Label, SplatSet
 from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.voxels import SWEPT, Balls, OccupancyGrid, SeenVoxels, VoxelState
 
 Index = NDArray[np.int64]
 

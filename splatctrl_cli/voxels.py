@@ -1,0 +1,140 @@
+"""Voxels: what is known of space, since when, and what is occupied without a splat."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.records import Float32, Float64, UInt8
+
+UNANSWERED = 0xFFFF  # in place of a time step: a camera looked at the voxel, and none ever got depth from it
+SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
+SOLID = 0b1000  # entity bit, where a robot is known: an object's pixel hit the voxel since it was last seen free
+
+
+class VoxelState(IntEnum):
+    """What is known of a voxel."""
+
+    NEVER_SEEN = 0
+    FREE = 1
+    OCCUPIED = 2
+    UNCERTAIN = 3
+    SWEPT_BY_ROBOT = 4  # never seen, but the robot was in it
+
+
+@dataclass(frozen=True, kw_only=True)
+class OccupancyGrid:
+    """Log-odds voxels; voxel (i, j, k) is centred at ``origin + voxel * (i, j, k)``, world [m].
+
+    log_odds (X, Y, Z) float32; num_updates (X, Y, Z) uint16, 0 = never seen; entity (X, Y, Z) uint8 bits of
+    `Label`, `SWEPT` and `SOLID`. Occupancy is ``1 / (1 + exp(-log_odds))``; below 0.3 is observed free, above 0.7
+    occupied.
+    """
+
+    origin: Float64
+    voxel: float
+    log_odds: Float32
+    num_updates: NDArray[np.uint16]
+    entity: UInt8
+
+    def states(self, free_below: float, occupied_above: float) -> UInt8:
+        """`VoxelState` (X, Y, Z) by these thresholds of occupancy."""
+        low, high = (float(np.log(p / (1.0 - p))) for p in (free_below, occupied_above))
+        states = np.full(self.log_odds.shape, VoxelState.UNCERTAIN, np.uint8)
+        states[self.log_odds < low] = VoxelState.FREE
+        states[self.log_odds > high] = VoxelState.OCCUPIED
+        is_never_seen = self.num_updates == 0
+        states[is_never_seen] = VoxelState.NEVER_SEEN
+        states[is_never_seen & (self.entity & SWEPT > 0)] = VoxelState.SWEPT_BY_ROBOT
+        return states
+
+    @classmethod
+    def from_states(cls, origin: Float64, voxel: float, states: UInt8) -> "OccupancyGrid":
+        """A grid that has these `states` (X, Y, Z) by any thresholds: log-odds of -20, 0 or 20, updates of 0 or 1."""
+        is_seen = (states != VoxelState.NEVER_SEEN) & (states != VoxelState.SWEPT_BY_ROBOT)
+        log_odds = np.zeros(states.shape, np.float32)
+        log_odds[states == VoxelState.FREE] = -20.0
+        log_odds[states == VoxelState.OCCUPIED] = 20.0
+        entity = np.where(states == VoxelState.SWEPT_BY_ROBOT, np.uint8(SWEPT), np.uint8(0))
+        num_updates = is_seen.astype(np.uint16)
+        return cls(origin=origin, voxel=voxel, log_odds=log_odds, num_updates=num_updates, entity=entity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Balls:
+    """Equal balls that stand for voxels: centers (K, 3) float32 [m], world; radius [m], half a voxel's diagonal, so
+    that a ball contains its voxel; labels (K,) uint8 (`Label`).
+    """
+
+    centers: Float32
+    radius: float
+    labels: UInt8
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @classmethod
+    def of_voxels(cls, centers: Float32, voxel: float, labels: UInt8) -> "Balls":
+        """The balls around voxels of edge `voxel` [m] at centers (K, 3)."""
+        return cls(centers=centers, radius=0.5 * 3**0.5 * voxel, labels=labels)
+
+    @property
+    def volume(self) -> float:
+        """[m^3] of the voxels that they stand for."""
+        return len(self) * (2.0 * self.radius / 3**0.5) ** 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenVoxels:
+    """When cameras last saw each voxel: its centre is `origin` [m] + its index times the edge `voxel` [m].
+
+    last_seen (X, Y, Z) uint8 or uint16: 1 + the index into step_stamps_ns (T,) int64 of the last time step in which
+    a camera returned depth through or on the voxel, 0 never, the type's largest number (`UNANSWERED` in uint16) never
+    although one looked at it.
+    """
+
+    origin: Float64
+    voxel: float
+    last_seen: NDArray[np.uint8] | NDArray[np.uint16]
+    step_stamps_ns: NDArray[np.int64]
+
+    def last_seen_ns(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        """points (Q, 3) [m], world -> stamps (Q,) [ns] at which their voxels were last seen; -1 never, or outside."""
+        cell = np.floor((points - self.origin) / self.voxel + 0.5)
+        is_inside = np.all((cell >= 0) & (cell < self.last_seen.shape), axis=1)
+        i, j, k = np.where(is_inside[:, None], cell, 0).astype(np.int64).T
+        step = np.where(is_inside, self.last_seen[i, j, k], 0).astype(np.int64)
+        return np.concatenate([[-1], self.step_stamps_ns])[np.where(step == self._unanswered, 0, step)]
+
+    @cached_property
+    def unanswered(self) -> Float64:
+        """Centres (K, 3) [m], world, of the voxels that a camera looked at and that never returned depth."""
+        flat = np.flatnonzero(self.last_seen == self._unanswered)  # ten times as fast as argwhere
+        cells = np.stack(np.unravel_index(flat, self.last_seen.shape), axis=1)
+        return np.asarray(self.origin + self.voxel * cells)
+
+    @property
+    def _unanswered(self) -> int:
+        return int(np.iinfo(self.last_seen.dtype).max)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownVoxels:
+    """What was known of space at one moment, and how old that evidence is.
+
+    last_seen, step_stamps_ns: as `SeenVoxels` has them. unrepresented: what is occupied, not the robot, and has no
+    splat.
+    """
+
+    grid: OccupancyGrid
+    last_seen: NDArray[np.uint16]
+    step_stamps_ns: NDArray[np.int64]
+    unrepresented: Balls
+
+    @property
+    def seen(self) -> SeenVoxels:
+        """When its voxels were last seen."""
+        grid, stamps_ns = self.grid, self.step_stamps_ns
+        return SeenVoxels(origin=grid.origin, voxel=grid.voxel, last_seen=self.last_seen, step_stamps_ns=stamps_ns)
