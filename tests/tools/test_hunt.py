@@ -377,6 +377,7 @@ FOUND = {  # runs that were once called safe, by what was wrong with that
     "a-thing-that-returns-no-depth": (0, 21),
     "a-thing-that-came-before-the-last-frame-set": (0, 575),
     "a-thing-in-space-that-a-lone-camera-never-saw": (0, 2157),
+    "a-hidden-side-of-a-thing-that-a-lone-camera-saw": (31, 202),
 }
 
 
