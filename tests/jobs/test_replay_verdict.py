@@ -158,15 +158,15 @@ def test_unknown_space_counts_from_the_share_that_is_allowed(stage: Stage, heigh
         assert decisive(verdict) == ({"known space": "not evaluable"} if code else {})
 
 
-def test_half_of_the_space_that_the_motion_comes_to_must_have_been_seen(stage: Stage) -> None:
+def test_at_most_45_percent_of_the_space_that_the_motion_comes_to_may_be_unseen(stage: Stage) -> None:
     stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
     shares, codes, drawn = [], [], np.random.default_rng(0).random(grid_seen().log_odds.shape)
     for number, share in enumerate((0.3, 0.4, 0.47, 0.53, 0.6)):  # here and there, so that no sphere sees nothing
         stage.last_seen = voxels(is_seen=drawn > share)
         codes.append(stage.judged(scene=stage.scene(f"scene{number}"))[0])
         shares.append(stage.desk.metrics()["max_unseen_share"])
-    assert [5 if share > 0.5 else 0 for share in shares] == codes
-    assert set(codes) == {0, 5} and min(abs(share - 0.5) for share in shares) < 0.15
+    assert [5 if share > 0.45 else 0 for share in shares] == codes
+    assert set(codes) == {0, 5} and min(abs(share - 0.45) for share in shares) < 0.15
 
 
 def test_a_part_of_the_arm_must_not_come_to_space_that_nobody_saw(stage: Stage) -> None:
@@ -176,11 +176,11 @@ def test_a_part_of_the_arm_must_not_come_to_space_that_nobody_saw(stage: Stage) 
     axes = [start + 0.1 * np.arange(40) for start in grid_seen().origin]
     away = np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - hand, axis=-1)
     found = []
-    for number, reach in enumerate((0.05, 0.25)):
+    for number, reach in enumerate((0.05, 0.22)):
         stage.last_seen = voxels(is_seen=away > reach)
         code, verdict = stage.judged(scene=stage.scene(f"scene{number}"))
         found.append((code, decisive(verdict)))
-        assert stage.desk.metrics()["max_unseen_share"] < 0.5
+        assert stage.desk.metrics()["max_unseen_share"] < 0.45
     assert found == [(0, {}), (5, {"known space": "not evaluable"})]
     assert "of the moving spheres come to space of which a camera never saw more than a tenth" in verdict["sentence"]
 
@@ -191,7 +191,7 @@ def test_what_was_known_about_the_arm_is_a_criterion_where_it_suffices_too(stage
     metrics, passed = stage.desk.metrics(), [r for r in verdict["reasons"] if r["outcome"] == "passed"]
     assert code == 0
     for criterion, figure, allowed in (
-        ("known space", "max_unseen_share", 0.5),
+        ("known space", "max_unseen_share", 0.45),
         ("known space", "unknown_share", 0.05),
         ("evidence age", "max_evidence_age_s", 1.0),
     ):
