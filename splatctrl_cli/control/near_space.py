@@ -27,12 +27,13 @@ LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
 @dataclass(frozen=True, kw_only=True)
 class Seen:
     """What cameras had seen at one moment. last_ns: points (Q, 3) [m], world -> stamps (Q,) [ns] at which a camera
-    last returned depth through or on them, -1 never; unanswered: centres (K, 3) [m], world, of the voxels that
-    cameras looked at and got no depth from.
+    last returned depth through or on them, -1 never; unanswered: centres (K, 3) [m], world, of the voxels, with edges
+    of `voxel` [m], that cameras looked at and got no depth from.
     """
 
     last_ns: Callable[[Float64], NDArray[np.int64]]
     unanswered: Float64 = field(default_factory=lambda: np.empty((0, 3)))
+    voxel: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class NearFigures:
     """Of one state: unseen, the share of the points in space that is new to the motion that no camera had ever seen;
     blind, the share of the moving spheres about which nearly all (`BLIND`) of that space was never seen; age [s]
     within which `FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen after
-    the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel's centre that
+    the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
     cameras looked at without an answer, and its place (3,) [m]; infinite and NaN where there is none.
     """
 
@@ -95,6 +96,7 @@ class NearSpace:
             ages = (stamp_ns - seen[~is_never]) * 1e-9
             age, ahead = float(np.quantile(ages, FRESH_SHARE)), max(-float(ages.min()), 0.0)
         distance, place = self._nearest(known.unanswered, centers)
+        distance = max(distance - known.voxel / 2, 0.0)  # from its nearest face
         return NearFigures(unseen=unseen, blind=blind, age=age, ahead=ahead, unanswered=distance, place=place)
 
     def _nearest(self, points: Float64, centers: Float64) -> tuple[float, Float64]:

@@ -106,9 +106,9 @@ def never_seen_where_it_goes(stage: Stage) -> None:
 
 def no_answer_beside_it(stage: Stage) -> None:
     """Nobody got depth from the voxel that the arm ends beside."""
-    center, _ = stage.ball_at_the_end(0.01, radius=0.0)
     stage.last_seen = voxels()
     grid = stage.last_seen.grid
+    center, _ = stage.ball_at_the_end(0.01 + grid.voxel / 2, radius=0.0)
     grid.origin[:] = center - grid.voxel * np.round((center - grid.origin) / grid.voxel)
     stage.last_seen.last_seen[tuple(np.round((center - grid.origin) / grid.voxel).astype(int))] = UNANSWERED
 
@@ -121,6 +121,20 @@ def frames_that_renew_nothing(stage: Stage) -> None:
 
 def frames_of_the_future(stage: Stage) -> None:
     stage.last_seen = voxels(2 * SECOND)
+
+
+def came_unwatched(stage: Stage) -> None:
+    """Between two maps 0.75 s apart the arm passes a place where the second has a ball."""
+    stage.map_stamps = [0, QUARTER, SECOND]
+    stage.states = passing(np.array([1.2, 0.1, 0, 0, 0, 0, 0]))
+    way = [state.position for state in stage.states]
+    stage.later, stage.later_from = [ball_beside(stage.arm, way[6], 0.0, way=np.array(way[-2:]))], SECOND
+
+
+def came_after_the_last_map(stage: Stage) -> None:
+    """The first map after the motion, 1.05 s after the one before, has a ball where the arm came to rest."""
+    stage.map_stamps = [0, QUARTER, SECOND + 3 * QUARTER // 2]
+    stage.later, stage.later_from = [stage.ball_at_the_end(0.01)], SECOND + QUARTER
 
 
 def no_new_map(stage: Stage) -> None:
@@ -190,6 +204,20 @@ ALONE: dict[str, Broken] = {
         "frames without depth do not count",
     ),
     "frames ahead": (frames_of_the_future, (), "evidence age", "not evaluable", "is 2.00 s later than the state"),
+    "unwatched": (
+        came_unwatched,
+        (),
+        "evidence age",
+        "not evaluable",
+        "arm from 0.25 to 1.00 s, and then",
+    ),
+    "unwatched end": (
+        came_after_the_last_map,
+        (),
+        "evidence age",
+        "not evaluable",
+        "10.0 mm from where the arm was",
+    ),
     "map age": (no_new_map, (), "map age", "not evaluable", "1.75 s old, allowed 1 s"),
     "gap": (gap_in_the_log, (), "judged time", "not evaluable", "0.50 s of 1.00 s lie between states"),
     "three stamps": (three_stamps, (), "judged time", "not evaluable", "2 gaps"),

@@ -27,6 +27,7 @@ def judged(**replay: Any) -> Any:
         "between": {"unbounded": np.zeros(NUM - 1), "surface": np.full(NUM, 0.1)},
         "margin": 0.02,
         "near": NOTHING_NEAR,
+        "unwatched": (),
         "map_age_s": np.zeros(NUM),
         "events": [],
         "lead_in_s": 0.0,

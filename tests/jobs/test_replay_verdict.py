@@ -170,18 +170,21 @@ def test_at_most_45_percent_of_the_space_that_the_motion_comes_to_may_be_unseen(
 
 
 def test_a_part_of_the_arm_must_not_come_to_space_that_nobody_saw(stage: Stage) -> None:
-    """However much is seen about the rest of it: all but a ball about where the hand ends."""
+    """However much is seen about the rest of it: all but a ball about where the hand ends. Where two thirds are seen,
+    a few spheres in a shadow do not count.
+    """
     stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
     hand = stage.arm.sphere_centers(stage.states[-1].position)[-1]
     axes = [start + 0.1 * np.arange(40) for start in grid_seen().origin]
     away = np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - hand, axis=-1)
     found = []
-    for number, reach in enumerate((0.05, 0.22)):
+    for number, reach in enumerate((0.05, 0.17, 0.22)):
         stage.last_seen = voxels(is_seen=away > reach)
         code, verdict = stage.judged(scene=stage.scene(f"scene{number}"))
         found.append((code, decisive(verdict)))
         assert stage.desk.metrics()["max_unseen_share"] < 0.45
-    assert found == [(0, {}), (5, {"known space": "not evaluable"})]
+        assert stage.desk.metrics()["max_blind_share"] > 0.09 or number == 0
+    assert found == [(0, {}), (0, {}), (5, {"known space": "not evaluable"})]
     assert "of the moving spheres come to space of which a camera never saw more than a tenth" in verdict["sentence"]
 
 

@@ -11,6 +11,7 @@ from splatctrl_cli.jobs.replays.metrics import Metrics
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.state_pass import SLIGHT
+from splatctrl_cli.records import Bool
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
 BROKEN, UNKNOWN = "failed", "*not evaluable*"  # as the table of the criteria has them
@@ -65,8 +66,11 @@ def mm(metres: float) -> str:
     return f"{1e3 * metres:.1f} mm"
 
 
-def nearby(judged: Judged, column: str) -> tuple[float, float, int] | None:
-    """The largest value of what was known about the arm, when [s], and over how many states; None without one."""
+def nearby(judged: Judged, column: str, which: Bool | None = None) -> tuple[float, float, int] | None:
+    """The largest value of what was known about the arm, of some states (T,) or all, when [s], and over how many
+    states; None without one.
+    """
     values = judged.replay.near[column]
+    values = values if which is None else np.where(which, values, np.nan)
     num = int(np.isfinite(values).sum())
     return (float(np.nanmax(values)), seconds_at(judged, int(np.nanargmax(values))), num) if num else None

@@ -205,7 +205,7 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
     def seen_at(stamp_ns: int) -> Seen | None:
         index = bisect_right(stamps, stamp_ns - latency_ns) - 1 if has_times else 0
         known = None if index < 0 else voxels(index)
-        return None if known is None else Seen(last_ns=known.last_seen_ns, unanswered=known.unanswered)
+        return None if known is None else seen_of(known)
 
     always = stamps if has_times else [-(2**63)]
     return KnownScene(
@@ -220,6 +220,11 @@ def from_splats(path: Path, config: Config, threads: int, *, latency_ns: int = 0
         figures=lambda: scene.run.get("metrics", {}),
         has_people_margin=config.control.human_margin > config.control.margin,
     )
+
+
+def seen_of(voxels: SeenVoxels) -> Seen:
+    """What the space about an arm is asked for."""
+    return Seen(last_ns=voxels.last_seen_ns, unanswered=voxels.unanswered, voxel=voxels.voxel)
 
 
 def known_space(occupancy: OccupancyGrid) -> Observed:

@@ -24,6 +24,7 @@ from splatctrl_cli.jobs.replays.known_scene import (
     from_grid,
     from_splats,
     known_space,
+    seen_of,
     splat_fields,
 )
 from splatctrl_cli.jobs.replays.request import ReplayRequest
@@ -163,7 +164,7 @@ class Lockstep:
             self._advance(stamp_ns)
             index = bisect_right(self._stamps_ns, stamp_ns - self._latency_ns) - 1
             known = None if index < 0 else voxels(self._files[index])
-            return None if known is None else Seen(last_ns=known.last_seen_ns, unanswered=known.unanswered)
+            return None if known is None else seen_of(known)
 
         return KnownScene(
             at=at,

@@ -167,6 +167,7 @@ def _replay(
     stamps = record.audit.stamp_ns
     requested, logged = _requested_ns(request, inputs), inputs.states.stamp_ns
     before = logged[(logged >= requested) & (logged < stamps[0])]
+    record.hindsight.finish()
     return Replay(
         model=inputs.model,
         config=config,
@@ -180,6 +181,7 @@ def _replay(
         start_time_s=float(int(stamps[0]) - int(inputs.states.stamp_ns[0])) * 1e-9,
         between=record.between,
         near=record.near,
+        unwatched=tuple(record.hindsight.found),
         strain=record.strain,
         statics=record.statics,
         events=record.events.events(),

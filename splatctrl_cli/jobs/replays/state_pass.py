@@ -15,6 +15,7 @@ from splatctrl_cli.control.near_space import NearSpace
 from splatctrl_cli.control.preconditions import static_clearance
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
+from splatctrl_cli.jobs.replays.hindsight import Hindsight
 from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replays.state_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64, Stamps
@@ -31,7 +32,8 @@ class ReplayRecord:
     between: of each state the clearance bound [m] since the one before (`lower`, NaN at the first), 1 where that is
     the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
     clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
-    near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at. strain:
+    near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at.
+    hindsight: what later depth says of times without any. strain:
     velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in
     the first scene and the least in any.
     """
@@ -67,6 +69,7 @@ class ReplayRecord:
             np.broadcast_to(limit, model.velocity_limit.shape) if limit.any() else None,
         )
         self.near, self._near = Figures(), NearSpace(model, config.control.margin)
+        self.hindsight = Hindsight(model, scene, self._near, config.control.margin)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
 
@@ -189,6 +192,8 @@ class ReplayRecord:
         num = len(part.stamp_ns)
         unseen, blind, age, ahead, unanswered = np.full((5, num), np.nan)
         place = np.full((num, 3), np.nan)
+        if self._scene.has_seen_times:
+            self.hindsight.add(part.stamp_ns, part.position)
         for at in self._near.due(part.stamp_ns):
             stamp = int(part.stamp_ns[at])
             known = self._scene.seen_at(stamp)
@@ -198,6 +203,7 @@ class ReplayRecord:
                 unanswered[at], place[at] = figures.unanswered, figures.place
                 if self._scene.has_seen_times:
                     age[at], ahead[at] = figures.age, figures.ahead
+                    self.hindsight.looked(stamp, figures.age)
         self.near.append(unseen=unseen, blind=blind, age=age, ahead=ahead, unanswered=unanswered, place=place)
 
     def _tell_represented(self, part: AuditTrace) -> None:
