@@ -16,9 +16,11 @@ class _LoadedLate(ModuleType):
 
 
 if TYPE_CHECKING:  # the same names, for type checkers
+    import distributed
     import matplotlib as mpl
     import trimesh
 else:
     mpl, trimesh = _LoadedLate("matplotlib"), _LoadedLate("trimesh")
+    distributed = _LoadedLate("distributed")
 
-__all__ = ["mpl", "trimesh"]
+__all__ = ["distributed", "mpl", "trimesh"]

@@ -140,6 +140,28 @@ def _num_images(text: str) -> int:
         raise argparse.ArgumentTypeError(f"expected a number of images, got {text!r}: {hint}") from None
 
 
+def _batch(add: Options, parser: Parser) -> None:
+    add("SUITE", "TOML file of recordings and jobs (docs/batch.md); with --list also a batch's folder", Path)
+    add("-o/--out DIR", "folder of the batch, where it goes on (default: what the suite says, or SUITE.out)", Path)
+    add("--workers N", "nodes that run at once (default: one per core)", whole(1, 256))
+    add("--shard I/N", "only every N-th recording, from the I-th on", _shard)
+    add("--again", "run what is done, too")
+    add("--dry-run", "print the nodes and their command lines, and run nothing")
+    add("--dask ADDRESS", "run the nodes on a Dask cluster that shares this folder")
+    listing = add.group("ledger")
+    listing("--list", "print what ran last, and run nothing")
+    listing("--failed", "as --list, of what did not end as expected")
+    listing("--where COLUMN=VALUE ...", "as --list, of the runs for which it holds; also !=, <, >, <=, >=")
+    listing("--csv FILE", "as --list, into a table with every column", Path)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)):
+        raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, got {text!r}")
+    return int(index), int(count)
+
+
 def _demo(add: Options, parser: Parser) -> None:
     add("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data)", Path)
     add_output(add, "folder for everything the demo makes", default="demo_output")
@@ -268,6 +290,12 @@ COMMANDS = {
         ),
         run="replay:run",
         options=replay_options,
+    ),
+    "batch": Command(
+        summary="run many recordings through many commands, again only what changed, with one verdict",
+        examples=("batch nightly.toml --shard 2/4", "batch nightly.toml --failed"),
+        run="batch:run",
+        options=_batch,
     ),
     "robot": Command(
         summary="fit and measure a robot's collision spheres, list its self-collision pairs and limits",

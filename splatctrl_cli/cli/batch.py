@@ -1,0 +1,181 @@
+"""``splatctrl batch``: a suite of recordings and commands, its verdict, and the ledger of what ran."""
+
+import argparse
+import difflib
+import importlib
+import os
+import shlex
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.cli.commands import build_parser
+from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.options import request_of
+from splatctrl_cli.cli.parser import Parser
+from splatctrl_cli.config import load_config
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.batches.batch import BatchRequest, BatchResult, batch, dry_run, node_document, planned
+from splatctrl_cli.jobs.batches.graph import Parsed
+from splatctrl_cli.jobs.batches.ledger import NAME, Ledger, Run, write_csv
+from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
+from splatctrl_cli.jobs.batches.suite import Table
+
+PRELOADED = ("check", "ingest", "reconstruct", "export", "bake", "score", "replay")  # jobs of a runner
+OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the subcommand and return its exit code."""
+    console = Console(args)
+    workers = args.workers or os.cpu_count() or 1
+    request = request_of(BatchRequest, args, workers=workers)
+    command_line = OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1))
+    if args.list or args.where or args.failed or args.csv is not None:
+        return _listed(console, args, request, command_line)
+    if args.dry_run:
+        planned_nodes = dry_run(request, command_line)
+        rows = [(node.name, state, ", ".join(node.needs) or "-") for node, state in planned_nodes]
+        found = [{"id": n.name, "state": s, "needs": n.needs, "words": n.words} for n, s in planned_nodes]
+        lines = [*table(("node", "state", "needs"), rows), ""]
+        console.result({"nodes": found}, [*lines, *(f"splatctrl {shlex.join(n.words)}" for n, _ in planned_nodes)])
+        return 0
+    result = batch(request, command_line, console)
+    printed = {
+        "out": str(result.out),
+        "suite": result.suite,
+        "kept": result.num_kept,
+        "nodes": [node_document(run) for run in result.runs],
+    }
+    return console.concluded(result.verdict, printed, _lines(result))
+
+
+class OfThisProgram:
+    """Nodes are commands of this program; `threads` is for each."""
+
+    entry = "splatctrl_cli.cli.batch:run_words"
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+
+    def parsed(self, command: str, options: Table, folder: Path) -> Parsed:
+        """Words for options by their long names, and the files among them. Raises UsageError for what is none."""
+        parser, places, words = _parser_of(command), list[str](), [command]
+        given = {"threads": self._threads, **options}
+        actions = {name: _action(parser, command, name) for name in given if name not in OWN or _has(parser, name)}
+        for name, action in actions.items():
+            made = _words_of(f"[{command}] {name}", action, given[name], folder)
+            places += made if not action.option_strings else []
+            words += made if action.option_strings else []
+        words += ["--json", *(["--", *places] if places else [])]
+        parsed = build_parser(command).parse_args(words)
+        if hasattr(parsed, "set"):
+            load_config(parsed.config, parsed.set)
+        values = [value for name, value in vars(parsed).items() if name != "out"]
+        found = [each for value in values for each in (value if isinstance(value, list) else [value])]
+        return Parsed(words=tuple(words), inputs=tuple(path for path in found if isinstance(path, Path)))
+
+
+def run_words(words: list[str]) -> int:
+    """What a runner calls: the program itself."""
+    main = importlib.import_module("splatctrl_cli.cli.main").main
+    code: int = main(words)
+    return code
+
+
+def preload() -> None:
+    """What a runner imports once, for all the commands that it runs."""
+    os.environ.setdefault(
+        "OPENCV_IO_MAX_IMAGE_PIXELS", str(importlib.import_module("splatctrl_cli.cli.main").MAX_PIXELS)
+    )
+    for job in PRELOADED:
+        importlib.import_module(f"splatctrl_cli.jobs.{job}")
+
+
+@cache
+def _parser_of(command: str) -> Parser:
+    actions = build_parser(command).actions
+    assert actions is not None
+    return actions.choices[command]
+
+
+def _has(parser: Parser, name: str) -> bool:
+    return f"--{name}" in parser._option_string_actions
+
+
+def _action(parser: Parser, command: str, name: str) -> argparse.Action:
+    by_name = {option.removeprefix("--"): action for option, action in parser._option_string_actions.items()}
+    by_name |= {action.dest: action for action in parser._actions if not action.option_strings}
+    if name not in by_name:
+        near = difflib.get_close_matches(name, by_name, n=1)
+        remedy = f"did you mean {near[0]}?" if near else f"see splatctrl {command} --help-all"
+        raise UsageError(f"[jobs] {command}: has no option {name!r}", remedy=remedy)
+    return by_name[name]
+
+
+def _words_of(where: str, action: argparse.Action, value: Any, folder: Path) -> list[str]:
+    """What a person would type for a value of a suite."""
+    name = max(action.option_strings, key=len, default="")
+    if action.nargs == 0:
+        if not isinstance(value, bool):
+            raise UsageError(f"{where}: expected true or false, got {value!r}")
+        return [name] * value
+    if isinstance(value, Mapping):
+        texts = [f"{key}={_text(each)}" for key, each in _flat(value)]
+    else:
+        texts = [_text(each) for each in (value if isinstance(value, list) else [value])]
+    if action.type is Path:
+        texts = [str(folder / text) for text in texts]
+    if name and not isinstance(action, argparse._AppendAction):
+        texts = [",".join(texts)]
+    return [f"{name}={text}" if name else text for text in texts]
+
+
+def _flat(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield before + key, value
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _lines(result: BatchResult) -> Iterator[str]:
+    """A row for each recording, a column for each job and variant."""
+    runs = {tuple(run.node.split("/", 1)): run for run in result.runs}
+    jobs = list(dict.fromkeys(job for _, job in runs))
+    rows = [
+        [recording, *(_cell(runs.get((recording, job))) for job in jobs)]
+        for recording in dict.fromkeys(recording for recording, _ in runs)
+    ]
+    yield from table(("recording", *jobs), rows)
+    yield ""
+    yield f"{len(result.runs) - result.num_kept} run, {result.num_kept} as before; wrote {result.out / 'batch.json'}"
+
+
+def _cell(run: Run | None) -> str:
+    if run is None:
+        return "-"
+    word = run.label or run.state
+    return word if run.state == DONE else f"{word.upper()} !" if run.state == FAILED else run.state.upper()
+
+
+def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
+    """The ledger's last runs, those that --where and --failed ask for."""
+    folder = request.suite if request.suite.is_dir() else planned(request, command_line)[2]
+    if not (folder / NAME).is_file():
+        raise InputError(f"{folder}: has no {NAME}", remedy="run the batch first")
+    conditions = [*args.where, *(["state!=done"] if args.failed else [])]
+    with Ledger(folder) as ledger:
+        if args.csv is not None:
+            console.log(f"wrote {write_csv(args.csv, ledger.runs(conditions))} runs to {args.csv}")
+        runs = list(ledger.runs(conditions))
+    rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
+    console.result(
+        {"nodes": [node_document(run) for run in runs]}, table(("node", "state", "outcome", "MB", "log"), rows)
+    )
+    return 0

@@ -1,0 +1,160 @@
+"""A batch from its request to its verdict: read the suite, run its graph, write batch.json."""
+
+import json
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
+from splatctrl_cli.files.output import write_durably, write_json
+from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of
+from splatctrl_cli.jobs.batches.keys import keys_of
+from splatctrl_cli.jobs.batches.ledger import Ledger, Run
+from splatctrl_cli.jobs.batches.run import DONE, ERROR, SKIPPED, Scheduler, local_executor, told
+from splatctrl_cli.jobs.batches.suite import Suite, read_suite
+from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.libraries import distributed
+
+CONNECT_S = 10.0  # to a scheduler
+FORMAT, VERSION = "splatctrl-batch", 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchRequest:
+    """Run a suite's file. out: its folder (default: what the suite says); workers: processes at once; shard: (i, n),
+    every n-th recording from the i-th on; dask: the address of a Dask scheduler that runs the nodes instead; again:
+    also what is done.
+    """
+
+    suite: Path
+    out: Path | None = None
+    workers: int = 1
+    shard: tuple[int, int] = (1, 1)
+    dask: str | None = None
+    again: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchResult:
+    """The run of every node, in the order of the graph; num_kept of them stood from before."""
+
+    out: Path
+    suite: str
+    runs: Sequence[Run]
+    num_kept: int
+    verdict: Verdict
+
+
+def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
+    """Run what is not done. Raises UsageError for a suite that makes no graph, InputError for files that lack."""
+    suite, nodes, out = planned(request, command_line)
+    with Ledger(out) as ledger, _executor(request) as (executor, slots):
+        scheduler = Scheduler(
+            ledger=ledger,
+            entry=command_line.entry,
+            executor=executor,
+            slots=slots,
+            progress=progress,
+            again=request.again,
+        )
+        progress.log(f"batch: {_counted(len(nodes), 'node')} into {out}")
+        try:
+            runs = list(scheduler.run(nodes).values())
+        finally:
+            write_batch(out, suite.name, ledger.latest().values())
+    verdict = verdict_of_runs(runs)
+    return BatchResult(out=out, suite=suite.name, runs=runs, num_kept=scheduler.num_kept, verdict=verdict)
+
+
+def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Suite, list[Node], Path]:
+    """The suite, its nodes after those they need, and where they write."""
+    suite = read_suite(request.suite, COMMANDS)
+    out = (request.out or suite.out).absolute()
+    nodes = nodes_of(suite, out, command_line, request.shard)
+    if not nodes:
+        index, count = request.shard
+        raise UsageError(
+            f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings", remedy="give fewer shards"
+        )
+    return suite, nodes, out
+
+
+def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
+    """Every node and whether it would run; nothing is written but a ledger's digests."""
+    _, nodes, out = planned(request, command_line)
+    with Ledger(out) as ledger:
+        keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
+    is_kept = {
+        node.name: not request.again
+        and (run := latest.get(node.name)) is not None
+        and run.key == keys[node.name]
+        and run.state in {DONE, "failed"}
+        for node in nodes
+    }
+    return [(node, "done" if is_kept[node.name] else "to do") for node in nodes]
+
+
+def verdict_of_runs(runs: Sequence[Run]) -> Verdict:
+    """A reason for each node: passed where it ended as expected."""
+    num = len({run.recording for run in runs})
+    return verdict_of(
+        "batch",
+        [_reason(run) for run in runs],
+        scope=f"{_counted(len(runs), 'node')} of {_counted(num, 'recording')}",
+        passed="as expected",
+        is_damaged=any(run.exit_code == 3 and run.state == DONE for run in runs),
+    )
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" + ("s" if number != 1 else "")
+
+
+def _reason(run: Run) -> Reason:
+    lacks = run.state == SKIPPED or (run.state != ERROR and run.outcome == Outcome.NOT_EVALUABLE)
+    outcome = Outcome.PASSED if run.state == DONE else Outcome.NOT_EVALUABLE if lacks else Outcome.FAILED
+    return Reason(
+        criterion=run.node,
+        outcome=outcome,
+        sentence=told(run) + (f": {run.sentence}" if run.sentence and run.state != DONE else ""),
+        label="error" if run.state == ERROR else "not as expected",
+        remedy="" if run.state in (DONE, SKIPPED) else f"see {run.log}",
+        count=1,
+    )
+
+
+def write_batch(out: Path, suite: str, runs: Any) -> None:
+    """batch.json: the last state of every node."""
+    document = {"format": FORMAT, "version": VERSION, "suite": suite, "nodes": [node_document(run) for run in runs]}
+    write_durably(out / "batch.json", lambda path: write_json(path, document))
+
+
+def node_document(run: Run) -> dict[str, Any]:
+    """A run as JSON has it."""
+    plain: dict[str, Any] = asdict(run)
+    for name in ("variant", "words", "needs"):
+        plain[name] = json.loads(plain[name])
+    return {"id": plain.pop("node"), **plain, "outcome": run.outcome or None}
+
+
+@contextmanager
+def _executor(request: BatchRequest) -> Iterator[tuple[Executor, int]]:
+    if request.dask is None:
+        with local_executor(request.workers) as executor:
+            yield executor, request.workers
+        return
+    try:
+        client = distributed.Client(request.dask, timeout=CONNECT_S)
+    except ImportError:
+        raise UsageError("--dask: dask is not installed", remedy="pip install 'splatctrl[dask]'") from None
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"--dask {request.dask}: no scheduler answers: {error}", remedy="check the address"
+        ) from None
+    with client:
+        slots = max(sum(client.nthreads().values()), 1)
+        yield client.get_executor(pure=False, retries=2), 2 * slots

@@ -1,0 +1,243 @@
+"""The graph of a suite: a node for each recording, job and variant, with the words that run it."""
+
+import itertools
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import Any, Protocol
+
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.batches.suite import Job, Limits, Recording, Suite, Table, job_for
+
+RECORDING, NAME = "recording", "name"  # what {…} in an option may stand for, beside the jobs
+ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
+WITHOUT_OUTPUT = ("check", "info")
+CAPTURE, SCENE = "ingest", "reconstruct"
+ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite does not say: of a command's only job
+    "ingest": {"source": RECORDING},
+    "check": {"source": RECORDING},
+    "info": {"path": RECORDING},
+    "reconstruct": {"source": CAPTURE},
+    "export": {"scene": SCENE},
+    "sdf-bake": {"scene": SCENE},
+    "score": {"scene": SCENE, "reference": CAPTURE},
+    "replay": {"log": CAPTURE, "scene": SCENE},
+}
+COMMANDS = tuple(ROLES)
+_PLACE = re.compile(r"\{([\w.+-]+)\}")
+_LONGEST = 120  # characters of a node's name
+
+Variant = Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parsed:
+    """Words of the command line that say what options say, and the files among them that are read."""
+
+    words: tuple[str, ...]
+    inputs: tuple[Path, ...]
+
+
+class CommandLine(Protocol):
+    """What a batch knows of the command line that runs its nodes; `entry` is MODULE:FUNCTION, words to exit code."""
+
+    entry: str
+
+    def parsed(self, command: str, options: Table, folder: Path) -> Parsed:
+        """Words for options, paths of which count from `folder`. Raises UsageError for what is not an option."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Node:
+    """One command on one recording. name: RECORDING/JOB; variant: by JOB.OPTION what a matrix chose here or before.
+
+    words: its command line; inputs: the files in it that decide what comes out; needs: names of nodes before it; out:
+    what it writes, None for a command that only prints.
+    """
+
+    name: str
+    recording: str
+    job: str
+    command: str
+    words: tuple[str, ...]
+    variant: Variant = field(default_factory=dict)
+    inputs: tuple[Path, ...] = ()
+    needs: tuple[str, ...] = ()
+    out: Path | None = None
+    expect: str = "passed"
+    limits: Limits = field(default_factory=Limits)
+
+
+def nodes_of(suite: Suite, out: Path, command_line: CommandLine, shard: tuple[int, int] = (1, 1)) -> list[Node]:
+    """Every node of the recordings of a shard (i of n), each after those it needs.
+
+    Raises UsageError for jobs that need each other, placeholders without a job, and options that a command lacks.
+    """
+    index, count = shard
+    nodes: list[Node] = []
+    for recording in sorted(suite.recordings, key=lambda each: each.name)[index - 1 :: count]:
+        jobs = [job for each in suite.jobs if (job := job_for(each, recording, COMMANDS)) is not None]
+        kept = {job.name: _with_roles(job, jobs) for job in jobs}
+        nodes += _nodes_of(recording, _in_order(kept, recording), suite.folder, out, command_line)
+    return nodes
+
+
+def _with_roles(job: Job, jobs: Sequence[Job]) -> Job:
+    """With the options that follow from the other jobs, where the suite does not give them."""
+    given = {*job.options, *job.matrix}
+    given |= {"field"} & given and {"scene"}  # a field stands for its scene
+    roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
+    if job.command in {"reconstruct", "score"} and "dtu" in given:
+        roles = {option: role for option, role in roles.items() if option == "scene"}
+    return replace(
+        job, options={**{option: _filled(job, role, jobs) for option, role in roles.items()}, **job.options}
+    )
+
+
+def _filled(job: Job, role: str, jobs: Sequence[Job]) -> str:
+    makers = [other.name for other in jobs if other.command == role and other.name != job.name]
+    if len(makers) > 1:
+        example = " or ".join(f"'{{{name}}}'" for name in makers)
+        raise UsageError(f"[jobs.{job.name}]: {len(makers)} jobs of {role} come before it", remedy=f"say {example}")
+    if not makers and role == SCENE:
+        raise UsageError(f"[jobs.{job.name}]: expected a job of {SCENE} before it", remedy="or give scene = PATH")
+    return f"{{{makers[0] if makers else RECORDING}}}"
+
+
+def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, tuple[str, ...]]]:
+    """Jobs with the names of those that they need, which come first."""
+    needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
+    try:
+        return [(jobs[name], needs[name]) for name in TopologicalSorter(needs).static_order()]
+    except CycleError as error:
+        raise UsageError(f"[jobs]: {' needs '.join(error.args[1][::-1])}", remedy="break the circle") from None
+
+
+def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str, ...]:
+    found = dict.fromkeys(place for text in _texts((job.options, job.matrix)) for place in _PLACE.findall(text))
+    for place in found:
+        if place not in {RECORDING, NAME, *jobs}:
+            known = ", ".join((RECORDING, NAME, *jobs))
+            where = f"[jobs.{job.name}] of {recording.name}"
+            raise UsageError(f"{where}: {{{place}}} is no job", remedy=f"known here: {known}")
+    return tuple(place for place in found if place in jobs)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for each in value.values():
+            yield from _texts(each)
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from _texts(each)
+
+
+def _nodes_of(
+    recording: Recording,
+    jobs: Sequence[tuple[Job, tuple[str, ...]]],
+    folder: Path,
+    out: Path,
+    command_line: CommandLine,
+) -> list[Node]:
+    made: dict[str, list[Node]] = {}
+    for job, needs in jobs:
+        made[job.name] = []
+        for before in itertools.product(*(made[name] for name in needs)):
+            inherited = _joined([node.variant for node in before])
+            if inherited is None:
+                continue
+            for chosen in _combinations(job.matrix):
+                own = {f"{job.name}.{option}": value for option, value in chosen.items()}
+                node = _node(recording, job, chosen, {**inherited, **own}, before, out)
+                values: dict[str, Any] = {each.job: str(each.out) for each in before}
+                values |= {RECORDING: [str(path) for path in recording.paths], NAME: recording.name}
+                options = _placed(_merged(job.options, chosen), values.__getitem__)
+                options |= {} if node.out is None else {"out": str(node.out), "force": True, "resume": True}
+                parsed = command_line.parsed(job.command, options, folder)
+                node = replace(node, words=parsed.words, inputs=_outside(parsed.inputs, before))
+                made[job.name].append(node)
+    nodes = [node for each in made.values() for node in each]
+    _check_names(nodes)
+    return nodes
+
+
+def _node(
+    recording: Recording, job: Job, chosen: Variant, variant: Variant, before: Sequence[Node], out: Path
+) -> Node:
+    prefix = {key: value for key, value in variant.items() if not key.startswith(f"{job.name}.")} | dict(chosen)
+    suffix = "".join(f"+{option}={value}" for option, value in prefix.items())
+    place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:_LONGEST]
+    ending = ENDINGS.get(job.command, "")
+    return Node(
+        name=f"{recording.name}/{place}",
+        recording=recording.name,
+        job=job.name,
+        command=job.command,
+        words=(),
+        variant=variant,
+        needs=tuple(node.name for node in before),
+        out=None if job.command in WITHOUT_OUTPUT else out / recording.name / f"{place}{ending}",
+        expect=job.expect,
+        limits=job.limits,
+    )
+
+
+def _outside(inputs: Sequence[Path], before: Sequence[Node]) -> tuple[Path, ...]:
+    """Inputs that no node before makes."""
+    made = [node.out for node in before if node.out is not None]
+    return tuple(path for path in inputs if not any(path == out or out in path.parents for out in made))
+
+
+def _joined(variants: Sequence[Variant]) -> Variant | None:
+    """All of them as one; None where two chose differently."""
+    joined: dict[str, Any] = {}
+    for variant in variants:
+        if any(joined.setdefault(key, value) != value for key, value in variant.items()):
+            return None
+    return joined
+
+
+def _combinations(matrix: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+    for values in itertools.product(*matrix.values()):
+        yield dict(zip(matrix, values, strict=True))
+
+
+def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
+    """Options with what a matrix chose; its key ``set.SECTION.KEY`` adds to the settings."""
+    merged = dict(options)
+    for key, value in chosen.items():
+        if key.startswith("set."):
+            settings = merged.get("set", {})
+            merged["set"] = {**(settings if isinstance(settings, Mapping) else {}), key.removeprefix("set."): value}
+        else:
+            merged[key] = value
+    return merged
+
+
+def _placed(value: Any, filled: Callable[[str], Any]) -> Any:
+    """With each {place} filled; a text that is one place alone becomes what stands for it, a list too."""
+    if isinstance(value, str):
+        alone = _PLACE.fullmatch(value)
+        if alone:
+            return filled(alone[1])
+        return _PLACE.sub(lambda match: _one(filled(match[1])), value)
+    if isinstance(value, Mapping):
+        return {key: _placed(each, filled) for key, each in value.items()}
+    return [_placed(each, filled) for each in value] if isinstance(value, list) else value
+
+
+def _one(value: Any) -> str:
+    return value[0] if isinstance(value, list) else str(value)
+
+
+def _check_names(nodes: Sequence[Node]) -> None:
+    by_name: dict[str, Node] = {}
+    for node in nodes:
+        other = by_name.setdefault(node.name.lower(), node)
+        if other is not node:
+            raise UsageError(f"two outputs are called {node.name}", remedy="rename a job, or a value of its matrix")

@@ -1,0 +1,250 @@
+"""What ran in a folder, by node and key, in one SQLite file; who runs what now; and digests of inputs."""
+
+import csv
+import fcntl
+import hashlib
+import os
+import re
+import socket
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Self, TextIO
+from uuid import uuid4
+
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.files.output import sha256, write_durably
+
+NAME, OWNERS = "ledger.sqlite", ".owners"
+VERSION = 1  # of the tables
+BUSY_S = 30.0  # to wait for another process that writes
+_COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|=|>|<)\s*(.*)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One run of a node, as it ended; `state` is done (as expected), failed (not so), error or skipped."""
+
+    node: str
+    recording: str
+    job: str
+    command: str
+    key: str
+    state: str
+    expect: str
+    outcome: str = ""
+    label: str = ""
+    sentence: str = ""
+    exit_code: int | None = None
+    cause: str = ""
+    started: float = 0.0
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    variant: str = "{}"
+    words: str = "[]"
+    needs: str = "[]"
+    out: str = ""
+    result: str = ""
+    log: str = ""
+    stamp: str = ""
+    version: str = ""
+    host: str = ""
+
+
+COLUMNS = tuple(column.name for column in fields(Run))
+_NUMBERS = ("exit_code", "started", "seconds", "peak_mb")
+_TABLES = f"""
+CREATE TABLE IF NOT EXISTS runs (id INTEGER PRIMARY KEY, {
+    ", ".join(f"{name} {'REAL' if name in _NUMBERS else 'TEXT'}" for name in COLUMNS)
+});
+CREATE INDEX IF NOT EXISTS runs_by_node ON runs (node, id);
+CREATE TABLE IF NOT EXISTS claims (node TEXT PRIMARY KEY, owner TEXT);
+CREATE TABLE IF NOT EXISTS digests (path TEXT PRIMARY KEY, stamp TEXT, digest TEXT);
+"""
+
+
+class Ledger:
+    """The ledger of the batches that write into one folder; several processes may have it open."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError for a file that is no ledger, or a newer one."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self.path = folder, folder / NAME
+        self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
+        self._lock: TextIO | None = None
+        try:
+            self._base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
+            self._base.row_factory = sqlite3.Row
+            version = int(self._base.execute("PRAGMA user_version").fetchone()[0])
+            if version > VERSION:
+                raise InputError(
+                    f"{self.path}: is of version {version}, expected {VERSION}", remedy="use a newer splatctrl"
+                )
+            self._base.execute("PRAGMA journal_mode = WAL")
+            self._base.execute("PRAGMA synchronous = NORMAL")
+            self._base.executescript(_TABLES)
+            self._base.execute(f"PRAGMA user_version = {VERSION}")
+        except sqlite3.DatabaseError as error:
+            raise InputError(f"{self.path}: is no ledger: {error}", remedy="move it away; outputs stay") from None
+
+    def close(self) -> None:
+        """Give up what is claimed."""
+        if self._lock is not None:
+            with suppress(sqlite3.Error):
+                self._base.execute("DELETE FROM claims WHERE owner = ?", (self._owner,))
+            Path(self._lock.name).unlink(missing_ok=True)
+            self._lock.close()
+        self._base.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def claim(self, node: str) -> bool:
+        """Whether this process may run a node: nobody alive does."""
+        with self._transaction():
+            row = self._base.execute("SELECT owner FROM claims WHERE node = ?", (node,)).fetchone()
+            if row is not None and row["owner"] != self._owner and self._is_alive(row["owner"]):
+                return False
+            self._hold()
+            self._base.execute("INSERT OR REPLACE INTO claims VALUES (?, ?)", (node, self._owner))
+        return True
+
+    def record(self, run: Run) -> None:
+        """A run that ended; its node is free again."""
+        places = ", ".join("?" * len(COLUMNS))
+        with self._transaction():
+            self._base.execute(
+                f"INSERT INTO runs ({', '.join(COLUMNS)}) VALUES ({places})", tuple(asdict(run).values())
+            )
+            self._base.execute("DELETE FROM claims WHERE node = ?", (run.node,))
+
+    def release(self, node: str) -> None:
+        """A node that was claimed and need not be run."""
+        self._base.execute("DELETE FROM claims WHERE node = ? AND owner = ?", (node, self._owner))
+
+    def last(self, node: str) -> Run | None:
+        """The last run of a node."""
+        row = self._base.execute("SELECT * FROM runs WHERE node = ? ORDER BY id DESC LIMIT 1", (node,)).fetchone()
+        return None if row is None else _run_of(row)
+
+    def latest(self) -> dict[str, Run]:
+        """The last run of each node."""
+        rows = self._base.execute(
+            "SELECT * FROM runs WHERE id IN (SELECT max(id) FROM runs GROUP BY node) ORDER BY node"
+        )
+        return {row["node"]: _run_of(row) for row in rows}
+
+    def mean_seconds(self) -> dict[str, float]:
+        """Of runs that ended by themselves, by job."""
+        rows = self._base.execute("SELECT job, avg(seconds) AS mean FROM runs WHERE cause = '' GROUP BY job")
+        return {row["job"]: float(row["mean"]) for row in rows}
+
+    def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
+        """Runs for which conditions such as "job=audit" or "seconds>10" hold. Raises UsageError for what is none."""
+        clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
+        for condition in conditions:
+            match = _COMPARISON.fullmatch(condition.strip())
+            if match is None or match[1] not in COLUMNS:
+                known = ", ".join(COLUMNS)
+                raise UsageError(f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {known}")
+            clauses.append(f"{match[1]} {match[2]} ?")
+            values.append(_value_of(match[1], match[3], condition))
+        where = f" WHERE {' AND '.join(clauses)}" if clauses else ""
+        for row in self._base.execute(f"SELECT * FROM runs{where} ORDER BY id", values):
+            yield _run_of(row)
+
+    def digest(self, path: Path) -> str:
+        """sha256 of a file, or of a folder's names and files; read again only where sizes or times changed."""
+        stamp = _stamp_of(path)
+        key = str(path.resolve())
+        row = self._base.execute("SELECT stamp, digest FROM digests WHERE path = ?", (key,)).fetchone()
+        if row is not None and row["stamp"] == stamp:
+            return str(row["digest"])
+        digest = _digest_of(path)
+        self._base.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (key, stamp, digest))
+        return digest
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._base.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._base.execute("ROLLBACK")
+            raise
+        self._base.execute("COMMIT")
+
+    def _hold(self) -> None:
+        """A lock on a file of this process, which ends with it."""
+        if self._lock is None:
+            place = self.folder / OWNERS / self._owner
+            place.parent.mkdir(exist_ok=True)
+            self._lock = place.open("w")
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def _is_alive(self, owner: str) -> bool:
+        place = self.folder / OWNERS / owner
+        try:
+            with place.open() as stream:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        place.unlink(missing_ok=True)
+        return False
+
+
+def write_csv(path: Path, runs: Iterable[Run]) -> int:
+    """Runs as a table with a header; how many."""
+    count = 0
+
+    def write(place: Path) -> None:
+        nonlocal count
+        with place.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            for run in runs:
+                writer.writerow(asdict(run).values())
+                count += 1
+
+    write_durably(path, write)
+    return count
+
+
+def _run_of(row: sqlite3.Row) -> Run:
+    plain = {name: row[name] for name in COLUMNS}
+    code = plain["exit_code"]
+    return Run(**plain | {"exit_code": None if code is None else int(code)})
+
+
+def _value_of(column: str, text: str, condition: str) -> Any:
+    if column not in _NUMBERS:
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"--where {condition}: {column} is a number, got {text!r}") from None
+
+
+def _stamp_of(path: Path) -> str:
+    found = path.stat()
+    if not path.is_dir():
+        return f"{found.st_size} {found.st_mtime_ns} {found.st_ino}"
+    lines = [f"{place.relative_to(path)} {(s := place.stat()).st_size} {s.st_mtime_ns}" for place in _files(path)]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def _digest_of(path: Path) -> str:
+    if not path.is_dir():
+        return sha256(path)
+    return hashlib.sha256("\n".join(f"{p.relative_to(path)} {sha256(p)}" for p in _files(path)).encode()).hexdigest()
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(place for place in folder.rglob("*") if place.is_file())

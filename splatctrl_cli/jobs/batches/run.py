@@ -1,0 +1,264 @@
+"""Nodes through processes, in the order of their graph: what is done is kept, what changed is run again."""
+
+import json
+import os
+import signal
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli import __version__
+from splatctrl_cli.jobs.batches.graph import Node
+from splatctrl_cli.jobs.batches.keys import keys_of
+from splatctrl_cli.jobs.batches.ledger import Ledger, Run
+from splatctrl_cli.jobs.batches.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
+from splatctrl_cli.jobs.progress import Progress
+
+DONE, FAILED, ERROR, SKIPPED = "done", "failed", "error", "skipped"
+NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
+AGAIN_S = 0.5  # between looks at what another batch runs
+MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
+DISK_FULL = 6
+PRINTED = "printed"  # stands for the stamp of an output that there is none of
+
+
+@dataclass(kw_only=True)
+class Scheduler:
+    """Runs nodes with an executor of `slots` places, and keeps the ledger."""
+
+    ledger: Ledger
+    entry: str
+    executor: Executor
+    slots: int
+    progress: Progress
+    again: bool = False
+    runs: dict[str, Run] = field(default_factory=dict)
+    num_kept: int = 0
+
+    def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
+        """The run of each node, by its name: the one that stands from before, or a new one."""
+        keys, latest = keys_of(nodes, self.ledger, self.entry), self.ledger.latest()
+        waiting = {node.name: node for node in nodes}
+        futures: dict[Future[End], Node] = {}
+        tries: Counter[str] = Counter()
+        clock = _Clock(len(nodes), self.ledger.mean_seconds(), self.slots)
+        while waiting or futures:
+            is_busy = False
+            for node in list(waiting.values()):
+                if len(futures) >= self.slots:
+                    break
+                if any(need not in self.runs for need in node.needs):
+                    continue
+                run = self._without_running(node, keys[node.name], latest.get(node.name))
+                if run is not None:
+                    self._settle(waiting.pop(node.name), run, clock)
+                elif self.ledger.claim(node.name):
+                    run = self._without_running(node, keys[node.name], self.ledger.last(node.name))
+                    if run is not None:
+                        self.ledger.release(node.name)
+                        self._settle(waiting.pop(node.name), run, clock)
+                        continue
+                    del waiting[node.name]
+                    Path(self._place(node, ".end")).unlink(missing_ok=True)
+                    futures[self.executor.submit(run_task, self._task(node, keys[node.name]))] = node
+                else:
+                    is_busy = True
+            ended, _ = wait(futures, timeout=AGAIN_S if is_busy else None, return_when=FIRST_COMPLETED)
+            if is_busy and not futures:
+                time.sleep(AGAIN_S)
+            latest = self.ledger.latest() if is_busy else latest
+            for future in ended:
+                node, end = futures.pop(future), _end_of(future)
+                tries[node.name] += 1
+                if tries[node.name] <= node.limits.retries and _may_pass(end):
+                    self.progress.log(f"batch: {node.name}: {end.cause or 'disk full'}, once more")
+                    waiting[node.name] = node
+                    continue
+                run = run_of(node, keys[node.name], end, self.ledger.folder)
+                self.ledger.record(run)
+                self._settle(node, run, clock)
+        return {node.name: self.runs[node.name] for node in nodes}
+
+    def _without_running(self, node: Node, key: str, before: Run | None) -> Run | None:
+        """The run that stands: that of before, one that ended unrecorded, or none, for want of what it needs."""
+        lacking = [need for need in node.needs if not self.runs[need].stamp]
+        if lacking:
+            run = _skipped(node, key, lacking[0], self.ledger.folder)
+            if before is None or (before.state, before.key) != (SKIPPED, key):
+                self.ledger.record(run)
+            return run
+        if self.again:
+            return None
+        if before is not None and before.key == key and before.state in (DONE, FAILED) and _stands(node, before):
+            self.num_kept += 1
+            return _judged_again(before, node)
+        end = read_end(Path(self._place(node, ".end")), key)
+        if end is None or end.exit_code is None or (before is not None and end.started <= before.started):
+            return None
+        if node.out is not None and end.stamp != stamp_of(node.out):
+            return None
+        run = run_of(node, key, end, self.ledger.folder)
+        self.ledger.record(run)
+        return run if run.state in (DONE, FAILED) else None
+
+    def _settle(self, node: Node, run: Run, clock: "_Clock") -> None:
+        self.runs[node.name] = run
+        line = clock.passed(run)
+        if run.started >= clock.started or run.state == SKIPPED:
+            self.progress.log(f"{line} {node.name}: {told(run)}{clock.left(self.runs)}")
+
+    def _task(self, node: Node, key: str) -> Task:
+        return Task(
+            entry=self.entry,
+            words=[*node.words],
+            key=key,
+            out="" if node.out is None else str(node.out.absolute()),
+            result=self._place(node, ".json"),
+            log=self._place(node, ".log"),
+            end=self._place(node, ".end"),
+            timeout=node.limits.timeout,
+            memory=node.limits.memory,
+        )
+
+    def _place(self, node: Node, ending: str) -> str:
+        return str((self.ledger.folder / node.name).absolute()) + ending
+
+
+def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
+    """What a run came to, by how it ended and what it printed."""
+    place = folder / node.name
+    verdict = _verdict_of(Path(f"{place}.json")) if end.exit_code is not None else {}
+    code, outcome, label = end.exit_code, verdict.get("outcome", ""), verdict.get("label", "")
+    if not verdict and code in (0, 3):
+        outcome, label = "passed", "done"
+    last = last_lines(Path(f"{place}.log"), 1)
+    run = Run(
+        node=node.name,
+        recording=node.recording,
+        job=node.job,
+        command=node.command,
+        key=key,
+        state=ERROR,
+        expect=node.expect,
+        outcome=outcome,
+        label=label,
+        sentence=verdict.get("sentence", "") or (last[0].removeprefix("splatctrl: ") if last and code else ""),
+        exit_code=code,
+        cause=end.cause,
+        started=end.started,
+        seconds=round(end.seconds, 3),
+        peak_mb=round(end.peak_mb, 1),
+        variant=json.dumps(dict(node.variant)),
+        words=json.dumps(node.words),
+        needs=json.dumps(node.needs),
+        out="" if node.out is None else os.path.relpath(node.out, folder),
+        result=f"{node.name}.json",
+        log=f"{node.name}.log",
+        stamp=end.stamp if node.out is not None else PRINTED if end.exit_code is not None else "",
+        version=__version__,
+        host=socket.gethostname(),
+    )
+    return _judged_again(run, node)
+
+
+def _judged_again(run: Run, node: Node) -> Run:
+    """With the state that the node's expectation makes of it."""
+    if run.cause:
+        return replace(run, state=ERROR)
+    is_expected = node.expect in {run.label, run.outcome, f"exit {run.exit_code}"}
+    state = DONE if is_expected else ERROR if run.exit_code in NO_VERDICT else FAILED
+    return replace(run, state=state, expect=node.expect)
+
+
+def told(run: Run) -> str:
+    """A run in a few words."""
+    what = run.cause or run.label.upper() or f"exit {run.exit_code}"
+    if run.state == SKIPPED:
+        return f"skipped: {run.cause}"
+    odd = "" if run.state == DONE else f", expected {run.expect}" if run.state == FAILED else ", an error"
+    return f"{what}{odd} ({run.seconds:.1f} s)"
+
+
+@contextmanager
+def local_executor(workers: int) -> Iterator[Executor]:
+    """Processes on this machine; they end with the block, however it ends, and with this process."""
+    executor = ThreadPoolExecutor(workers, thread_name_prefix="node")
+    before = None
+    if threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGTERM, _interrupted)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        stop_runners()
+        raise
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+        stop_runners()
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
+
+
+def _interrupted(*_: object) -> None:
+    raise KeyboardInterrupt("interrupted; run the same again to go on")
+
+
+class _Clock:
+    """How many nodes have passed, and about how long the others take."""
+
+    def __init__(self, total: int, means: Mapping[str, float], slots: int) -> None:
+        self.started = time.time()
+        self._total, self._num, self._slots = total, 0, slots
+        self._means = dict(means)
+        self._seen: dict[str, list[float]] = {}
+
+    def passed(self, run: Run) -> str:
+        self._num += 1
+        if run.started >= self.started:
+            self._seen.setdefault(run.job, []).append(run.seconds)
+        return f"[{self._num}/{self._total}]"
+
+    def left(self, runs: Mapping[str, Run]) -> str:
+        """Nothing as long as no run has ended."""
+        rest = self._total - self._num
+        seen = [seconds for each in self._seen.values() for seconds in each]
+        if not rest or not seen:
+            return ""
+        seconds = rest * sum(seen) / len(seen) / min(self._slots, rest)
+        return f", about {seconds:.0f} s left" if seconds < 90 else f", about {seconds / 60:.0f} min left"
+
+
+def _end_of(future: "Future[End]") -> End:
+    """How a task ended; one that never came back is lost."""
+    try:
+        return future.result()
+    except Exception as error:  # of the executor: a worker that died, a machine that is gone
+        return End.without_one("", f"lost: {type(error).__name__}: {error}"[:200])
+
+
+def _may_pass(end: End) -> bool:
+    return end.exit_code == DISK_FULL or end.cause.startswith(MAY_PASS)
+
+
+def _stands(node: Node, run: Run) -> bool:
+    return node.out is None or run.stamp == stamp_of(node.out) != ""
+
+
+def _verdict_of(result: Path) -> dict[str, Any]:
+    with suppress(OSError, ValueError):
+        document = json.loads(result.read_bytes())
+        verdict = document.get("verdict") if isinstance(document, dict) else None
+        return verdict if isinstance(verdict, dict) else {}
+    return {}
+
+
+def _skipped(node: Node, key: str, need: str, folder: Path) -> Run:
+    end = End.without_one(key, f"needs {need}, which left nothing")
+    return replace(run_of(node, key, end, folder), state=SKIPPED)

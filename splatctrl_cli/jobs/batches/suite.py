@@ -1,0 +1,236 @@
+"""SUITE.toml: recordings, and the commands that each goes through."""
+
+import difflib
+import glob
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.config.ranges import shown
+from splatctrl_cli.errors import InputError, UsageError
+
+Table = Mapping[str, Any]
+
+UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
+SECONDS = {"s": 1, "m": 60, "min": 60, "h": 3600}
+_NAME = re.compile(r"[\w][\w.+-]*")
+_ENDINGS = (".mcap", ".bag", ".db3", ".toml", ".capture")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a job may take: wall time [s] and memory [bytes], 0 for any; retries after causes that may pass."""
+
+    timeout: float = 0.0
+    memory: int = 0
+    retries: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One command of a suite. options: by their long names; matrix: values by option, each combination a variant.
+
+    expect: the verdict's label or outcome, or "exit N".
+    """
+
+    name: str
+    command: str
+    options: Table = field(default_factory=dict)
+    matrix: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    expect: str = "passed"
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """One recording: its files (several are read as one session), and what a job has otherwise for it."""
+
+    name: str
+    paths: tuple[Path, ...]
+    overrides: Mapping[str, Table] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """A suite as its file has it; `folder` is that of the file, from which its paths count."""
+
+    name: str
+    folder: Path
+    out: Path
+    recordings: tuple[Recording, ...]
+    jobs: tuple[Job, ...]
+
+
+def read_suite(path: Path, commands: Sequence[str]) -> Suite:
+    """The suite in a file. Raises InputError for a file that is none, UsageError for what it says.
+
+    commands: those that a job may have.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: is not TOML: {error}", remedy="see docs/batch.md for an example") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="check the path") from None
+    _check_keys(path.name, document, ("name", "out", "recordings", "jobs"))
+    folder = path.absolute().parent
+    name = _text(path.name, document, "name", path.stem)
+    jobs = tuple(_job(key, table, commands) for key, table in _tables(path.name, document, "jobs").items())
+    recordings = [one for table in _list(path.name, document, "recordings") for one in _recordings(folder, table)]
+    if not jobs or not recordings:
+        raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {_lacking(jobs)}")
+    _check_recordings(recordings, {job.name for job in jobs})
+    out = folder / _text(path.name, document, "out", f"{path.stem}.out")
+    return Suite(name=name, folder=folder, out=out, recordings=tuple(recordings), jobs=jobs)
+
+
+def job_for(job: Job, recording: Recording, commands: Sequence[str]) -> Job | None:
+    """The job as a recording has it, None where it skips it. Raises UsageError for what the override says."""
+    override = recording.overrides.get(job.name, {})
+    if override.get("skip") is True:
+        return None
+    own = _job(job.name, {key: value for key, value in override.items() if key != "skip"}, commands, job)
+    return replace(own, options={**job.options, **own.options}, matrix={**job.matrix, **own.matrix})
+
+
+def _lacking(jobs: Sequence[Job]) -> str:
+    return "the first" if jobs else "the second"
+
+
+def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = None) -> Job:
+    where = f"[jobs.{name}]"
+    if not isinstance(table, Mapping):
+        raise UsageError(f"{where}: expected a table, got {shown(table)}")
+    _checked_name(where, name)
+    command = _text(where, table, "command", base.command if base else name)
+    if command not in commands:
+        near = difflib.get_close_matches(command, commands, n=1)
+        remedy = f"did you mean {near[0]}?" if near else f"give command = one of: {', '.join(commands)}"
+        raise UsageError(f"{where}: no job is called {command!r}", remedy=remedy)
+    own = next((option for option in _OWN if option in table), None)
+    if own is not None:
+        raise UsageError(f"{where}: a batch gives {own} itself", remedy="leave it out")
+    matrix = table.get("matrix", {})
+    if not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()):
+        raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {shown(matrix)}")
+    limits = base.limits if base else Limits()
+    return Job(
+        name=name,
+        command=command,
+        matrix=matrix,
+        expect=_text(where, table, "expect", base.expect if base else "passed"),
+        limits=Limits(
+            timeout=_amount(where, table, "timeout", SECONDS, limits.timeout),
+            memory=int(_amount(where, table, "memory", UNITS, limits.memory)),
+            retries=int(_amount(where, table, "retries", {}, limits.retries)),
+        ),
+        options={key: v for key, v in table.items() if key not in {"command", "matrix", "expect", *_LIMITS}},
+    )
+
+
+_OWN = ("out", "force", "resume", "json", "verbose", "quiet")
+_LIMITS = tuple(each.name for each in fields(Limits))
+
+
+def _recordings(folder: Path, table: Table) -> list[Recording]:
+    """Those of one [[recordings]]: one for each file that is found, or one of a session."""
+    where = "[[recordings]]"
+    _check_keys(where, table, ("name", "paths", "session", "jobs"))
+    overrides = _tables(where, table, "jobs")
+    if ("paths" in table) == ("session" in table):
+        raise UsageError(f"{where}: expected paths or session, and not both")
+    key = "paths" if "paths" in table else "session"
+    paths = list(dict.fromkeys(path for each in _list(where, table, key) for path in _found(folder, where, each)))
+    name = _text(where, table, "name", "")
+    if key == "session":
+        return [Recording(name=name or _name_of(paths[0]), paths=tuple(paths), overrides=overrides)]
+    if name and len(paths) > 1:
+        raise UsageError(f"{where} name = {name!r}: {len(paths)} recordings match", remedy="leave the name out")
+    return [Recording(name=name or _name_of(path), paths=(path,), overrides=overrides) for path in paths]
+
+
+def _found(folder: Path, where: str, pattern: object) -> list[Path]:
+    """What a pattern matches, sorted; a path without * is itself."""
+    places = sorted(glob.glob(_worded(where, "paths", pattern), root_dir=folder, recursive=True))  # noqa: PTH207
+    if not places:
+        raise InputError(f"{where}: nothing matches {pattern!r} in {folder}", remedy="check the pattern")
+    return [folder / place for place in places]
+
+
+def _name_of(path: Path) -> str:
+    """Of the file, without its ending; of a file called like thousands of others with its folder's."""
+    name = path.name
+    for ending in _ENDINGS:
+        name = name.removesuffix(ending)
+    name = f"{path.parent.name}-{name}" if name in {"log", "capture", "recording", "data"} else name
+    return re.sub(r"[^\w.+-]", "_", name)
+
+
+def _check_recordings(recordings: Sequence[Recording], jobs: Iterable[str]) -> None:
+    by_name: dict[str, Recording] = {}
+    for recording in recordings:
+        _checked_name("[[recordings]] name", recording.name)
+        other = by_name.setdefault(recording.name, recording)
+        if other is not recording:
+            both = f"{other.paths[0]} and {recording.paths[0]}"
+            raise UsageError(f"two recordings are called {recording.name!r}: {both}", remedy="give each a name")
+        for job in recording.overrides:
+            if job not in jobs:
+                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_near(job, list(jobs)))
+
+
+def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:
+    for key in table:
+        if key not in known:
+            raise UsageError(f"{where}: unknown key {key!r}", remedy=_near(key, known))
+
+
+def _near(word: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+
+
+def _checked_name(where: str, name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise UsageError(f"{where}: {name!r} is no name of a folder", remedy="use letters, digits, . _ + -")
+
+
+def _text(where: str, table: Table, key: str, default: str) -> str:
+    return _worded(where, key, table.get(key, default))
+
+
+def _worded(where: str, key: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise UsageError(f"{where} {key}: expected text, got {shown(value)}")
+    return value
+
+
+def _list(where: str, table: Table, key: str) -> list[Any]:
+    value = table.get(key, [])
+    if not isinstance(value, list) or (key in table and not value):
+        raise UsageError(f"{where} {key}: expected a list, got {shown(value)}")
+    return value
+
+
+def _tables(where: str, table: Table, key: str) -> dict[str, Table]:
+    value = table.get(key, {})
+    if not isinstance(value, dict) or not all(isinstance(each, dict) for each in value.values()):
+        raise UsageError(f"{where} {key}: expected [{key}.NAME], got {shown(value)}")
+    return value
+
+
+def _amount(where: str, table: Table, key: str, units: Mapping[str, int], default: float) -> float:
+    """A number, or text such as "10 min" or "4GiB"."""
+    value = table.get(key, default)
+    match = re.fullmatch(r"\s*([\d.]+)\s*(\w+)\s*", value) if isinstance(value, str) else None
+    try:
+        amount = float(match[1]) * units[match[2]] if match else float(value)
+    except (KeyError, TypeError, ValueError):
+        amount = -1.0
+    if isinstance(value, bool) or not 0 <= amount < 1e15:
+        example = f" or with one of {', '.join(units)}" if units else ""
+        raise UsageError(f"{where} {key}: expected a number, 0 or more{example}, got {shown(value)}")
+    return amount

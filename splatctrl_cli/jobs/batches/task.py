@@ -1,0 +1,271 @@
+"""One node's run in a process of its own: a forked child under limits, its log, its result, and how it ended.
+
+A runner process has the commands imported, so that a node costs a fork and not a start of Python; it has one thread
+and runs one node at a time, told by lines of JSON on its stdin. When stdin ends, so does what runs.
+"""
+
+import contextlib
+import ctypes
+import importlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NoReturn
+
+from splatctrl_cli.files.output import partial_path, write_durably
+from splatctrl_cli.files.output_lock import remove
+
+Entry = Callable[[list[str]], int]
+
+POLL = 0.02  # [s] between looks at a child's memory
+GRACE = 10.0  # [s] from asking a child to end to ending it
+PAGE = os.sysconf("SC_PAGE_SIZE")
+PR_SET_PDEATHSIG = 1  # of prctl(2): what a child gets when its parent dies
+PART = ".part"  # ends the name of a result that is not whole
+_LAST = 4096  # bytes of a log that are looked at for its last lines
+_local = threading.local()  # a runner for each thread that has run a task
+_runners: list["subprocess.Popen[str]"] = []
+WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What a runner is to do: call `entry` with `words`, and leave `result` (stdout), `log` (stderr) and `end`.
+
+    key: of the node, kept in `end`; timeout [s] and memory [bytes], 0 for any. All plain values, for other machines.
+    """
+
+    entry: str
+    words: Sequence[str]
+    key: str
+    out: str
+    result: str
+    log: str
+    end: str
+    timeout: float = 0.0
+    memory: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class End:
+    """How a run ended: its exit code, None where it was killed and `cause` says why; seconds of wall time from
+    `started` [s since 1970]; peak memory [MB]; stamp: of the output, which changes when somebody writes it.
+    """
+
+    key: str
+    exit_code: int | None
+    cause: str
+    started: float
+    seconds: float
+    peak_mb: float
+    stamp: str
+
+    @classmethod
+    def without_one(cls, key: str, cause: str) -> "End":
+        """Of a task that never ran to an end."""
+        return cls(key=key, exit_code=None, cause=cause, started=time.time(), seconds=0.0, peak_mb=0.0, stamp="")
+
+
+def run_task(task: Task) -> End:
+    """Run a task in this thread's runner, unless it has already ended, and say how it ended.
+
+    A runner that was killed is started once more.
+    """
+    known = read_end(Path(task.end), task.key)
+    if known is not None and known.exit_code is not None and known.stamp in ("", stamp_of(Path(task.out))):
+        return known  # by a worker that was lost before it could say so
+    for _ in range(2):
+        runner = getattr(_local, "runner", None)
+        if runner is None or runner.poll() is not None:
+            runner = _local.runner = _started(task.entry)
+        assert runner.stdin is not None and runner.stdout is not None
+        try:
+            runner.stdin.write(json.dumps(asdict(task)) + "\n")
+            runner.stdin.flush()
+            line = runner.stdout.readline()
+        except (BrokenPipeError, ValueError):  # killed, or closed by stop_runners
+            line = ""
+        if line:
+            return End(**json.loads(line))
+        runner.kill()
+        runner.wait()
+    return End.without_one(task.key, "its runner was killed twice")
+
+
+def stop_runners() -> None:
+    """End every runner of this process, and what it runs."""
+    while _runners:
+        runner = _runners.pop()
+        assert runner.stdin is not None and runner.stdout is not None
+        with contextlib.suppress(OSError):
+            runner.stdin.close()
+        runner.wait()
+        runner.stdout.close()
+
+
+def read_end(path: Path, key: str) -> End | None:
+    """How the run of a node with this key ended, None where none did."""
+    try:
+        end = End(**json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError):
+        return None
+    return end if end.key == key else None
+
+
+def stamp_of(out: Path) -> str:
+    """Of an output: size and time of its run.json, or of the file itself; empty where there is none."""
+    for place in (out / "run.json", out / "capture.json", out):
+        with contextlib.suppress(OSError):
+            found = place.stat()
+            return f"{found.st_size} {found.st_mtime_ns}" if place != out or not out.is_dir() else "folder"
+    return ""
+
+
+def last_lines(log: Path, number: int = 5) -> list[str]:
+    """The end of a log, without control characters."""
+    try:
+        with log.open("rb") as stream:
+            stream.seek(max(log.stat().st_size - _LAST, 0))
+            text = stream.read(_LAST).decode("utf-8", "replace")
+    except OSError:
+        return []
+    lines = ["".join(c for c in line if c.isprintable()) for line in text.replace("\r", "\n").splitlines()]
+    return [line for line in lines if line.strip()][-number:]
+
+
+def _started(entry: str) -> "subprocess.Popen[str]":
+    words = [sys.executable, "-m", __name__, entry]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    pipe = subprocess.PIPE
+    runner = subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, start_new_session=True, env=environment)
+    _runners.append(runner)
+    return runner
+
+
+def main(entry: str) -> None:
+    """A runner: tasks from stdin, ends to stdout, until stdin ends."""
+    module = importlib.import_module(entry.partition(":")[0])
+    function: Entry = getattr(module, entry.partition(":")[2])
+    getattr(module, "preload", lambda: None)()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    pending = b""
+    while True:
+        while b"\n" not in pending:
+            part = os.read(0, 1 << 16)
+            if not part:
+                return
+            pending += part
+        line, _, pending = pending.partition(b"\n")
+        end = _run(function, Task(**json.loads(line)))
+        os.write(1, (json.dumps(asdict(end)) + "\n").encode())
+
+
+def _run(function: Entry, task: Task) -> End:
+    """Fork, wait within the limits, and write `task.end`."""
+    Path(task.end).parent.mkdir(parents=True, exist_ok=True)
+    _clear(task)
+    started, start = time.time(), time.perf_counter()
+    pid = os.fork()
+    if pid == 0:
+        _be_child(function, task)
+    cause = _wait(pid, task)
+    _, status, used = os.wait4(pid, 0)
+    if os.WIFSIGNALED(status) and not cause:
+        cause = f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
+    if not cause:
+        Path(task.result + PART).replace(task.result)
+    end = End(
+        key=task.key,
+        exit_code=None if cause else os.WEXITSTATUS(status),
+        cause=cause,
+        started=started,
+        seconds=time.perf_counter() - start,
+        peak_mb=used.ru_maxrss * 1024 / 1e6,
+        stamp=stamp_of(Path(task.out)) if not cause and os.WEXITSTATUS(status) in WROTE else "",
+    )
+    write_durably(Path(task.end), lambda path: path.write_text(json.dumps(asdict(end)) + "\n"))
+    return end
+
+
+def _clear(task: Task) -> None:
+    """Remove what a run with another key left, whole or not, so that nobody takes it for this one's."""
+    begun = Path(task.end).with_suffix(".begun")
+    if begun.is_file() and begun.read_text() != task.key and task.out:
+        remove(Path(task.out))
+        remove(partial_path(Path(task.out)))
+    begun.write_text(task.key)
+
+
+def _be_child(function: Entry, task: Task) -> NoReturn:
+    """Run the words as a process of its own session would, and leave."""
+    code = 70
+    try:
+        os.setsid()
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, path in ((0, os.devnull), (1, task.result + PART), (2, task.log)):
+            os.dup2(os.open(path, os.O_RDWR if number == 0 else os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+        sys.argv = ["splatctrl", *task.words]
+        code = function(list(task.words))
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 70
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+
+
+def _wait(pid: int, task: Task) -> str:
+    """Until the child has ended or was made to; why, if it was. Leaves this process where stdin ends."""
+    start, asked, cause = time.monotonic(), 0.0, ""
+    ended, look = os.pidfd_open(pid), POLL if task.memory else 1.0
+    try:
+        while True:
+            ready, _, _ = select.select([ended, 0], [], [], look)
+            if ended in ready:
+                return cause
+            if 0 in ready and not os.read(0, 1):  # nobody waits for this any more
+                _signal(pid, signal.SIGKILL)
+                os._exit(1)
+            if task.memory and _memory_of(pid) > task.memory:
+                _signal(pid, signal.SIGKILL)
+                cause = f"took more memory than {task.memory / 1e6:.0f} MB"
+            elif task.timeout and not asked and time.monotonic() - start > task.timeout:
+                _signal(pid, signal.SIGINT)
+                asked, cause = time.monotonic(), f"timed out after {task.timeout:g} s"
+            elif asked and time.monotonic() - asked > GRACE:
+                _signal(pid, signal.SIGKILL)
+    finally:
+        os.close(ended)
+
+
+def _signal(pid: int, number: signal.Signals) -> None:
+    """To a child and what it started; to itself alone as long as it has no group."""
+    try:
+        os.killpg(pid, number)
+    except ProcessLookupError:
+        os.kill(pid, number)
+
+
+def _memory_of(pid: int) -> int:
+    """Bytes of memory that a process has to itself or shares, 0 where it is gone."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE
+    except (OSError, IndexError):
+        return 0
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

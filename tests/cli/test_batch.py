@@ -1,0 +1,81 @@
+"""``splatctrl batch`` as a person and a CI job use it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from splatctrl_cli.cli.main import main
+from tests.conftest import ROOT
+
+LOG = ROOT / "sample_data/tabletop/log.mcap"
+SUITE = f"""
+name = "two logs"
+[[recordings]]
+name = "good"
+paths = ["{LOG}"]
+[[recordings]]
+paths = ["damaged.mcap"]
+[recordings.jobs.info]
+expect = "exit 4"
+[jobs.info]
+[jobs.ingest]
+cameras = ["cam0"]
+"""
+
+
+def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
+    suite.write_text(SUITE)
+    (tmp_path / "damaged.mcap").write_bytes(b"not a log")
+
+    def said(*words: str, code: int) -> tuple[str, str]:
+        assert main(["batch", str(suite), *words]) == code
+        return capsys.readouterr()
+
+    planned, _ = said("--dry-run", code=0)
+    assert [line.split()[:3] for line in planned.splitlines()[2:6]] == [
+        [f"{name}/{job}", "to", "do"] for name in ("damaged", "good") for job in ("info", "ingest")
+    ]
+    assert f"splatctrl ingest --cameras=cam0 --out={out}/good/ingest.capture" in planned
+    assert not (out / "good").exists()
+    printed, told = said("--workers", "1", code=1)
+    assert printed.startswith("batch: ERROR (4 nodes of 2 recordings): damaged/ingest: exit 4, an error")
+    assert "[4/4]" in told and "see damaged/ingest.log" in printed
+    assert (out / "good/ingest.capture/capture.json").is_file()
+    printed, _ = said("--json", "--workers", "1", "-q", code=1)
+    found = json.loads(printed)
+    assert (found["kept"], found["exit_code"], found["verdict"]["label"]) == (3, 1, "error")
+    states = {node["id"]: node["state"] for node in found["nodes"]}
+    assert states == {"good/info": "done", "good/ingest": "done", "damaged/info": "done", "damaged/ingest": "error"}
+    document = json.loads((out / "batch.json").read_text())
+    assert (document["format"], document["version"], len(document["nodes"])) == ("splatctrl-batch", 1, 4)
+    listed, _ = said("--failed", code=0)
+    assert "damaged/ingest" in listed and "good" not in listed
+    listed, _ = said("--where", "state=done", "--where", "job=ingest", "--csv", str(tmp_path / "runs.csv"), code=0)
+    assert listed.count("good/ingest") == 2  # the node and its log
+    assert (tmp_path / "runs.csv").read_text().count("\n") == 2
+    assert main(["batch", str(out), "--list"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["missing.toml"], 4, "missing.toml: cannot be read"),
+        (["--shard", "3/2"], 2, "expected I/N with I from 1 to N, got '3/2'"),
+        (["--shard", "5/9"], 2, "has none of the 2 recordings; give fewer shards"),
+        (["--list"], 4, "has no ledger.sqlite; run the batch first"),
+        (["--dask", "tcp://127.0.0.1:1"], 2, "--dask"),
+    ],
+)
+def test_what_cannot_run_is_said_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, said: str
+) -> None:
+    (tmp_path / "suite.toml").write_text(SUITE)
+    (tmp_path / "damaged.mcap").touch()
+    place = [] if words[0].endswith(".toml") else [str(tmp_path / "suite.toml")]
+    assert main(["batch", *place, *words]) == code
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
