@@ -24,7 +24,6 @@ CODE = re.compile(r"`([^`\n]+)`")
 PLACE = re.compile(r"([\w/]+\.(?:py|h|cpp))(?:: (.+))?")
 FOREIGN = {  # options of other programs
     "benchmarks.md": {"--demo"},
-    "hunt.md": {"--continue"},
     "reliability.md": {"--always-decode-chunk"},
 }
 EXAMPLE = ROOT / "docs" / "start.md"

@@ -1,5 +1,6 @@
 """What a job says while it works."""
 
+import sys
 from typing import Protocol
 
 
@@ -20,6 +21,17 @@ class Silent:
 
     def log(self, line: str) -> None:
         """Drop the line."""
+
+
+class Lines:
+    """Prints on stderr."""
+
+    is_quiet = False
+
+    def log(self, line: str) -> None:
+        """One line."""
+        sys.stderr.write(line + "\n")
+        sys.stderr.flush()
 
 
 SILENT = Silent()

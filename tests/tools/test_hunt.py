@@ -17,7 +17,7 @@ from tools.hunt.families import CAMERAS, FAMILIES, Draft
 from tools.hunt.faults import Fault
 from tools.hunt.observability import observable
 from tools.hunt.recording import Recorder, Shown
-from tools.hunt.table import Row, append_rows, border_of, read_rows, report, upper_limit
+from tools.hunt.table import Row, border_of, merge_rows, read_rows, report, upper_limit
 from tools.hunt.trial import Trial, draw, record, run, true_robot
 from tools.hunt.world import DURATION_S, World, at_s, draw_cameras, during, moving, positions_of, table
 
@@ -336,8 +336,9 @@ def test_a_false_green_is_safe_in_contact_or_five_millimetres_under_the_margin()
 
 def test_rows_come_back_from_the_table_as_they_were(tmp_path: Path) -> None:
     rows = [row(), row(index=2, outcome="contact", reason="a, b", clearance=-0.0125, observable=False)]
-    append_rows(tmp_path / "t.csv", rows[:1])
-    append_rows(tmp_path / "t.csv", rows[1:])
+    merge_rows(tmp_path / "t.csv", rows[:1])
+    merge_rows(tmp_path / "t.csv", rows[1:])
+    merge_rows(tmp_path / "t.csv", rows)
     assert read_rows(tmp_path / "t.csv") == rows
 
 

@@ -1,69 +1,80 @@
-"""Run the hunt: ``python -m tools.hunt --runs 2000 --seed 0``. The same seed gives the same runs."""
+"""Run the hunt: ``python -m tools.hunt --runs 2000 --seed 0``. The same seed gives the same runs.
+
+The runs are a batch: those of a folder that no change of the code or of the hunt concerns are not run again.
+"""
 
 import argparse
+import json
 import os
 import sys
-import traceback
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
-from tools.hunt.table import append_rows, border_of, read_rows, report
+from splatctrl_cli.jobs.batches.graph import Node
+from splatctrl_cli.jobs.batches.ledger import Ledger, Run
+from splatctrl_cli.jobs.batches.run import DONE, FAILED, Scheduler, local_executor
+from splatctrl_cli.jobs.progress import Lines
+from tools.hunt.table import border_of, merge_rows, read_rows, report
 from tools.hunt.trial import Row, family_of, run
 
-TABLE = Path(__file__).parent / "campaigns.csv"
+HERE = Path(__file__).parent
+TABLE, ENTRY = HERE / "campaigns.csv", "tools.hunt.__main__:one"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, and print the table; 1 where something observable in contact, or a crash, was called safe."""
     args = _parser().parse_args(arguments)
-    known = {(row.seed, row.index): row for row in read_rows(args.table)}
-    if args.only:
-        wanted = args.only
-    else:
-        done = [index for seed, index in known if seed == args.seed]
-        first = max(done, default=-1) + 1 if args.goes_on else args.first
-        wanted = [(args.seed, index) for index in range(first, first + args.runs)]
     if args.border:
-        print("\n".join(f"{row.name}  {row.family}, {row.kind}" for row in border_of(list(known.values()))))
+        print("\n".join(f"{row.name}  {row.family}, {row.kind}" for row in border_of(read_rows(TABLE))))
         return 0
-    rows: list[Row] = []
-    try:
-        for row in _rows(wanted, args.jobs):
-            rows.append(row)
-            print(_line(row), file=sys.stderr, flush=True)
-            if args.goes_on:
-                append_rows(args.table, [row])
-    except KeyboardInterrupt:
-        print(f"interrupted after {len(rows)} runs", file=sys.stderr)
-    counted = [row for row in known.values() if row.seed == args.seed] + rows if args.goes_on else rows
-    print("\n".join(report(counted)))
+    wanted = args.only or [(args.seed, index) for index in range(args.first, args.first + args.runs)]
+    nodes = [_node(seed, index) for seed, index in wanted]
+    with Ledger(args.out) as ledger, local_executor(args.jobs) as executor:
+        places = {"executor": executor, "slots": args.jobs}
+        runs = Scheduler(ledger=ledger, entry=ENTRY, progress=Lines(), **places).run(nodes)
+    rows = [_row(args.out, run) for run in runs.values()]
+    if args.table is not None:
+        merge_rows(args.table, rows)
+    print("\n".join(report(rows)))
     return int(any(row.outcome == "crash" or _is_grave(row) for row in rows))
 
 
-def _rows(wanted: Sequence[tuple[int, int]], jobs: int) -> Iterator[Row]:
-    """The runs in their order, whichever process ends first."""
-    if jobs == 1:
-        yield from (_caught(seed, index) for seed, index in wanted)
-        return
-    with ProcessPoolExecutor(jobs) as pool:
-        try:
-            yield from pool.map(_caught, *zip(*wanted, strict=True))
-        except KeyboardInterrupt:
-            pool.shutdown(cancel_futures=True)
-            raise
+def one(words: list[str]) -> int:
+    """What a node runs: the run that its word names; its row and line go to stdout."""
+    row = run(*_run_name(words[0]))
+    label = (
+        ("false green" if row.observable else "false green, not observable") if row.is_false_green else row.outcome
+    )
+    outcome = "failed" if row.is_false_green and row.observable else "passed"
+    verdict = {"outcome": outcome, "label": label, "sentence": _line(row)}
+    print(json.dumps({"verdict": verdict, "row": asdict(row)}))
+    return 0
 
 
-def _caught(seed: int, index: int) -> Row:
-    """The run's row; one of outcome `crash` where the tool raised what it must not."""
-    try:
-        return run(seed, index)
-    except Exception as error:  # whatever it is, it is a finding, and the hunt goes on
-        traceback.print_exc()
-        return Row(
-            seed=seed, index=index, family=family_of(index), kind="", strength=0.0, mode="", outcome="crash",
-            clearance=0.0, observable=True, rule="", reason=f"{type(error).__name__}: {error}"[:90],
-        )  # fmt: skip
+def preload() -> None:
+    """What a runner does once: a run, after which the coverage of the arm is known to all others."""
+    run(0, 0)
+
+
+def _node(seed: int, index: int) -> Node:
+    name = f"{seed}/{index}"
+    return Node(name=name, recording=str(seed), job=str(index), command="hunt", words=(name,), inputs=_code())
+
+
+def _code() -> tuple[Path, ...]:
+    return tuple(sorted(HERE.glob("*.py")))
+
+
+def _row(out: Path, run: Run) -> Row:
+    """The row of a run; one of outcome `crash` where the tool raised what it must not."""
+    if run.state in (DONE, FAILED):
+        return Row(**json.loads((out / run.result).read_text(encoding="utf-8"))["row"])
+    seed, index = _run_name(run.node)
+    return Row(
+        seed=seed, index=index, family=family_of(index), kind="", strength=0.0, mode="", outcome="crash",
+        clearance=0.0, observable=True, rule="", reason=(run.cause or run.sentence)[:90],
+    )  # fmt: skip
 
 
 def _is_grave(row: Row) -> bool:
@@ -71,10 +82,9 @@ def _is_grave(row: Row) -> bool:
 
 
 def _line(row: Row) -> str:
-    mark = "  FALSE GREEN" if row.is_false_green else ""
     return (
-        f"{row.name} {row.family} ({row.kind}, {row.strength:.3g}) {row.mode}: {row.outcome} ({row.reason}); "
-        f"true {1e3 * row.clearance:.1f} mm, {'' if row.observable else 'not '}observable ({row.rule}){mark}"
+        f"{row.family} ({row.kind}, {row.strength:.3g}) {row.mode}: {row.outcome} ({row.reason}); "
+        f"true {1e3 * row.clearance:.1f} mm, {'' if row.observable else 'not '}observable ({row.rule})"
     )
 
 
@@ -91,12 +101,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--only", type=_run_name, nargs="+", metavar="SEED/INDEX", help="these runs alone")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
     parser.add_argument(
-        "--continue", dest="goes_on", action="store_true", help="go on where the table ends, and add to it"
+        "--border", action="store_true", help=f"print runs of {TABLE.name} for tests/tools/border.txt"
     )
+    parser.add_argument("--table", type=Path, metavar="FILE.csv", help="put the runs into it, for those of before")
     parser.add_argument(
-        "--border", action="store_true", help="print the runs of the table for tests/tools/border.txt"
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("hunt.out"),
+        metavar="DIR",
+        help="the batch's folder (default: hunt.out)",
     )
-    parser.add_argument("--table", type=Path, default=TABLE, metavar="FILE.csv", help=f"(default: {TABLE.name})")
     return parser
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from scipy.stats import beta
 
+from splatctrl_cli.files.output import write_durably
 from tools.hunt.observability import MARGIN, TOLERATED
 from tools.hunt.outcome import WORDS
 from tools.hunt.trial import Row
@@ -28,14 +29,17 @@ def read_rows(path: Path) -> list[Row]:
         return [_row(entry) for entry in csv.DictReader(stream)]
 
 
-def append_rows(path: Path, rows: Iterable[Row]) -> None:
-    """Add runs at the end of a table, with its header where it is new."""
-    is_new = not path.is_file()
-    with path.open("a", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        if is_new:
+def merge_rows(path: Path, rows: Iterable[Row]) -> None:
+    """Put runs into a table, in the place of the same ones of before."""
+    merged = {(row.seed, row.index): row for row in (*read_rows(path), *rows)}
+
+    def write(place: Path) -> None:
+        with place.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(COLUMNS)
-        writer.writerows(_words(row) for row in rows)
+            writer.writerows(_words(merged[key]) for key in sorted(merged))
+
+    write_durably(path, write)
 
 
 def truth_of(row: Row) -> str:
