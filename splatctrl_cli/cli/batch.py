@@ -69,7 +69,7 @@ class OfThisProgram:
             places += made if not action.option_strings else []
             words += made if action.option_strings else []
         words += ["--json", *(["--", *places] if places else [])]
-        parsed = build_parser(command).parse_args(words)
+        parsed = parser.parse_args(words[1:])
         if hasattr(parsed, "set"):
             load_config(parsed.config, parsed.set)
         values = [value for name, value in vars(parsed).items() if name != "out"]
