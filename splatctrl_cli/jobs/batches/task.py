@@ -166,7 +166,10 @@ def main(entry: str) -> None:
             pending += part
         line, _, pending = pending.partition(b"\n")
         end = _run(function, Task(**json.loads(line)))
-        os.write(1, (json.dumps(asdict(end)) + "\n").encode())
+        try:
+            os.write(1, (json.dumps(asdict(end)) + "\n").encode())
+        except BrokenPipeError:  # nobody waits for it any more; the end is in its file
+            return
 
 
 def _run(function: Entry, task: Task) -> End:
