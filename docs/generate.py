@@ -35,7 +35,7 @@ SHARED_BY = 2  # commands with the same option, in the same words, from which on
 INPUT = "input"  # the group of options that say how a recording is read
 HELP = ("help", "help_all")
 SIMPLE = ("int", "float", "str")  # types that a default shows
-TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:\|.*\n)*)")
+TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:[|-].*\n)*)")
 REGISTRIES: dict[
     str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout | Check | Criterion[Judged]]]
 ] = {
@@ -43,7 +43,7 @@ REGISTRIES: dict[
     "grid_files": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
     "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
     "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
-    "checks": (("code", "what it means", "severity"), CHECKS.values()),
+    "checks": ((), CHECKS.values()),  # without a header: a list
 }
 
 Row = tuple[str, str]  # an argument, and what it means
@@ -66,11 +66,12 @@ def pages() -> dict[str, str]:
 
 
 def _filled(found: re.Match[str]) -> str:
-    """A mark in a page, and the table of the registry that it names."""
+    """A mark in a page, and the table, or list, of the registry that it names."""
     header, entries = REGISTRIES[found[2]]
     texts = [text for entry in entries for text in entry.docs.split("\n\n") if text]
     rows = [tuple(cell.strip() for cell in " ".join(text.split()).split("|")) for text in texts]
-    return found[1] + "\n".join(_table(header, rows)) + "\n"
+    lines = _table(header, rows) if header else _list((name, meaning) for name, meaning in rows)
+    return found[1] + "\n".join(lines) + "\n"
 
 
 def cli_page() -> str:

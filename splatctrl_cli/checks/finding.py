@@ -36,8 +36,8 @@ class Check:
 
     @property
     def docs(self) -> str:
-        """Its row in docs/check.md, cells between bars: code, meaning, severity."""
-        return f"`{self.code}` | {self.meaning} | {', '.join(self.severities)}"
+        """Its line in docs/check.md: code and severity, a bar, meaning."""
+        return f"`{self.code}` ({', '.join(self.severities)}) | {self.meaning}"
 
 
 _TABLE = """
@@ -48,23 +48,22 @@ missing | error | all | what `ingest` needs is not there, or cannot be joined (d
 refused | error | all | the capture or folder cannot be read as described
 gap | warning |  | an image or state topic pauses for over 0.1 s and three median intervals; topics and transforms
     that pause together are one finding
-part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log on
+part | note, warning |  | a topic begins or ends over 1 s inside the others; a warning from a tenth of the log
 files-apart | warning |  | over 60 s between two files of one recording
 stamp-repeats | warning |  | header stamps that repeat the one before
 stamp-back | warning |  | header stamps that go back
 stamp-zero | warning, error | all | header stamps of 0 (use `--stamps log`); an error where all of an image topic are
 clock | note |  | the stamps of all topics are shifted alike against the log's clock (a played log)
-clock-offset | warning |  | stamps over 20 ms after or 1 s before their log time, or shifted against it by over 0.2 s
-    more or less than most topics, or by over 60 ms more or less than the other cameras (three or more)
+clock-offset | warning |  | stamps over 20 ms after or 1 s before their log time, or whose shift against it differs by
+    over 0.2 s from most topics, or by over 60 ms from the other cameras (three or more)
 clock-drift | warning |  | the time from stamp to log changes by over 20 ms (and six times its spread) over the log
 robot-clock | note, warning |  | the offset of cameras and robot: with `--urdf` from where depth shows the arm (a
     warning beyond 40 ms, for one camera if only it is off), else from when both show motion (beyond 30 ms plus twice
     its uncertainty)
 sampled | note |  | not every image was decoded
-undecodable | note, warning, error | all | images that do not decode; an error where none decodes, a note where no
-    camera uses the topic
-encoding | note, warning |  | an encoding that is not read, or that changes; a note where no camera uses the topic
-image-size | note, warning |  | images of one topic of several sizes; a note where no camera uses the topic
+undecodable | note, warning, error | all | images that do not decode; an error where none does
+encoding | note, warning |  | an encoding that is not read, or that changes
+image-size | note, warning |  | images of one topic of several sizes
 pairing | warning, error | all | less than 95 % of the images of colour or depth find a partner; an error where none
     is found
 rates-differ | note |  | one of colour and depth has 1.5 times as many images as the other
@@ -78,7 +77,7 @@ principal-point | warning, error | later | cx or cy over 15 % of the size off th
     where both fit another image size
 focal-ratio | warning |  | fx and fy differ by over 5 %
 field-of-view | warning |  | horizontal field of view outside 20 to 140 degrees
-uncalibrated | note, warning |  | a CameraInfo whose K is zero; a note where no camera needs it
+uncalibrated | note, warning |  | a CameraInfo whose K is zero
 camera-info-size | error | all | a CameraInfo of another size than its images
 camera-info-changes | warning |  | a CameraInfo that changes within the log
 camera-info-two | warning |  | a second CameraInfo for the same frame and size, with another K

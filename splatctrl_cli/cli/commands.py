@@ -273,8 +273,7 @@ COMMANDS = {
         options=sdf_bake_options,
     ),
     "score": Command(
-        summary="compare renders of a scene with recorded views (by default of the cameras that did not train it): "
-        "PSNR, SSIM, depth error, by a named protocol; or fit scans first (--fit)",
+        summary="compare renders of a scene with recorded views: PSNR, SSIM, depth error; or fit scans first (--fit)",
         examples=(
             "score out/scene --reference out/x.capture --cameras cam3 -o out/score",
             "score out/scan --dtu sample_data/dtu --protocol holdout:2,5 --require 'psnr_all>=20'",

@@ -66,13 +66,10 @@ def add_source(add: Options) -> None:
     add("--camera NAME=COLOR,DEPTH[,INFO] ...", "topics of a camera, instead of those found")
     add(
         f"--camera-pose NAME={POSE} ...",
-        "pose of a fixed camera in the world, instead of the recorded one, or NAME=identity; or NAME=TOPIC[@FRAME], a"
-        " topic of poses (Odometry, PoseStamped, ...) of FRAME where tf has none",
+        "pose of a fixed camera in the world; or NAME=identity; or NAME=TOPIC[@FRAME], a topic of its poses, or of"
+        " FRAME's",
     )
-    add(
-        "--intrinsics NAME=FX,FY,CX,CY ...",
-        "intrinsics of a camera in pixels, without distortion, instead of the recorded ones",
-    )
+    add("--intrinsics NAME=FX,FY,CX,CY ...", "of a camera [px], without distortion, instead of the recorded ones")
     add("--human-topic NAME=TOPIC ...", "mono8 masks of a camera's colour images, not 0 where they show a person")
     add("--world-frame FRAME", "tf frame of poses (default: root of the tf tree)")
     add("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m"))
@@ -94,14 +91,14 @@ def add_scan(add: Options) -> None:
     add("--depths DIR", "depth_map_0000.pfm and so on of a scan in IDR's layout", Path)
     add(
         "--downscale N",
-        "make images of --dtu N times smaller (default: down to the size of the protocol, if a whole factor)",
+        "make images of --dtu N times smaller (default: as the protocol has them, if N is whole)",
         whole(1, 64),
     )
 
 
 def add_disagreement(add: Options) -> None:
     """``--max-pose-jump`` and ``--allow-disagreement``: by how much a log may contradict itself."""
-    jump = "how far a camera may move between frames less than a second apart, in metres"
+    jump = "how far a camera may move between frames less than a second apart"
     add("--max-pose-jump M", jump, real(1e-3, MAX_LENGTH, "m"), 1.0)
     add("--allow-disagreement", "continue although cameras disagree about surfaces")
 
@@ -113,13 +110,13 @@ def add_declare(add: Options) -> None:
 
 def add_packages(add: Options) -> None:
     """``--packages``."""
-    packages = "folder in which package:// paths of the URDF's meshes are found; default: the folders above it"
+    packages = "where package:// paths of the URDF are found (default: the folders above it)"
     add("--packages DIR ...", packages, Path)
 
 
 def add_lock(add: Options) -> None:
     """``--lock``."""
-    held = "hold a joint still at a value [rad or m], and what mimics it, such as a finger that no log moves"
+    held = "hold a joint, and what mimics it, at a value [rad or m]"
     add("--lock JOINT=VALUE ...", held)
 
 

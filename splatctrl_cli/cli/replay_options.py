@@ -30,7 +30,7 @@ def replay_options(add: Options, parser: Parser) -> None:
     scene = add.either(required=True)
     scene("--field FIELD", "a baked field (folder or field.npz)", Path)
     scene("--scene SCENE", "a reconstruction: its splats, as known at each time", Path)
-    lockstep = "reconstruct the scene from LOG's own cameras, in step with the replay; --set scene.max_splats=N"
+    lockstep = "reconstruct the scene from LOG's own cameras, in step with the replay"
     scene("--lockstep", lockstep)
     add("--urdf FILE", "the robot's URDF", Path, required=True)
     add("--spheres FILE.yaml", "its spheres (default: the URDF's own)", Path)
@@ -52,7 +52,7 @@ def _add_robot(add: Options) -> None:
     add(f"--base {POSE}", "pose of the URDF's root in world (default: identity)", pose)
     add_lock(add)
     add_packages(add)
-    add("--srdf FILE", "self-collision rows leave out what its disable_collisions name", Path)
+    add("--srdf FILE", "leave the pairs of its disable_collisions out of the self-collision rows", Path)
     add_declare(add)
 
 
@@ -64,7 +64,7 @@ def _add_goal(add: Options) -> None:
     goal("--goal-joints Q1,Q2,...", "goal configuration [rad]", numbers)
     goal("--waypoints FILE", "goals in order, poses or configurations (.toml or .csv)", Path)
     goal("--follow", "the logged pose of each time is the goal (the default of --mode open-loop)")
-    twists = "reach for the twists of this topic of LOG (Twist, TwistStamped), or of a .toml's table: twists"
+    twists = "track the twists of this topic of LOG (Twist, TwistStamped), or of a .toml's table: twists"
     goal("--twist-topic NAME", twists)
     add("--twist-frame LINK", "axes of the twists: world or those of a link (default: as the log says)")
     back = "put the arm back into the logged configuration every S seconds"
@@ -78,10 +78,10 @@ def _add_evidence(add: Options) -> None:
     add("--latency S", late, real(0, MAX_SECONDS, "s"), 0.0)
     add(
         "--evidence CAMERA|K",
-        "bound the map's error by depth that is kept out of the map: of a camera of LOG that did not train it, or"
-        " (--lockstep) of every K-th frame set",
+        "bound the map's error by depth kept out of the map: of a camera that did not train it, or (--lockstep) of"
+        " every K-th frame set",
     )
-    add("--require-evidence", "a replay whose map error nothing bounds cannot be evaluated (exit 5)")
+    add("--require-evidence", "not evaluable (exit 5) without a bound on the map's error")
     add_disagreement(add)
 
 
@@ -89,7 +89,7 @@ def _add_comparison(add: Options) -> None:
     """``--golden``, and what is driven beside the closed loop."""
     add(
         "--golden FILE",
-        "fail (exit 1) where a command differs from an earlier replay's (its folder, run.json or steps.csv)",
+        "fail (exit 1) where a command differs from an earlier replay (its folder, run.json or steps.csv)",
         Path,
     )
     add("--golden-tolerance RAD/S", "by more than this, per joint", real(0, 100, "rad/s"), GOLDEN_TOLERANCE)
@@ -104,7 +104,7 @@ def _add_comparison(add: Options) -> None:
     add("--zone STOP,RESUME", "distances [m] of that zone", str, "0.5,0.6")
     add(
         f"--zone-box {BOX}",
-        "a box [m] instead: stop while a person is in it, go on when nobody is within RESUME - STOP of it",
+        "a box [m] instead: stop while a person is in it, resume when nobody is within RESUME - STOP of it",
     )
     person = "a primitive of --truth that counts as a person; default: human*, person*"
     add("--human NAME ...", person)

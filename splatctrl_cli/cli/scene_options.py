@@ -38,14 +38,14 @@ def reconstruct_options(add: Options, parser: Parser) -> None:
     more = add.group("fit")
     more(
         "--method",
-        "a fixed budget of isotropic splats, or 3D Gaussian splatting: a baseline for views of a scene that stands"
-        " still, which grows as it likes and has no distances",
+        "a fixed budget of isotropic splats, or 3D Gaussian splatting, a baseline for views of a scene that stands"
+        " still, without distances",
         ("budget", "3dgs"),
         "budget",
     )
     more(
         "--points FILE.ply",
-        "coloured points to start from; depth is then not looked at (colour cameras alone: no occupancy)",
+        "coloured points to start from instead of depth, for colour cameras alone (no occupancy)",
         Path,
     )
     add_declare(more)
@@ -60,8 +60,8 @@ def export_options(add: Options, parser: Parser) -> None:
     add("--labels NAME,...", "only splats of these labels: object, robot, human (default: all)")
     add(
         "--layout",
-        "of a PLY: short has label and density and no harmonics, full has the reference's 62 properties (default:"
-        " short for isotropic splats; for others full, and a label where one is not object)",
+        "of a PLY: short has label and density, full the reference's 62 properties (default: short for isotropic"
+        " splats, for others full, and a label where one is not object)",
         ("short", "full"),
     )
     add("--isotropic", "make anisotropic Gaussians round: same volume, opacity and mean colour")
@@ -78,7 +78,7 @@ def sdf_bake_options(add: Options, parser: Parser) -> None:
     add("--formats NAME,...", f"of {', '.join(GRID_FORMATS)}", str, "npz,vti")
     add("--truth truth.json", "measure the field against this truth", Path)
     add("--seen-by LOG", "the log or capture whose cameras saw the scene, for --truth", Path)
-    add("--resume", "go on with a bake that was interrupted, to the same bytes")
+    add("--resume", "continue an interrupted bake, to the same bytes")
     add_config(add, parser)
     add_gates(add)
     more = add.group("field")
@@ -132,7 +132,7 @@ def score_options(add: Options, parser: Parser) -> None:
     add_scan(more)
     more("--masks DIR", "object masks 000.png and so on, for MVSNet's layout", Path)
     more = add.group("views")
-    newest = "render each view from the newest snapshot not later than it, or all from the final splats"
+    newest = "render each view from the newest snapshot by then, or all from the final splats"
     more("--snapshots", newest, ("newest", "final"), "newest")
     more("--allow-training", "also score cameras that trained the scene")
     more("--allow-other-recording", "continue although this is not the recording that made the scene")
@@ -148,7 +148,7 @@ def score_options(add: Options, parser: Parser) -> None:
     )
     more(
         "--cloud-masks DIR",
-        "DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where its own evaluation does",
+        "DTU's folder ObsMask (ObsMask24_10.mat, Plane24.mat): compare only where DTU does",
         Path,
     )
     more("--cloud-unit M", "metres per unit (default: 0.001 with --dtu, else 1)", real(1e-9, 1e3, "m"))
@@ -157,8 +157,8 @@ def score_options(add: Options, parser: Parser) -> None:
     more = add.group("fit")
     more(
         "--fit",
-        "fit the scans of --dtu (--scan A,B; default: all), or the image folder of --reference, with both methods,"
-        " then score them (default protocol of scans: dtu-holdout8)",
+        "fit the scans of --dtu (--scan A,B; default: all), or the image folder of --reference, with both methods and"
+        " score them (default protocol: dtu-holdout8)",
     )
     more(
         "--fit-iterations N", "of each method (default: those of the configuration, 2300)", whole(1, MOST_ITERATIONS)
