@@ -25,7 +25,8 @@ import numpy as np
 from benchmarks.random_tabletop import random_things
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import Config, load_config
-from splatctrl_cli.evaluate.conformal import FEWEST, autocorrelation_time, conformal_rank, stretch_scores, stretches
+from splatctrl_cli.config.fixed import FEWEST_STRETCHES
+from splatctrl_cli.evaluate.conformal import autocorrelation_time, conformal_rank, stretch_scores, stretches
 from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.replays.evidence import Misses, misses_of
 from splatctrl_cli.jobs.replays.inputs import read_states
@@ -124,7 +125,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 stream.write(json.dumps(asdict(found)) + "\n")
     print("\n".join(table_of(trials)))
     print(
-        f"{args.scenes - len(trials)} more of {args.scenes} scenes make fewer than {FEWEST} stretches: not evaluable"
+        f"{args.scenes - len(trials)} more of {args.scenes} scenes make fewer than {FEWEST_STRETCHES} stretches: "
+        "not evaluable"
     )
     return 0
 
@@ -135,7 +137,7 @@ def read_trials(path: Path) -> list[Trial]:
 
 
 def trial_of(seed: int) -> Trial | None:
-    """One scene, None where its held-out sets make fewer than FEWEST stretches."""
+    """One scene, None where its held-out sets make fewer than FEWEST_STRETCHES stretches."""
     start = time.process_time()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -226,7 +228,7 @@ def judged(
     length = autocorrelation_time(measured.distance)
     stretch = stretches(len(measured.distance), length)
     scores, deciding = stretch_scores(measured.distance, stretch)
-    if len(scores) < FEWEST:
+    if len(scores) < FEWEST_STRETCHES:
         return None
     drawn = int(np.random.default_rng([seed, 8]).integers(len(scores)))
     core = np.flatnonzero(stretch == stretch[deciding[drawn]])[:length]

@@ -28,7 +28,8 @@ from benchmarks.surfaces import (
 )
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.evaluate.field_accuracy import BANDS, BandAccuracy, band_accuracy
+from splatctrl_cli.config.fixed import BANDS
+from splatctrl_cli.evaluate.field_accuracy import BandAccuracy, band_accuracy
 from splatctrl_cli.field.distance import GpdfField, LogSumExpField, SafeField, SeField, SphereField
 from splatctrl_cli.field.health import median_spacing
 from splatctrl_cli.field.weights import METHODS

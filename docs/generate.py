@@ -17,6 +17,7 @@ from splatctrl_cli import config
 from splatctrl_cli.checks.finding import CHECKS, Check
 from splatctrl_cli.cli.commands import COMMANDS, EXIT_CODES, build_parser
 from splatctrl_cli.cli.parser import Parser, invocation
+from splatctrl_cli.config import fixed
 from splatctrl_cli.config.load import type_name
 from splatctrl_cli.config.ranges import OneOf, Section
 from splatctrl_cli.datasets.layout import Layout
@@ -179,7 +180,16 @@ def config_page() -> str:
         kind: Any = type(getattr(config.Config(), section.name))
         rows = [_setting_row(kind, key) for key in kind.declared]
         lines += ["", f"## [{section.name}]", "", inspect.cleandoc(kind.__doc__), "", *_list(rows)]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_fixed_numbers()]) + "\n"
+
+
+def _fixed_numbers() -> list[str]:
+    """Name, value and meaning of what is not a setting, as its module declares them, by group."""
+    source = inspect.getsource(fixed)
+    lines = ["", "## Fixed numbers", "", inspect.cleandoc(fixed.__doc__ or "")]
+    for group, row, meaning in re.findall(r"^# (.*)|^(\w+ = .*?)  # (.*)", source, re.MULTILINE):
+        lines += ["", f"### {group}", ""] if group else _list([(f"`{row}`", meaning)])
+    return lines
 
 
 def _setting_row(section: type[Section], key: str) -> Row:

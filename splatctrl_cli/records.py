@@ -4,7 +4,7 @@ Shapes: N splats, Q queries, S spheres, J joints, (X, Y, Z) voxels, (H, W) pixel
 """
 
 import heapq
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from operator import attrgetter
@@ -13,6 +13,7 @@ from typing import Any, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import UsageError
 
 Float32 = NDArray[np.float32]
@@ -20,6 +21,8 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Stamps = NDArray[np.int64]  # (T,) [ns]
+SECOND_NS = 1_000_000_000
+MILLIMETRE, MILLIMETRES = 0.001, 1000.0  # [m] of one, and how many a metre has
 
 
 class FloatRows(Protocol):
@@ -41,9 +44,6 @@ class Label(IntEnum):
     OBJECT = 0b00
     ROBOT = 0b01
     HUMAN = 0b10
-
-
-MAX_PLACE = 1e6  # [m] of a workspace's corner from the world's origin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +98,14 @@ class JointState:
 
 
 Record = RgbdFrame | JointState
+
+
+Item = TypeVar("Item")
+
+
+def spread(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many of the items, in order, spread over all."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))]
 
 
 class Stamped(Protocol):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.records import Float32, Float64, UInt8
 
+MOST_VOXELS = 400_000_000  # of a grid
 UNANSWERED = 0xFFFF  # in place of a time step: a camera looked at the voxel, and none ever got depth from it
 SWEPT = 0b100  # entity bit of a voxel that the robot was in at some time of the log
 SOLID = 0b1000  # entity bit, where a robot is known: an object's pixel hit the voxel since it was last seen free

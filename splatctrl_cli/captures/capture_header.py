@@ -15,7 +15,6 @@ from splatctrl_cli.logs.joint_topics import AGAIN
 from splatctrl_cli.records import LossReport
 
 INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
-_MOST = 1 << 16  # pixels of a side
 
 
 def check_header(file: Path, header: Mapping[str, Any]) -> None:
@@ -49,7 +48,7 @@ def _is_camera(value: object) -> bool:
     sides = [value.get(name) for name in ("width", "height")]
     scale = value.get("depth_scale")
     return (
-        all(isinstance(side, int) and 0 < side <= _MOST for side in sides)
+        all(isinstance(side, int) and 0 < side <= 65_536 for side in sides)
         and all(_is_number(value.get(name)) for name in ("fx", "fy", "cx", "cy"))
         and min(value["fx"], value["fy"]) > 0
         and (scale is None or (_is_number(scale) and scale > 0))

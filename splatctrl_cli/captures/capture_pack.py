@@ -25,15 +25,15 @@ from splatctrl_cli.containers.mcap_records import ATTACHMENT, BadRecordError, Me
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.image_file import PNG
+from splatctrl_cli.files.unpacking import PIECE
 from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.joint_topics import AGAIN
-from splatctrl_cli.logs.mcap_writer import MILLIMETRES, McapLog, mcap_log
+from splatctrl_cli.logs.mcap_writer import McapLog, mcap_log
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.records import MILLIMETRES, JointState, RgbdFrame
 
 MOST_FILES = 1 << 20  # an empty file takes a disk's block, its name in an archive thirty bytes
 _LONGEST = 255  # bytes of a name
-_PIECE = 1 << 20
 MARK = "splatctrl-capture"  # name of the metadata record
 DEPTH_HEAD = bytes(12)  # of compressed_depth_image_transport: its parameters, which 16UC1 does not use
 _TYPES = {".json": "application/json", ".csv": "text/csv", ".npz": "application/zip"}
@@ -253,6 +253,6 @@ def _u32(stream: BinaryIO) -> int:
 
 
 def _pieces(stream: BinaryIO, size: int) -> Iterator[bytes]:
-    while size > 0 and (piece := stream.read(min(size, _PIECE))):
+    while size > 0 and (piece := stream.read(min(size, PIECE))):
         size -= len(piece)
         yield piece

@@ -16,6 +16,7 @@ from numpy.lib import format as npy
 
 from splatctrl_cli.captures.capture_index import COLUMNS, MASKS, Checksums
 from splatctrl_cli.captures.capture_journal import Entry, Journal, check_same_frame
+from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, WriteError
 from splatctrl_cli.files.output import sha256, write_json
 from splatctrl_cli.files.spilled_rows import Table, blocks_of
@@ -30,8 +31,6 @@ FORMAT, VERSION = "splatctrl-capture", 1
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))
-FLOAT_DEPTH_UNIT = 1e-4  # [m] tried for depth that was not recorded as counts
-FLOAT_DEPTH_ERROR = 1e-6  # [m] at most, else the floats themselves are stored
 PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]  # docs/benchmarks.md
 
 

@@ -9,30 +9,15 @@ from itertools import combinations
 
 import numpy as np
 
+from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_images import strided_lens
 from splatctrl_cli.checks.clock_offset import ClockOffset, ImageMotion, estimate_clock_offset, states_asked
 from splatctrl_cli.checks.finding import Finding, note, warning
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.records import Float64, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 
-NEAR = 0.10  # [m] beyond its surface: something else is seen where the arm should be; nearer by more: it is hidden
-COVER = 0.02  # [m] by which covering spheres may stand before the surface
-MAX_OFFSET = 0.03  # [m]
-MAX_SEEN_THROUGH = 0.25  # of the arm's pixels
-MAX_MISFIT = 0.025  # [m] mean of the pixels' offsets, each cut at NEAR
-MIN_PIXELS = 100
-CLOSE_NS = 100_000_000  # between a frame and the joint states around it
-ROWS = 60  # of an image
-NUM_SWAPPED = 8  # frames that exchanged joints are tried on
-SWAPPED = 0.4  # of the misfit that may remain
-REACH, STEP, FINE = 0.32, 0.04, 0.02  # [s] of clock offsets that are tried, and between them, first and then
-CHEAPER, SAVED = 0.9, 0.0005  # [-], [m] of the misfit at offset 0 that a better one must reach
-MAX_SPREAD, OTHER_SCALE = 0.04, 0.04  # [-] of depth over predicted depth: its spread, and its departure from 1
 Posture = Callable[[int], Float64 | None]
-OFFSET = 0.030  # [s] between the clocks of cameras and robot
-ERROR = 0.010  # [s] of an offset found by the arm; on the simulated log, 0, 80 and 100 ms are found within 7 ms
-OWN = 0.85  # of the misfit at the offset of most cameras, for a camera to have an offset of its own
 LATE = "synchronise the clocks, or shift the stamps: robot labels and replay come too {}"
 
 
@@ -40,10 +25,10 @@ LATE = "synchronise the clocks, or shift the stamps: robot labels and replay com
 class ArmAgreement:
     """Depth minus the rendered depth of the robot's surface, over the pixels that it covers, of one camera's frames.
 
-    median [m] of those within `NEAR`, positive where the robot is measured behind its surface; misfit [m]: mean
-    distance from it (from 0 where it is negative, from `COVER` where it is more), each cut at `NEAR`; seen_through:
-    share of the pixels whose depth lies more than `NEAR` behind; num_pixels with depth; num_frames with joint states;
-    scale: depth over predicted depth where it is one factor for most pixels.
+    median [m] of those within `ARM_NEAR`, positive where the robot is measured behind its surface; misfit [m]: mean
+    distance from it (from 0 where it is negative, from `ARM_COVER` where it is more), each cut at `ARM_NEAR`;
+    seen_through: share of the pixels whose depth lies more than `ARM_NEAR` behind; num_pixels with depth; num_frames
+    with joint states; scale: depth over predicted depth where it is one factor for most pixels.
     """
 
     median: float
@@ -56,8 +41,8 @@ class ArmAgreement:
     @property
     def is_good(self) -> bool:
         """Whether the arm is where the joints say."""
-        is_there = self.seen_through <= MAX_SEEN_THROUGH and abs(self.median) <= MAX_OFFSET
-        return is_there and self.misfit <= MAX_MISFIT
+        is_there = self.seen_through <= limits.ARM_SEEN_THROUGH and abs(self.median) <= limits.ARM_OFFSET
+        return is_there and self.misfit <= limits.ARM_MISFIT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +64,7 @@ def posture_at(states: StateColumns) -> Posture:
         near = [
             i
             for i in (after - 1, after)
-            if 0 <= i < len(states) and abs(int(states.stamp_ns[i]) - stamp_ns) <= CLOSE_NS
+            if 0 <= i < len(states) and abs(int(states.stamp_ns[i]) - stamp_ns) <= limits.ARM_CLOSE_NS
         ]
         if not near:
             return None
@@ -93,8 +78,8 @@ def posture_at(states: StateColumns) -> Posture:
 
 
 def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Frames of at most `ROWS` rows."""
-    strides = [max(1, -(-frame.depth.shape[0] // ROWS)) for frame in frames]
+    """Frames of at most `limits.ARM_ROWS` rows."""
+    strides = [max(1, -(-frame.depth.shape[0] // limits.ARM_ROWS)) for frame in frames]
     return [
         replace(f, depth=f.depth[::s, ::s], color=f.color[::s, ::s], intrinsics=strided_lens(f.intrinsics, s))
         for f, s in zip(frames, strides, strict=True)
@@ -115,21 +100,22 @@ def arm_agreement(
         both = (predicted > 0) & (frame.depth > 0)
         parts.append(np.stack([frame.depth[both], predicted[both]]).astype(np.float64))
     rows = np.concatenate(parts, axis=1) if parts else np.zeros((2, 0))
-    if rows.shape[1] < MIN_PIXELS:
+    if rows.shape[1] < limits.ARM_PIXELS:
         return None
     offsets = rows[0] - rows[1]
-    visible = offsets[offsets > -NEAR]  # what is nearer by more hides the arm
-    near = visible[visible < NEAR]
-    behind = float(np.clip(np.median(near), 0.0, COVER)) if len(near) else 0.0
+    reach = limits.ARM_NEAR
+    visible = offsets[offsets > -reach]  # what is nearer by more hides the arm
+    near = visible[visible < reach]
+    behind = float(np.clip(np.median(near), 0.0, limits.ARM_COVER)) if len(near) else 0.0
     ratio = rows[0] / rows[1]
     scale = float(np.median(ratio))
-    is_scaled = abs(scale - 1) > OTHER_SCALE and np.median(np.abs(ratio / scale - 1)) < MAX_SPREAD / 2
-    if len(visible) < MIN_PIXELS and not is_scaled:
+    is_scaled = abs(scale - 1) > limits.ARM_SCALE and np.median(np.abs(ratio / scale - 1)) < limits.ARM_SPREAD / 2
+    if len(visible) < limits.ARM_PIXELS and not is_scaled:
         return None
     return ArmAgreement(
         median=float(np.median(near)) if len(near) else float("inf"),
-        misfit=float(np.minimum(np.abs(visible - behind), NEAR).mean()) if len(visible) else NEAR,
-        seen_through=float((visible > NEAR).mean()) if len(visible) else 0.0,
+        misfit=float(np.minimum(np.abs(visible - behind), reach).mean()) if len(visible) else reach,
+        seen_through=float((visible > reach).mean()) if len(visible) else 0.0,
         num_pixels=rows.shape[1],
         num_frames=len(parts),
         scale=scale if is_scaled else None,
@@ -141,35 +127,36 @@ def arm_timing(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture)
 
     def misfit(offset: float) -> float:
         agreement = arm_agreement(model, frames, posture, offset_s=offset)
-        return NEAR if agreement is None else agreement.misfit
+        return limits.ARM_NEAR if agreement is None else agreement.misfit
 
-    tried = np.round(np.arange(-REACH, REACH + STEP / 2, STEP), 3)
+    tried = np.round(np.arange(-limits.TIME_REACH, limits.TIME_REACH + limits.TIME_STEP / 2, limits.TIME_STEP), 3)
     costs = np.array([misfit(float(offset)) for offset in tried])
     best = int(np.argmin(costs))
-    if best in {0, len(tried) - 1} or costs[best] > MAX_MISFIT:
+    if best in {0, len(tried) - 1} or costs[best] > limits.ARM_MISFIT:
         return None
     ends = min(costs[max(best - 4, 0)], costs[min(best + 4, len(tried) - 1)])
-    if costs[best] > CHEAPER * ends or ends - costs[best] < SAVED:
+    if costs[best] > limits.TIME_CHEAPER * ends or ends - costs[best] < limits.TIME_SAVED:
         return None
-    near = np.round(np.arange(tried[best] - STEP, tried[best] + STEP + FINE / 2, FINE), 3)
-    fine = np.array([misfit(float(offset)) for offset in near])
-    low = int(np.argmin(fine[1:-1])) + 1
-    before, least, after = fine[low - 1 : low + 2]
+    step, fine = limits.TIME_STEP, limits.TIME_FINE
+    near = np.round(np.arange(tried[best] - step, tried[best] + step + fine / 2, fine), 3)
+    costs = np.array([misfit(float(offset)) for offset in near])
+    low = int(np.argmin(costs[1:-1])) + 1
+    before, least, after = costs[low - 1 : low + 2]
     bend = before - 2 * least + after
-    shift = float(np.clip(0.5 * FINE * (before - after) / bend, -FINE, FINE)) if bend > 0 else 0.0
+    shift = float(np.clip(0.5 * fine * (before - after) / bend, -fine, fine)) if bend > 0 else 0.0
     return ArmTiming(camera=frames[0].camera, offset_s=float(near[low]) + shift, misfit=float(least))
 
 
 def swapped_joints(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> tuple[int, int] | None:
     """Two joints that, exchanged, put the arm where the depth images show it; None where no such pair exists."""
-    few = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), NUM_SWAPPED)).astype(int))]
+    few = spread(frames, limits.SWAPPED_FRAMES)
     plain = arm_agreement(model, few, posture)
     best: tuple[float, tuple[int, int]] | None = None
     for i, j in combinations(range(model.num_joints), 2):
         agreement = arm_agreement(model, few, _exchanged(posture, i, j))
         if agreement is not None and agreement.is_good and (best is None or agreement.misfit < best[0]):
             best = agreement.misfit, (i, j)
-    if best is None or plain is None or best[0] > SWAPPED * plain.misfit:
+    if best is None or plain is None or best[0] > limits.SWAPPED_MISFIT * plain.misfit:
         return None
     return best[1]
 
@@ -205,7 +192,7 @@ def misplaced_finding(bad: Mapping[str, ArmAgreement], cause: str) -> Finding:
     off = ", ".join(f"{1e3 * agreement.misfit:.0f}" for agreement in bad.values())
     through = ", ".join(f"{100 * agreement.seen_through:.0f}" for agreement in bad.values())
     text = f"the arm is not where the joints say: {off} mm off in the mean (each pixel counted as"
-    text = f"{text} {1e3 * NEAR:.0f} mm at most); {through} % of its pixels show what is behind it"
+    text = f"{text} {1e3 * limits.ARM_NEAR:.0f} mm at most); {through} % of its pixels show what is behind it"
     remedy = cause or "check the URDF, --base, the joints' zeros and the camera's pose; robot labels will be wrong"
     worst = max(agreement.misfit for agreement in bad.values())
     return warning("arm", where, text, remedy, value=round(1e3 * worst, 1), unit="mm")
@@ -268,8 +255,8 @@ def _own_timings(
     for timing in timings:
         its = reduced([frame for frame in frames if frame.camera == timing.camera])
         at_middle = arm_agreement(model, its, posture, offset_s=middle)
-        is_other = abs(timing.offset_s - middle) > OFFSET + ERROR
-        if not is_other or at_middle is None or timing.misfit < OWN * at_middle.misfit:
+        is_other = abs(timing.offset_s - middle) > limits.TIME_OFFSET + limits.TIME_ERROR
+        if not is_other or at_middle is None or timing.misfit < limits.TIME_OWN * at_middle.misfit:
             kept.append(timing)
     return kept
 
@@ -285,22 +272,25 @@ def _swap(model: RobotModel, frames: Sequence[RgbdFrame], posture: Posture) -> s
 def _timing_findings(timings: Sequence[ArmTiming]) -> list[Finding]:
     """One finding for all cameras of one clock, and one for each that has another."""
     middle = float(np.median([timing.offset_s for timing in timings]))
-    others = [t for t in timings if abs(t.offset_s - middle) > OFFSET + ERROR] if len(timings) > 2 else []
+    apart = limits.TIME_OFFSET + limits.TIME_ERROR
+    others = [t for t in timings if abs(t.offset_s - middle) > apart] if len(timings) > 2 else []
     found = [
         _offset_finding(f"camera {t.camera}", t.offset_s, f"; those of most cameras {1e3 * middle:+.0f} ms")
         for t in others
     ]
     same = [t for t in timings if t not in others]
-    if len(same) == 2 and abs(same[0].offset_s - same[1].offset_s) > OFFSET + ERROR:
+    if len(same) == 2 and abs(same[0].offset_s - same[1].offset_s) > apart:
         return [*found, *(_offset_finding(f"camera {t.camera}", t.offset_s, "") for t in same)]
     mean = float(np.mean([t.offset_s for t in same]))
     return [*found, _offset_finding("joint states", mean, f" ({len(same)} cameras)")]
 
 
 def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
-    text = f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * ERROR:.0f} ms, by where"
-    text = f"{text} depth shows the arm){rest}"
-    is_off = abs(offset_s) > OFFSET + ERROR
+    text = (
+        f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * limits.TIME_ERROR:.0f} ms,"
+    )
+    text = f"{text} by where depth shows the arm){rest}"
+    is_off = abs(offset_s) > limits.TIME_OFFSET + limits.TIME_ERROR
     make = warning if is_off else note
     remedy = LATE.format("late" if offset_s > 0 else "early") if is_off else ""
     return make("robot-clock", where, text, remedy, value=round(1e3 * offset_s, 1), unit="ms")
@@ -309,7 +299,7 @@ def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
 def _clock_finding(offset: ClockOffset) -> Finding:
     if offset.offset_s is None or offset.uncertainty_s is None:
         return note("robot-clock", "joint states", offset.sentence)
-    is_off = abs(offset.offset_s) > OFFSET + 2 * offset.uncertainty_s
+    is_off = abs(offset.offset_s) > limits.TIME_OFFSET + 2 * offset.uncertainty_s
     make = warning if is_off else note
     remedy = LATE.format("late" if offset.offset_s > 0 else "early") if is_off else ""
     return make("robot-clock", "joint states", offset.sentence, remedy, value=1e3 * offset.offset_s, unit="ms")

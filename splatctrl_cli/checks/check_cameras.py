@@ -6,28 +6,17 @@ from itertools import pairwise
 
 import numpy as np
 
+from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, note, warning
+from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.logs.decoder import CAMERA_INFO
 from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, NUM_COEFFICIENTS, SAME_MODELS
 from splatctrl_cli.logs.rig import Camera, intrinsics_of, nearest_gap_ns
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
-from splatctrl_cli.logs.tf_tree import MAX_GAP_NS
 from splatctrl_cli.records import Float64, Intrinsics
 
-SAME_FACTOR = 0.1  # by which both factors of another size may differ
-CENTRE = 0.15  # of the image's size that a principal point may be off its middle
-RATIO = 0.05  # by which fx / fy may differ from 1
-FIELD_OF_VIEW = (20.0, 140.0)  # [deg], horizontal
-MAX_POSES = 20_000  # of a camera that are looked up
-JUMP = 0.2  # [m] in a frame, as `reconstruct` refuses them
-JUMP_RATIO = 10.0  # times the median step
-MIN_PAIRED = 0.95  # of the images of the rarer topic
-LATE_PAIR = 0.010  # [s] between colour and depth at which an arm at 1 m/s is 1 cm apart
-MAX_PAIRED = 20_000  # stamps of a topic that are paired
-FEWEST = 5  # images that a rate is judged by
-SLOWER = 1.5  # of the images of one topic that the other has at least, for a note
 NUM_DISTORTION = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
 
@@ -37,25 +26,25 @@ def lens_findings(where: str, lens: Intrinsics, source: str = "") -> list[Findin
     says = f"{source}: " if source else ""
     remedy = "calibrate again, or give the CameraInfo of this very stream (a crop or another size has its own)"
     off = [(c + 0.5) / size - 0.5 for c, size in ((lens.cx, lens.width), (lens.cy, lens.height))]
-    if max(map(abs, off)) > CENTRE:
+    if max(map(abs, off)) > limits.LENS_CENTRE:
         worst = max(off, key=abs)
         text = f"{says}cx, cy = {lens.cx:.1f}, {lens.cy:.1f} px of {lens.width}x{lens.height}"
         text, make = f"{text}: {100 * abs(worst):.0f} % off the middle of the image", warning
         times = [2 * (share + 0.5) for share in off]
-        if abs(times[0] / times[1] - 1) < SAME_FACTOR:
+        if abs(times[0] / times[1] - 1) < limits.LENS_SAME_FACTOR:
             factor = float(np.mean(times))
             size = f"{factor * lens.width:.0f}x{factor * lens.height:.0f}"
             text, remedy = f"{text}, as if calibrated at about {size}", f"scale K by {1 / factor:.3g}, or {remedy}"
             make = error
         found.append(make("principal-point", where, text, remedy, value=round(100 * worst, 1), unit="%"))
     ratio = lens.fx / lens.fy
-    if abs(ratio - 1) > RATIO:
+    if abs(ratio - 1) > limits.LENS_RATIO:
         text = (
             f"{says}fx / fy = {ratio:.3f} ({lens.fx:.1f}, {lens.fy:.1f} px): pixels are square in every RGB-D camera"
         )
         found.append(warning("focal-ratio", where, text, remedy, value=ratio))
     angle = math.degrees(2 * math.atan(0.5 * lens.width / lens.fx))
-    low, high = FIELD_OF_VIEW
+    low, high = limits.LENS_FIELD_OF_VIEW
     if not low <= angle <= high:
         text = (
             f"{says}field of view {angle:.0f} deg (fx {lens.fx:.1f} of {lens.width} px): expected {low:g} to {high:g}"
@@ -177,12 +166,12 @@ def pose_findings(where: str, stamps_ns: Sequence[int], poses: Sequence[Float64 
     steps = [
         (float(np.linalg.norm(b - a)), first)
         for (first, a), (last, b) in pairwise(known)
-        if last - first <= MAX_GAP_NS
+        if last - first <= TF_GAP_NS
     ]
     if steps:
         longest, at = max(steps)
         median = float(np.median([step for step, _ in steps]))
-        if longest > max(JUMP, JUMP_RATIO * median):
+        if longest > max(limits.POSES_JUMP, limits.POSES_JUMP_RATIO * median):
             text = f"the camera jumps by {longest:.3g} m from one frame to the next (median {median:.2g} m)"
             remedy = "two publishers of one frame, or a localisation that was corrected; reconstruct refuses it"
             findings.append(error("pose-jump", where, text, remedy, value=longest, unit="m", stamp_ns=at))
@@ -196,7 +185,7 @@ def camera_findings(
     findings = [*_pairing(found, topics, options), *_lens(found, topics, options)]
     if camera is None or camera.fixed_pose is not None:
         return findings
-    stamps = sorted(found.topics[topics.color].stamps_ns)[:MAX_POSES]
+    stamps = sorted(found.topics[topics.color].stamps_ns)[: limits.POSES_LOOKED_UP]
     tolerance_ns = round(options.pose_tolerance_s * 1e9)
     poses = [camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in stamps]
     return [*findings, *pose_findings(f"camera {topics.name}", stamps, poses)]
@@ -204,7 +193,7 @@ def camera_findings(
 
 def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> list[Finding]:
     where = f"camera {camera.name}"
-    color, depth = (found.topics[t].stamps_ns[:MAX_PAIRED] for t in (camera.color, camera.depth))
+    color, depth = (found.topics[t].stamps_ns[: limits.PAIRED_STAMPS] for t in (camera.color, camera.depth))
     pairs = pair_by_stamp(color, depth, round(options.pairing_tolerance_s * 1e9))
     rarer, other = sorted((len(color), len(depth)))
     if not pairs or not rarer:
@@ -213,17 +202,18 @@ def _pairing(found: Survey, camera: CameraTopics, options: SourceOptions) -> lis
         remedy = f"give --pairing-tolerance {gap * 1.01 + 1e-4:.3g} (seconds), if that is right"
         return [error("pairing", where, text, remedy, value=1e3 * gap, unit="ms")]
     findings = []
-    if len(pairs) < MIN_PAIRED * rarer:
+    if len(pairs) < limits.PAIRED_SHARE * rarer:
         text = f"{len(pairs)} of {rarer} images find a partner within {1e3 * options.pairing_tolerance_s:g} ms"
         remedy = "let the driver synchronise colour and depth, or give --pairing-tolerance"
         findings.append(warning("pairing", where, text, remedy, value=len(pairs) / rarer))
-    if other > SLOWER * rarer and rarer >= FEWEST and max(len(color), len(depth)) < MAX_PAIRED:
+    is_all = max(len(color), len(depth)) < limits.PAIRED_STAMPS
+    if other > limits.RATE_SLOWER * rarer and rarer >= limits.RATE_FEWEST and is_all:
         names = ("depth", "colour") if len(depth) < len(color) else ("colour", "depth")
         text = f"{rarer} {names[0]} images to {other} of {names[1]}: {other - len(pairs)} {names[1]} images go unused"
         remedy = "record both at one rate; more frames show more, and what moves is seen sooner"
         findings.append(note("rates-differ", where, text, remedy, value=rarer / other))
     offset = float(np.median([depth[j] - color[i] for i, j in pairs])) * 1e-9
-    if abs(offset) > LATE_PAIR:
+    if abs(offset) > limits.PAIRED_LATE:
         text = f"depth is stamped {1e3 * offset:+.1f} ms against its colour image (median)"
         remedy = "let the driver synchronise colour and depth: what moves is in two places"
         findings.append(note("pair-offset", where, text, remedy, value=1e3 * offset, unit="ms"))

@@ -10,27 +10,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_times import Thinned
 from splatctrl_cli.checks.finding import Finding, error, note, warning
-from splatctrl_cli.logs.messages import MILLIMETRE
-from splatctrl_cli.logs.stored_frame import PLAUSIBLE_DEPTH
-from splatctrl_cli.records import Float32, Float64, Intrinsics, RgbdFrame, UInt8
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
+from splatctrl_cli.records import MILLIMETRE, Float32, Float64, Intrinsics, RgbdFrame, UInt8
 
-ROWS = 240  # that a kept depth image has at most
-NUM_KEPT = 12  # depth images of a camera
-COLUMNS = 64  # of a thumbnail, as motion is judged by (state_motion)
-NUM_THUMBNAILS = 300
-NUM_DECODED = 300
-LITTLE_DEPTH, SOME_DEPTH = 0.10, 0.5  # of the pixels
 SCALES = (1e-3, 1e-4, 1.0, 1e-2, 2e-4, 1e-5, 1e-6)
-TABLE_DEPTH = (0.15, 8.0)  # [m] within which a median is usual
-NUM_FRAMES = 4  # of a camera
-EDGE_STEP = 0.05  # of the depth, across an edge
-BORDER = 3  # [px] that are left out
-CLEAR, AHEAD = 0.2, 1.35  # correlation of a peak, and how far above the next one, for it to be believed
-SHIFT = 0.015  # of the width
-AROUND = 3  # [px] of a peak, and around no shift
-SEARCHED = 8  # a shift of up to an eighth of the image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +33,7 @@ class Kept:
 
 @dataclass(frozen=True, kw_only=True)
 class Thumbnail:
-    """An image of `COLUMNS` columns: depth (h, w) [m] or colour (h, w, 3)."""
+    """An image of `limits.THUMBNAIL_COLUMNS` columns: depth (h, w) [m] or colour (h, w, 3)."""
 
     stamp_ns: int
     depth: Float32 | None = None
@@ -57,7 +43,7 @@ class Thumbnail:
 class ImageWatch:
     """Watches the images of one topic or camera in bounded memory.
 
-    All of the first `NUM_DECODED` images are to be decoded, then every second, fourth, ... (`is_wanted`).
+    All of the first `limits.DECODED_IMAGES` images are to be decoded, then every second, fourth, ... (`is_wanted`).
     """
 
     def __init__(self, where: str, scale: float | None = None) -> None:
@@ -69,9 +55,9 @@ class ImageWatch:
         self.sizes: Counter[tuple[int, int]] = Counter()
         self.medians: Thinned[float] = Thinned(1000)
         self.shares: Thinned[float] = Thinned(1000)
-        self.kept: Thinned[Kept] = Thinned(NUM_KEPT)
+        self.kept: Thinned[Kept] = Thinned(limits.KEPT_IMAGES)
         self.thumbnails: list[Thumbnail] = []
-        self._wanted: Thinned[None] = Thinned(NUM_DECODED)
+        self._wanted: Thinned[None] = Thinned(limits.DECODED_IMAGES)
 
     def is_wanted(self) -> bool:
         """Whether the image that comes now is to be decoded; to be asked once for each."""
@@ -92,7 +78,7 @@ class ImageWatch:
         height, width = color.shape[:2]
         self.add_undecoded(encoding, width, height)
         self.num_decoded += 1
-        if len(self.thumbnails) < NUM_THUMBNAILS:
+        if len(self.thumbnails) < limits.THUMBNAILS:
             small = cv2.resize(color, thumbnail_size(width, height), interpolation=cv2.INTER_AREA)
             self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, color=np.asarray(small, dtype=np.uint8)))
         if self.kept.is_next():
@@ -117,7 +103,7 @@ class ImageWatch:
             self.medians.add(float(np.median(valid)) if valid.size else 0.0)
         if self.kept.is_next():
             self.kept.add(Kept(stamp_ns=stamp_ns, stride=stride, width=width, height=height, depth=small.copy()))
-        if len(self.thumbnails) < NUM_THUMBNAILS:
+        if len(self.thumbnails) < limits.THUMBNAILS:
             size = thumbnail_size(width, height)
             thumbnail = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
             self.thumbnails.append(Thumbnail(stamp_ns=stamp_ns, depth=thumbnail))
@@ -151,12 +137,12 @@ class ImageWatch:
 
 def stride_of(height: int) -> int:
     """The rows from one kept row to the next."""
-    return max(1, -(-height // ROWS))
+    return max(1, -(-height // limits.KEPT_ROWS))
 
 
 def thumbnail_size(width: int, height: int) -> tuple[int, int]:
     """Width and height [px]."""
-    columns = min(COLUMNS, width)
+    columns = min(limits.THUMBNAIL_COLUMNS, width)
     return columns, max(1, round(height * columns / width))
 
 
@@ -201,8 +187,8 @@ def sample_findings(topics: Sequence[ImageWatch]) -> list[Finding]:
     if not few:
         return []
     decoded, count = sum(images.num_decoded for images in few), sum(images.count for images in few)
-    text = f"{decoded} of {count} images were decoded, the first {NUM_DECODED} of a topic and fewer and fewer later"
-    text = f"{text}; of the others only head, closing mark and checksum were read"
+    text = f"{decoded} of {count} images were decoded, the first {limits.DECODED_IMAGES} of a topic and"
+    text = f"{text} fewer and fewer later; of the others only head, closing mark and checksum were read"
     return [note("sampled", "images", text, value=decoded / count)]
 
 
@@ -219,8 +205,8 @@ def depth_findings(images: ImageWatch) -> list[Finding]:
         if every:
             return found
     share = float(np.median(list(images.shares)))
-    if share < SOME_DEPTH:
-        severity = warning if share < LITTLE_DEPTH else note
+    if share < limits.SOME_DEPTH:
+        severity = warning if share < limits.LITTLE_DEPTH else note
         text = f"{100 * share:.0f} % of the pixels have depth (median of the images)"
         remedy = "the rest stays unseen: dark or shiny things, too near, or warped depth with holes"
         found.append(severity("depth-share", where, text, remedy, value=share))
@@ -239,14 +225,14 @@ def _scale(images: ImageWatch) -> list[Finding]:
     used = images.unit or 1.0
     low, high = PLAUSIBLE_DEPTH
     if low <= median <= high:
-        near, far = TABLE_DEPTH
+        near, far = limits.TABLE_DEPTH
         if near <= median <= far:
             return []
         text = f"median depth {median:.3g} m, read as {used:g} m per count: unusual for a robot's table"
         remedy = "if it is wrong, give --depth-scale"
         return [note("depth-scale", images.where, text, remedy, value=median, unit="m")]
     counts = median / used
-    fits = [s for s in SCALES if TABLE_DEPTH[0] <= counts * s <= TABLE_DEPTH[1]]
+    fits = [s for s in SCALES if limits.TABLE_DEPTH[0] <= counts * s <= limits.TABLE_DEPTH[1]]
     guess = "millimetres stored as floats" if images.is_float and counts > high else ""
     guess = "metres stored as integers" if not images.is_float and counts < 20 else guess
     text = f"median depth {median:.4g} m, read as {used:g} m per count: expected {low:g} to {high:g} m"
@@ -258,7 +244,7 @@ def _scale(images: ImageWatch) -> list[Finding]:
 def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
     """Of every camera whose frames have colour."""
     edges = {
-        camera: [_spectra(f) for f in its[:: max(1, len(its) // NUM_FRAMES)][:NUM_FRAMES]]
+        camera: [_spectra(f) for f in its[:: max(1, len(its) // limits.EDGE_FRAMES)][: limits.EDGE_FRAMES]]
         for camera in sorted({frame.camera for frame in frames})
         if (its := [frame for frame in frames if frame.camera == camera and frame.color.any()])
     }
@@ -268,8 +254,8 @@ def alignment_findings(frames: Sequence[RgbdFrame]) -> list[Finding]:
         where = f"camera {camera}"
         dv, du, peak, runner_up = _peak(surface)
         width = surface.shape[1]
-        if max(peak, 0.0) >= CLEAR and peak >= AHEAD * runner_up:
-            if max(abs(du), abs(dv)) > SHIFT * width:
+        if max(peak, 0.0) >= limits.EDGE_CLEAR and peak >= limits.EDGE_AHEAD * runner_up:
+            if max(abs(du), abs(dv)) > limits.EDGE_SHIFT * width:
                 found.append(_shifted(where, du, dv, width, peak))
             continue
         other = _other(camera, edges, _at_zero(surface))
@@ -303,7 +289,7 @@ def _other(
         if name != camera and all(a[0].shape == b[1].shape for a, b in pairs):
             scores[name] = _at_zero(np.mean([_correlation(a[0], b[1]) for a, b in pairs], axis=0))
     best = max(scores, key=lambda name: scores[name], default=None)
-    if best is None or scores[best] < max(CLEAR, 2 * own):
+    if best is None or scores[best] < max(limits.EDGE_CLEAR, 2 * own):
         return None
     return best, own, scores[best]
 
@@ -316,9 +302,9 @@ def _spectra(frame: RgbdFrame) -> tuple[Float64, Float64]:
     around = np.ones((5, 5), np.uint8)
     far = cv2.dilate(frame.depth, around)
     near = cv2.erode(np.where(frame.depth > 0, frame.depth, np.float32(1e9)), around)
-    is_edge = (far - near > EDGE_STEP * near) & (near < 1e8)
-    is_edge[:BORDER] = is_edge[-BORDER:] = False
-    is_edge[:, :BORDER] = is_edge[:, -BORDER:] = False
+    is_edge = (far - near > limits.EDGE_STEP * near) & (near < 1e8)
+    is_edge[: limits.EDGE_BORDER] = is_edge[-limits.EDGE_BORDER :] = False
+    is_edge[:, : limits.EDGE_BORDER] = is_edge[:, -limits.EDGE_BORDER :] = False
     return _transformed(slope), _transformed(is_edge.astype(np.float32))
 
 
@@ -337,16 +323,17 @@ def _correlation(color: Float64, depth: Float64) -> Float64:
 def _peak(surface: Float64) -> tuple[int, int, float, float]:
     """Rows and columns of the best shift, its correlation, and the best one apart from it."""
     height, width = surface.shape
-    rows, columns = height // SEARCHED, width // SEARCHED
+    rows, columns = height // limits.EDGE_SEARCHED, width // limits.EDGE_SEARCHED
     near = surface[
         height // 2 - rows : height // 2 + rows + 1, width // 2 - columns : width // 2 + columns + 1
     ].copy()
     v, u = np.unravel_index(int(np.argmax(near)), near.shape)
     peak = float(near[v, u])
-    near[max(0, v - 2 * AROUND) : v + 2 * AROUND + 1, max(0, u - 2 * AROUND) : u + 2 * AROUND + 1] = -1.0
+    wide = 2 * limits.EDGE_AROUND
+    near[max(0, v - wide) : v + wide + 1, max(0, u - wide) : u + wide + 1] = -1.0
     return int(v) - rows, int(u) - columns, peak, float(near.max())
 
 
 def _at_zero(surface: Float64) -> float:
-    v, u = surface.shape[0] // 2, surface.shape[1] // 2
-    return float(surface[v - AROUND : v + AROUND + 1, u - AROUND : u + AROUND + 1].max())
+    v, u, wide = surface.shape[0] // 2, surface.shape[1] // 2, limits.EDGE_AROUND
+    return float(surface[v - wide : v + wide + 1, u - wide : u + wide + 1].max())

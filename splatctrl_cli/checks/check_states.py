@@ -8,7 +8,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, error, note, warning
+from splatctrl_cli.config.fixed import STATES_STILL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import blocks_of, ranges
 from splatctrl_cli.geometry import invert_transform
@@ -18,21 +20,11 @@ from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.state_topics import joint_records
 from splatctrl_cli.logs.survey import Survey
-from splatctrl_cli.records import Float64, JointState, LossReport
+from splatctrl_cli.records import Float64, JointState, LossReport, spread
 from splatctrl_cli.robot.model import RobotModel
 
-FAR = 0.5  # [rad] beyond the limits, and beyond a whole turn: not the limits of another joint
-MANY = 0.5  # of the states that must be there
-LONGEST_PAUSE = 86_400.0  # [s] between states; beyond it another clock goes on
-SLACK = 0.1  # [rad] by which degrees may exceed the limits
-MAX_POSES = 200  # that are compared, spread over the log
-SAME_POSITION, SAME_ROTATION = 0.005, 0.02  # [m], [rad] within which poses agree
-MIN_TRAVEL = 0.05  # [m] or, of rotation, [rad] that a link must move to tell a tool from a wrong robot
-_LEVER = 0.1  # [m] by which a rotation counts beside a position
 TURN = 2 * np.pi
 DEGREES = 3.0 * TURN  # that no joint of an arm turns to, in radians
-MOVING = 1e-3  # [rad or m] of all motion under which nothing moves
-LIMIT_SLACK = 0.01  # [rad or m]
 
 
 class PoseVerdict(StrEnum):
@@ -57,7 +49,7 @@ class Spread:
     @property
     def is_small(self) -> bool:
         """Whether the poses are the same."""
-        return self.max_position < SAME_POSITION and self.max_rotation < SAME_ROTATION
+        return self.max_position < limits.POSES_POSITION and self.max_rotation < limits.POSES_ROTATION
 
     @property
     def words(self) -> str:
@@ -118,7 +110,7 @@ def check_states(states: StateColumns, joints: Sequence[str]) -> None:
             remedy="sort the states by stamp",
         )
     pauses = np.diff(stamps)
-    if len(pauses) and pauses.max() > LONGEST_PAUSE * 1e9:
+    if len(pauses) and pauses.max() > limits.STATES_PAUSE * 1e9:
         index = int(np.argmax(pauses)) + 1
         raise InputError(
             f"joint states: mixed clocks: stamps jump by {pauses[index - 1] * 1e-9:.0f} s at state {index} of "
@@ -139,18 +131,18 @@ def check_angles(model: RobotModel, states: Sequence[JointState], name: str) -> 
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     if not len(states) or not limited.any():
         return
-    lower, upper = model.lower[limited], model.upper[limited]
+    lower, upper, slack = model.lower[limited], model.upper[limited], limits.DEGREES_SLACK
     num_far = num_fit = 0
     worst, at_worst = np.full(len(lower), -np.inf), np.zeros(len(lower))  # of each joint
     for q in _positions(states):
         beyond = np.abs(q[:, limited]) - np.maximum(np.maximum(np.abs(lower), np.abs(upper)), 2 * np.pi)
         as_degrees = np.radians(q[:, limited])
-        num_far += int((beyond.max(axis=1) > FAR).sum())
-        num_fit += int(((as_degrees > lower - SLACK) & (as_degrees < upper + SLACK)).all(axis=1).sum())
+        num_far += int((beyond.max(axis=1) > limits.ANGLES_FAR).sum())
+        num_fit += int(((as_degrees > lower - slack) & (as_degrees < upper + slack)).all(axis=1).sum())
         for joint, row in enumerate(beyond.argmax(axis=0)):
             if beyond[row, joint] > worst[joint]:
                 worst[joint], at_worst[joint] = beyond[row, joint], q[row, limited][joint]
-    if num_far / len(states) < MANY or num_fit / len(states) < 1 - (1 - MANY) / 5:
+    if num_far / len(states) < limits.STATES_SHARE or num_fit / len(states) < 1 - (1 - limits.STATES_SHARE) / 5:
         return
     joint = int(np.argmax(worst))
     names = [n for n, is_limited in zip(model.joint_names, limited, strict=True) if is_limited]
@@ -170,7 +162,7 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     posed = _posed(states)
     if not len(posed):
         return None
-    chosen = [states[int(posed[i])] for i in np.unique(np.linspace(0, len(posed) - 1, MAX_POSES).astype(int))]
+    chosen = [states[i] for i in spread(posed.tolist(), limits.POSES_COMPARED)]
     logged = np.array([_world(model, state) for state in chosen])
     links = {
         link: np.array([model.frame_pose(state.position, link) for state in chosen]) for link in model.frame_names
@@ -183,7 +175,7 @@ def pose_agreement(model: RobotModel, states: Sequence[JointState]) -> PoseAgree
     bases = {link: _explained(_inverse(poses), _inverse(logged)) for link, poses in links.items()}
     tool = min(tools, key=lambda link: (round(_cost(tools[link][1]), 6), _cost(_spread(links[link], logged))))
     base = min(bases, key=lambda link: _cost(bases[link][1]))
-    if _travel(logged) < MIN_TRAVEL:
+    if _travel(logged) < limits.LINK_TRAVEL:
         return _agreement(PoseVerdict.STILL, near, len(chosen), difference, np.eye(4), difference)
     if tools[tool][1].is_small:
         return _agreement(PoseVerdict.TOOL, tool, len(chosen), _spread(links[tool], logged), *tools[tool])
@@ -256,7 +248,7 @@ def _angle(R: Float64) -> float:
 
 
 def _cost(spread: Spread) -> float:
-    return spread.median_position + _LEVER * spread.median_rotation
+    return spread.median_position + limits.POSES_LEVER * spread.median_rotation
 
 
 def _travel(poses: Float64) -> float:
@@ -333,7 +325,7 @@ def stream_findings(where: str, stream: JointStream) -> list[Finding]:
         text = f"{stream.names[worst]} reaches {widest[worst]:.4g}: degrees, not radians?"
         remedy = 'record radians (REP 103), or convert the states to CSV or NPZ with unit = "deg"'
         found.append(error("joints-degrees", where, text, remedy, value=widest[worst]))
-    found += _velocities(where, stream, bool((highest - lowest > MOVING).any()))
+    found += _velocities(where, stream, bool((highest - lowest > STATES_STILL).any()))
     return found
 
 
@@ -373,7 +365,7 @@ def _limits(model: RobotModel, states: Sequence[JointState], where: str) -> list
     for state in states:
         beyond = np.maximum(model.lower - state.position, state.position - model.upper)
         worst = np.maximum(worst, beyond)
-        if beyond.max() > LIMIT_SLACK:
+        if beyond.max() > limits.LIMIT_SLACK:
             num += 1
             first = state.stamp_ns if first is None else first
     if first is None:

@@ -8,23 +8,10 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.finding import Finding, Rate, error, note, warning
 from splatctrl_cli.records import Float64
 
-MAX_KEPT = 4096  # intervals and delays of a topic, however long the log
-MAX_GAPS = 1000  # the longest intervals
-GAP_RATIO = 3.0  # of the median interval
-MIN_GAP = 0.1  # [s]; a shorter gap costs nothing
-REGULAR = 2.0  # times the median that nine of ten intervals must stay under for a topic to have a rate
-AHEAD = 0.020  # [s] that a stamp may be after its log time
-DELAYED = 1.0  # [s] from stamp to log that no driver takes
-APART = 0.2  # [s] between the delays of two topics
-PEERS = 0.060  # [s] between the delays of one kind of images of several cameras
-DRIFT = 0.020  # [s] over the log
-TOGETHER = 0.8  # of the shorter of two pauses that both share
-ENDS = 1.0  # [s] before the last image; or after the first of all topics, before the last
-MUCH = 0.1  # of the log
-FILES_APART = 60.0  # [s]
 _NS = 1e-9
 
 
@@ -71,8 +58,8 @@ class TimesWatch:
         self.first_ns = self.last_ns = 0
         self.first_duplicate_ns = self.first_back_ns = 0
         self.furthest_back = 0.0
-        self._intervals: Thinned[float] = Thinned(MAX_KEPT)
-        self._delays: Thinned[tuple[float, float]] = Thinned(MAX_KEPT)
+        self._intervals: Thinned[float] = Thinned(limits.KEPT_INTERVALS)
+        self._delays: Thinned[tuple[float, float]] = Thinned(limits.KEPT_INTERVALS)
         self._longest: list[tuple[int, int]] = []
         self._latest_ns = 0
 
@@ -102,7 +89,7 @@ class TimesWatch:
             if self._intervals.is_next():
                 self._intervals.add(interval * _NS)
             entry = (interval, self._latest_ns)
-            if len(self._longest) < MAX_GAPS:
+            if len(self._longest) < limits.KEPT_GAPS:
                 heapq.heappush(self._longest, entry)
             else:
                 heapq.heappushpop(self._longest, entry)
@@ -116,7 +103,7 @@ class TimesWatch:
     def is_regular(self) -> bool:
         """Whether the messages have a rate at all."""
         median = self.median_interval
-        return median is not None and float(np.quantile(list(self._intervals), 0.9)) <= REGULAR * median
+        return median is not None and float(np.quantile(list(self._intervals), 0.9)) <= limits.REGULAR * median
 
     @property
     def delays(self) -> Float64:
@@ -133,7 +120,7 @@ class TimesWatch:
         median = self.median_interval
         if median is None or not self.is_regular:
             return []
-        limit = max(MIN_GAP, GAP_RATIO * median)
+        limit = max(limits.GAP_SECONDS, limits.GAP_RATIO * median)
         return sorted(((i * _NS, at) for i, at in self._longest if i * _NS > limit), key=lambda gap: gap[1])
 
     def rate(self, *, is_read: bool) -> Rate:
@@ -197,7 +184,7 @@ def joined_gaps(findings: list[Finding]) -> list[Finding]:
 def _overlap(a: Finding, b: Finding) -> bool:
     """Whether the longest pauses of two topics are the same."""
     (a0, a1), (b0, b1) = (((f.stamp_ns or 0) * _NS, (f.stamp_ns or 0) * _NS + (f.value or 0.0)) for f in (a, b))
-    return min(a1, b1) - max(a0, b0) > TOGETHER * min(a1 - a0, b1 - b0)
+    return min(a1, b1) - max(a0, b0) > limits.PAUSED_TOGETHER * min(a1 - a0, b1 - b0)
 
 
 def _joined(group: list[Finding]) -> Finding:
@@ -213,7 +200,7 @@ def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
     found = []
     for (before, name), (after, other) in pairwise(ordered):
         pause = (after[0] - before[1]) * _NS
-        if pause > FILES_APART:
+        if pause > limits.FILES_APART:
             text = f"between {name} and {other} nothing was logged for {pause:.4g} s"
             remedy = "are they one recording? if not, give each alone"
             found.append(warning("files-apart", "files", text, remedy, value=pause, unit="s", stamp_ns=before[1]))
@@ -222,8 +209,9 @@ def file_findings(spans: Mapping[str, tuple[int, int]]) -> list[Finding]:
 
 def ending_findings(edges: list[TimesWatch], last_ns: int) -> list[Finding]:
     """Moving transforms that end long before the last image."""
+    early_s = limits.ENDS_EARLY
     ended = [
-        e for e in edges if e.count > 2 and (last_ns - e.last_ns) * _NS > max(ENDS, 3 * (e.median_interval or 0))
+        e for e in edges if e.count > 2 and (last_ns - e.last_ns) * _NS > max(early_s, 3 * (e.median_interval or 0))
     ]
     if not ended:
         return []
@@ -241,13 +229,13 @@ def part_findings(topics: list[TimesWatch]) -> list[Finding]:
     found = []
     first, last = (min((t.first_ns for t in several), default=0), max((t.last_ns for t in several), default=0))
     for times in several:
-        least = max(ENDS, 3 * (times.median_interval or 0.0))
+        least = max(limits.ENDS_EARLY, 3 * (times.median_interval or 0.0))
         begins, ends = (times.first_ns - first) * _NS, (last - times.last_ns) * _NS
         for seconds, words, at in ((begins, "begins", times.first_ns), (ends, "ends", times.last_ns)):
             if seconds > least:
                 side = "after the first" if words == "begins" else "before the last"
                 text = f"{words} {seconds:.3g} s {side} of the other topics"
-                make = warning if seconds > MUCH * (last - first) * _NS else note
+                make = warning if seconds > limits.ENDS_MUCH * (last - first) * _NS else note
                 remedy = "start and stop all drivers with the recorder, or cut the log there"
                 found.append(make("part", times.topic, text, remedy, value=seconds, unit="s", stamp_ns=at))
     return found
@@ -264,7 +252,7 @@ def peer_findings(topics: list[TimesWatch]) -> list[Finding]:
         others = np.array([t.delay for t in stamped if t is not times], dtype=np.float64)
         apart = float(np.median(own) - np.median(others))
         spread = float(np.median(np.abs(own - np.median(own))))
-        if abs(apart) > max(PEERS, 5 * spread, 3 * float(np.ptp(others))) and abs(apart) <= APART:
+        if max(limits.PEERS_APART, 5 * spread, 3 * float(np.ptp(others))) < abs(apart) <= limits.DELAYS_APART:
             text = f"stamps are {1e3 * abs(apart):.0f} ms {'before' if apart > 0 else 'after'} those of the other"
             text = f"{text} cameras' images, as logged"
             remedy = "is its clock synchronised (PTP, chrony), or is its stream only slower? compare what moves"
@@ -280,7 +268,7 @@ def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
         return []
     delays = [t.delay for t in stamped if t.delay is not None]
     common = float(np.median(delays))
-    if abs(common) > DELAYED and max(abs(delay - common) for delay in delays) <= APART:
+    if abs(common) > limits.STAMP_DELAYED and max(abs(delay - common) for delay in delays) <= limits.DELAYS_APART:
         text = f"header stamps are of another clock than the log's, {common:+.4g} s apart, the same for all topics"
         found = [note("clock", "all topics", f"{text} (a played log, or simulated time)", value=common, unit="s")]
     else:
@@ -291,11 +279,11 @@ def clock_findings(topics: list[TimesWatch]) -> list[Finding]:
 def _offset(times: TimesWatch, common: float) -> Finding | None:
     delay = times.delay
     assert delay is not None
-    if -delay > AHEAD:
+    if -delay > limits.STAMP_AHEAD:
         text = f"header stamps are {-delay:.3g} s later than the log's times: the sender's clock is ahead"
-    elif delay > DELAYED:
+    elif delay > limits.STAMP_DELAYED:
         text = f"header stamps are {delay:.4g} s before the log's times"
-    elif abs(delay - common) > APART:
+    elif abs(delay - common) > limits.DELAYS_APART:
         text = f"header stamps are {delay:.3g} s before the log's times, those of most topics {common:.3g} s"
     else:
         return None
@@ -313,7 +301,7 @@ def _drift(times: TimesWatch) -> Finding | None:
     slope = _slope(at, delay)
     spread = float(np.median(np.abs(delay - np.median(delay) - slope * (at - np.median(at)))))
     change = slope * float(at[-1])
-    if abs(change) < max(DRIFT, 6.0 * spread):
+    if abs(change) < max(limits.DELAYS_DRIFT, 6.0 * spread):
         return None
     text = f"header stamps drift against the log's times by {1e3 * change:+.0f} ms ({1e6 * slope:+.0f} ppm)"
     remedy = "synchronise the clocks (chrony, PTP) and record again"

@@ -6,37 +6,16 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.checks.check_images import TABLE_DEPTH, strided_lens
+from splatctrl_cli.checks import limits
+from splatctrl_cli.checks.check_images import strided_lens
 from splatctrl_cli.checks.finding import Finding, error, warning
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
 from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
-from splatctrl_cli.logs.stored_frame import PLAUSIBLE_DEPTH
-from splatctrl_cli.records import Bool, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float64, RgbdFrame, spread
 
-ROWS = 80  # of an image that are looked at
-NUM_VIEWS = 12
-NUM_PAIRS = 40
-NUM_POINTS = 1000  # of a view that are laid into others
-MIN_LANDED = 1000  # of all pairs
-BASELINE = 0.02  # [m] between two views that are compared
 SCALES = (0.001, 0.01, 0.1, 0.2, 0.25, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0)
 SCALES = (*SCALES, *(1 / s for s in reversed(SCALES[:-1])))
 FINE = np.linspace(0.92, 1.08, 17)
-FIT = 0.01  # of the depth, from a surface, within which a point fits it
-FEW_LANDED = 0.6  # of the most: with fewer, the share that fits is taken of as many
-SAME_FIT = 0.9  # of the best share of points, for another to be as good
-OTHER_SCALE = 0.08  # of its logarithm, that a scale must differ from 1 to be named
-TRUSTED = 0.2  # of the most points that land: with so many that fit, depths are taken as they are
-UNUSUAL = 0.75  # of the largest usual depth: beyond it views that do not meet are doubtful
-BESIDE = (1 / 1.5, 1.5)  # of the best scale: where one of them fits as well, the scale is not determined
-MORE_FIT, TIMES_FIT = 0.07, 1.12  # by which more points must fit
-LEAST_FIT = 0.4  # of the points that must fit then
-WIDTHS = (0.05, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)  # [m] of a residual that counts, by round
-WIDE = (0.15, 0.15, 0.12, 0.1, 0.08, 0.06)  # before them, where a camera is far off
-FLAT = 2e-3  # eigenvalue (of the mean normal equation) below which a direction is not seen
-CUT = 0.015  # [m] of a residual, in the cost
-CHEAPER = 0.04  # share of the cost that a move must save
-MOVED, TURNED = 0.012, 0.8  # [m], [deg] from which a move is named
-GOOD_SHARE = 0.45  # of the points that must lie within 1 % of the depth after a move
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +87,7 @@ def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> di
     found = {}
     plain = {camera: _cost(views, _with(views, pairs, camera))[1] for camera in cameras}
     for camera in cameras if len(cameras) > 1 else []:
-        if plain[camera] > max(GOOD_SHARE, 0.7 * max(plain.values())):
+        if plain[camera] > max(limits.MOVE_GOOD_SHARE, 0.7 * max(plain.values())):
             continue
         scale = _best_scale(views, _with(views, pairs, camera), [camera])
         if scale is not None:
@@ -132,8 +111,9 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
         its = _with(views, pairs, camera)
         own_before, own_after = _cost(views, its)[0], _cost(_moved(views, camera, T), its)
         move = _move(camera, T, own_before, own_after[0])
-        is_large = move.distance > MOVED or move.angle > TURNED
-        if not is_large or move.after > (1 - CHEAPER) * move.before or own_after[1] < GOOD_SHARE:
+        is_large = move.distance > limits.MOVE_METRES or move.angle > limits.MOVE_DEGREES
+        is_dear = move.after > (1 - limits.MOVE_CHEAPER) * move.before
+        if not is_large or is_dear or own_after[1] < limits.MOVE_GOOD_SHARE:
             break
         if costs[best][0] >= before[0]:
             break
@@ -144,13 +124,13 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
 
 def _overlap_findings(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Finding]:
     """Of depths that are unusual, and with which views that would meet at a tenth or at ten times do not."""
-    low, high = TABLE_DEPTH[0], UNUSUAL * TABLE_DEPTH[1]
+    low, high = limits.TABLE_DEPTH[0], limits.VIEWS_UNUSUAL * limits.TABLE_DEPTH[1]
     depths = np.concatenate([view.points[:, 2] for view in views])
     if not len(depths) or low <= (median := float(np.median(depths))) <= high:
         return []
     scale = 0.1 if median > high else 10.0
     (_, plain), (fits, most) = (_fitting(views, pairs, [v.frame.camera for v in views], s) for s in (1.0, scale))
-    if most < MIN_LANDED or plain > TRUSTED * most or fits < LEAST_FIT * most:
+    if most < limits.VIEWS_LANDED or plain > limits.VIEWS_TRUSTED * most or fits < limits.VIEWS_LEAST_FIT * most:
         return []
     text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
     return [warning("views-scale", "cameras", text, "if so, multiply --depth-scale by it", value=scale)]
@@ -188,18 +168,18 @@ def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
         where, what = f"cameras {' and '.join(cameras)}", f"their views fit where {move.camera} is moved by {by}"
         remedy = "calibrate both cameras' poses again (hand-eye): two do not tell which of them is wrong"
     falls = f"points then lie {1e3 * move.after:.1f} mm off surfaces instead of {1e3 * move.before:.1f}"
-    text = f"{what}: {falls} (mean, each counted as {1e3 * CUT:.0f} mm at most)"
+    text = f"{what}: {falls} (mean, each counted as {1e3 * limits.MOVE_CUT:.0f} mm at most)"
     return warning("views-pose", where, text, remedy, value=round(1e3 * move.distance, 1), unit="mm")
 
 
 def _chosen(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
     """As many of each camera, spread over its frames."""
     cameras = sorted({frame.camera for frame in frames})
-    each = max(2, min(8, NUM_VIEWS // max(len(cameras), 1)))
+    each = max(2, min(8, limits.VIEWS // max(len(cameras), 1)))
     chosen: list[RgbdFrame] = []
     for camera in cameras:
         its = [frame for frame in frames if frame.camera == camera]
-        chosen += [its[i] for i in np.unique(np.linspace(0, len(its) - 1, min(each, len(its))).astype(int))]
+        chosen += spread(its, each)
     return chosen
 
 
@@ -210,9 +190,9 @@ def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
         (i, j)
         for i in range(len(views))
         for j in range(len(views))
-        if i != j and float(np.linalg.norm(places[i] - places[j])) > BASELINE
+        if i != j and float(np.linalg.norm(places[i] - places[j])) > limits.VIEWS_BASELINE
     ]
-    return [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), NUM_PAIRS)).astype(int))]
+    return spread(pairs, limits.VIEWS_PAIRS)
 
 
 def _with(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> list[tuple[int, int]]:
@@ -221,14 +201,14 @@ def _with(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str)
 
 
 def _view(frame: RgbdFrame) -> _View:
-    stride = max(1, frame.depth.shape[0] // ROWS)
+    stride = max(1, frame.depth.shape[0] // limits.VIEWS_ROWS)
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth), 3)[::stride, ::stride]
     lens = strided_lens(frame.intrinsics, stride)
     surface = back_project(lens, depth)
     normals = _normals(surface)
     points = surface[np.any(normals != 0, axis=-1)]
-    if len(points) > NUM_POINTS:
-        points = points[np.linspace(0, len(points) - 1, NUM_POINTS).astype(int)]
+    if len(points) > limits.VIEWS_POINTS:
+        points = points[np.linspace(0, len(points) - 1, limits.VIEWS_POINTS).astype(int)]
     reduced = replace(frame, depth=np.asarray(depth, np.float32), color=np.zeros((*depth.shape, 3), np.uint8))
     return _View(frame=replace(reduced, intrinsics=lens), surface=surface, normals=normals, points=points)
 
@@ -278,42 +258,44 @@ def _best_scale(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera
     tried = [s for s in SCALES if s == 1.0 or low <= s * float(np.median(medians)) <= high]
     counts = np.array([_fitting(views, pairs, cameras, s) for s in tried], dtype=np.float64)
     most = counts[:, 1].max()
-    if most < MIN_LANDED:
+    if most < limits.VIEWS_LANDED:
         return None
     plain = tried.index(1.0)
-    shares = counts[:, 0] / np.maximum(counts[:, 1], FEW_LANDED * most)
+    shares = counts[:, 0] / np.maximum(counts[:, 1], limits.VIEWS_FEW_LANDED * most)
     fit = counts[:, 0] / np.maximum(counts[:, 1], 1.0)
     best = int(np.argmax(shares))
-    if counts[plain, 1] > TRUSTED * most and fit[plain] > SAME_FIT * fit[best]:
+    if counts[plain, 1] > limits.VIEWS_TRUSTED * most and fit[plain] > limits.VIEWS_SAME_FIT * fit[best]:
         return None
-    if shares[best] < max(shares[plain] + MORE_FIT, TIMES_FIT * shares[plain], LEAST_FIT):
+    more = shares[plain] + limits.VIEWS_MORE_FIT, limits.VIEWS_TIMES_FIT * shares[plain]
+    if shares[best] < max(*more, limits.VIEWS_LEAST_FIT):
         return None
-    beside = [_fitting(views, pairs, cameras, tried[best] * factor) for factor in BESIDE]
-    if min(num_fit / max(num, 1) for num_fit, num in beside if num > MIN_LANDED // 10) > SAME_FIT * fit[best]:
+    beside = [_fitting(views, pairs, cameras, tried[best] * factor) for factor in limits.VIEWS_BESIDE]
+    least = min(num_fit / max(num, 1) for num_fit, num in beside if num > limits.VIEWS_LANDED // 10)
+    if least > limits.VIEWS_SAME_FIT * fit[best]:
         return None  # a flat wall fits at any scale
     near = [tried[best] * factor for factor in FINE]
-    scale = float(near[int(np.argmax([_fitting(views, pairs, cameras, s, FIT / 4)[0] for s in near]))])
-    return scale if abs(np.log(scale)) > OTHER_SCALE else None
+    scale = float(near[int(np.argmax([_fitting(views, pairs, cameras, s, 1 / 4)[0] for s in near]))])
+    return scale if abs(np.log(scale)) > limits.VIEWS_OTHER_SCALE else None
 
 
 def _fitting(
-    views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str], scale: float, fit: float = FIT
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], cameras: Sequence[str], scale: float, share: float = 1.0
 ) -> tuple[int, int]:
-    """Points that land within `fit` of the depth where these cameras' depths are scaled, and all that land."""
+    """Points that land within `share` of `VIEWS_FIT` where these cameras' depths are scaled, and all that land."""
     num_fit = num = 0
     for i, j in pairs:
         a, b = views[i], views[j]
         scales = [scale if view.frame.camera in cameras else 1.0 for view in (a, b)]
         off, depth = _distances(a, b, *scales)
-        num_fit += int((off < fit * depth).sum())
+        num_fit += int((off < limits.VIEWS_FIT * share * depth).sum())
         num += len(off)
     return num_fit, num
 
 
 def _fitted(views: Sequence[_View], pairs: Sequence[tuple[int, int]], camera: str) -> Float64 | None:
     """The better of two starts, near and wide."""
-    is_far = _cost(views, _with(views, pairs, camera))[1] < GOOD_SHARE
-    starts = [WIDTHS, (*WIDE, *WIDTHS)] if is_far else [WIDTHS]
+    is_far = _cost(views, _with(views, pairs, camera))[1] < limits.MOVE_GOOD_SHARE
+    starts = [limits.MOVE_WIDTHS, (*limits.MOVE_WIDE, *limits.MOVE_WIDTHS)] if is_far else [limits.MOVE_WIDTHS]
     found = [T for widths in starts if (T := _descended(views, pairs, camera, widths)) is not None]
     return min(found, key=lambda T: _cost(_moved(views, camera, T), pairs)[0], default=None)
 
@@ -333,10 +315,10 @@ def _descended(
             H += (rows * weight[:, None]).T @ rows
             g += (rows * weight[:, None]).T @ residual
             total += float(weight.sum())
-        if total < MIN_LANDED / 20:
+        if total < limits.VIEWS_LANDED / 20:
             return None
         values, vectors = np.linalg.eigh(H / total)
-        inverse = np.where(values > FLAT, 1 / np.maximum(values, FLAT), 0.0)
+        inverse = np.where(values > limits.MOVE_FLAT, 1 / np.maximum(values, limits.MOVE_FLAT), 0.0)
         step = -vectors @ (inverse * (vectors.T @ (g / total)))
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = cv2.Rodrigues(step[:3])[0], step[3:]
@@ -349,7 +331,7 @@ def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
     view a that land on a surface of view b.
     """
     points, lands, surface, normals = _landed(a, b)
-    lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * WIDE[0])
+    lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * limits.MOVE_WIDE[0])
     points, surface, normals = points[lands], surface[lands], normals[lands]
     rows = np.zeros((len(points), 6))
     if a.frame.camera == camera:
@@ -362,14 +344,14 @@ def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
 
 
 def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Mean distance from surfaces [m], each cut at `CUT`, and the share of points that fit."""
+    """Mean distance from surfaces [m], each cut at `limits.MOVE_CUT`, and the share of points that fit."""
     total = num = num_good = 0.0
     for i, j in pairs:
         off, depth = _distances(views[i], views[j])
-        total += float(np.minimum(off, CUT).sum())
-        num_good += float((off < FIT * depth).sum())
+        total += float(np.minimum(off, limits.MOVE_CUT).sum())
+        num_good += float((off < limits.VIEWS_FIT * depth).sum())
         num += len(off)
-    return (total / num, num_good / num) if num >= MIN_LANDED else (CUT, 0.0)
+    return (total / num, num_good / num) if num >= limits.VIEWS_LANDED else (limits.MOVE_CUT, 0.0)
 
 
 def _moved(views: Sequence[_View], camera: str, T: Float64) -> list[_View]:

@@ -10,28 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.checks import limits
 from splatctrl_cli.checks.check_images import thumbnail_lens
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RgbdFrame, Stamps, UInt8
 
-DEPTH_STEP = 0.05  # [m] at which the change of a pixel's depth counts in full
-COLOR_STEP = 64.0  # [grey levels] likewise
-MAX_FRAMES = 300  # of a camera; later ones are not looked at
-FIXED = 1e-3  # [m, rad] within which a camera stands still
 _NEAR = 0.05  # [m] in front of the camera
-MAX_OFFSET = 2.0  # [s] searched on either side
-MAX_SHARE = 0.25  # of the log that may be searched on either side
-MIN_INTERVALS = 10  # between frames
-MIN_MOTION = 0.02  # [rad or m] that a joint must move
-MIN_CORRELATION = 0.6  # of summed motion
-MIN_PIXEL_CORRELATION = 0.3  # of motion pixel by pixel, which noise and the background lower
-MIN_LEAD = 0.05  # over the next best peak
-STEPS_PER_INTERVAL = 6  # offsets tried per time between frames
-MAX_CAMERAS = 2  # that are compared pixel by pixel, those in which most changes
-PIXEL_ERROR = 0.15  # of the time between frames: found on the simulated log, per camera (docs/replay.md)
-SUM_ERROR = 1.0  # likewise
 Score = Callable[[float], float]
-FEW = 1000  # states by which a joint is seen to move
 Index = NDArray[np.int64]
 
 
@@ -60,7 +45,7 @@ class ImageMotion:
             small = thumbnail_lens(frame.intrinsics)
             camera = CameraMotion(intrinsics=small, T_world_camera=frame.T_world_camera)
             self.cameras[frame.camera] = camera
-        if len(camera.stamps_ns) == MAX_FRAMES:
+        if len(camera.stamps_ns) == limits.MOTION_FRAMES:
             return
         size = (camera.intrinsics.width, camera.intrinsics.height)
         gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
@@ -68,7 +53,7 @@ class ImageMotion:
             np.asarray(cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32),
             np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8),
         )
-        camera.is_fixed &= bool(np.abs(frame.T_world_camera - camera.T_world_camera).max() < FIXED)
+        camera.is_fixed &= bool(np.abs(frame.T_world_camera - camera.T_world_camera).max() < limits.MOTION_FIXED)
         camera.stamps_ns.append(frame.stamp_ns)
         if frame.camera in self._last:
             camera.changes.append(_change(*self._last[frame.camera], *now))
@@ -78,8 +63,8 @@ class ImageMotion:
 def _change(depth_a: Float32, gray_a: UInt8, depth_b: Float32, gray_b: UInt8) -> Float32:
     """Change of each pixel in [0, 1]: of depth where both frames have some, else of brightness."""
     both = (depth_a > 0) & (depth_b > 0)
-    of_depth = np.minimum(np.abs(depth_b - depth_a) / DEPTH_STEP, 1.0)
-    of_gray = np.minimum(np.abs(gray_b.astype(np.float32) - gray_a) / COLOR_STEP, 1.0)
+    of_depth = np.minimum(np.abs(depth_b - depth_a) / limits.MOTION_DEPTH_STEP, 1.0)
+    of_gray = np.minimum(np.abs(gray_b.astype(np.float32) - gray_a) / limits.MOTION_COLOR_STEP, 1.0)
     return np.asarray(np.where(both, of_depth, of_gray), dtype=np.float32)
 
 
@@ -107,7 +92,7 @@ def silhouettes(centers_world: Float64, radii: Float64, camera: CameraMotion) ->
 def predicted_change(depth_a: Float32, depth_b: Float32) -> Float32:
     """Change (K, h, w) in [0, 1] between silhouettes (K, h, w): 1 where only one has the robot."""
     a, b = depth_a > 0, depth_b > 0
-    of_depth = np.minimum(np.abs(depth_b - depth_a) / np.float32(DEPTH_STEP), np.float32(1.0))
+    of_depth = np.minimum(np.abs(depth_b - depth_a) / np.float32(limits.MOTION_DEPTH_STEP), np.float32(1.0))
     return np.where(a & b, of_depth, (a ^ b).astype(np.float32)).astype(np.float32)
 
 
@@ -166,26 +151,27 @@ def estimate_clock_offset(
     """
     cameras = [motion.cameras[name] for name in sorted(motion.cameras) if motion.cameras[name].changes]
     num = sum(len(camera.changes) for camera in cameras)
-    if len(states) < 3 or num < MIN_INTERVALS:
-        return _unknown(num, f"expected at least {MIN_INTERVALS} times between frames and 3 states")
+    if len(states) < 3 or num < limits.MOTION_INTERVALS:
+        return _unknown(num, f"expected at least {limits.MOTION_INTERVALS} times between frames and 3 states")
     states, robot = _near(states, robot, cameras)
     if len(states) < 3:
-        return _unknown(num, f"no joint states within {MAX_OFFSET:g} s of the frames")
+        return _unknown(num, f"no joint states within {limits.OFFSET_REACH:g} s of the frames")
     position = np.array([state.position for state in states])
-    if np.ptp(position, axis=0).max() < MIN_MOTION:
+    if np.ptp(position, axis=0).max() < limits.MOTION_LEAST:
         return _unknown(num, "no joint moves")
     start = states[0].stamp_ns
     seconds = np.array([state.stamp_ns - start for state in states]) * 1e-9
     offsets, step = _offsets(float(seconds[-1]), cameras)
     if not len(offsets):
         return _unknown(num, "the log is too short")
-    interval = step * STEPS_PER_INTERVAL
-    fixed = sorted((c for c in cameras if c.is_fixed), key=lambda c: -float(np.sum(c.changes)))[:MAX_CAMERAS]
+    interval = step * limits.OFFSET_STEPS
+    fixed = sorted((c for c in cameras if c.is_fixed), key=lambda c: -float(np.sum(c.changes)))
     if robot is not None and fixed:
-        scores = [_pixel_scores(seconds, robot, step, camera, start, offsets) for camera in fixed]
-        return _peak(offsets, np.array(scores), num, MIN_PIXEL_CORRELATION, PIXEL_ERROR * interval)
+        most = fixed[: limits.MOTION_CAMERAS]
+        scores = [_pixel_scores(seconds, robot, step, camera, start, offsets) for camera in most]
+        return _peak(offsets, np.array(scores), num, limits.PIXEL_CORRELATION, limits.PIXEL_ERROR * interval)
     scores = [_sum_scores(seconds, position, camera, start, offsets) for camera in cameras]
-    return _peak(offsets, np.array(scores), num, MIN_CORRELATION, SUM_ERROR * interval)
+    return _peak(offsets, np.array(scores), num, limits.OFFSET_CORRELATION, limits.OFFSET_SUM_ERROR * interval)
 
 
 def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
@@ -203,7 +189,7 @@ def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
     seconds = np.asarray((near - near[0]) * 1e-9, dtype=np.float64)
     offsets, step = _offsets(float(seconds[-1]), cameras)
     is_asked = np.zeros(len(near), dtype=np.bool_)
-    is_asked[np.linspace(0, len(near) - 1, FEW).astype(np.int64)] = True  # whether a joint moves
+    is_asked[np.linspace(0, len(near) - 1, limits.MOTION_STATES).astype(np.int64)] = True  # whether a joint moves
     for camera in cameras:
         at = _since(camera, int(near[0]))
         for offset in offsets:
@@ -214,16 +200,16 @@ def states_asked(stamp_ns: Stamps, motion: ImageMotion) -> Index:
 
 
 def _span(cameras: Sequence[CameraMotion]) -> tuple[int, int]:
-    """First and last stamp [ns] that an offset within `MAX_OFFSET` can bring to a frame."""
-    reach = round(MAX_OFFSET * 1e9)
+    """First and last stamp [ns] that an offset within `OFFSET_REACH` can bring to a frame."""
+    reach = round(limits.OFFSET_REACH * 1e9)
     return min(c.stamps_ns[0] for c in cameras) - reach, max(c.stamps_ns[-1] for c in cameras) + reach
 
 
 def _offsets(span_s: float, cameras: Sequence[CameraMotion]) -> tuple[Float64, float]:
     """The offsets [s] to try over states of `span_s`, none where these are too few, and the step between them."""
-    step = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras) / STEPS_PER_INTERVAL
-    count = int(min(MAX_OFFSET, MAX_SHARE * span_s) / step) if step > 0 else 0
-    if count < 2 * STEPS_PER_INTERVAL:
+    step = min(float(np.median(np.diff(camera.stamps_ns))) * 1e-9 for camera in cameras) / limits.OFFSET_STEPS
+    count = int(min(limits.OFFSET_REACH, limits.OFFSET_SHARE * span_s) / step) if step > 0 else 0
+    if count < 2 * limits.OFFSET_STEPS:
         return np.zeros(0), step
     return np.asarray(step * np.arange(-count, count + 1), dtype=np.float64), step
 
@@ -236,7 +222,7 @@ def _since(camera: CameraMotion, start: int) -> Float64:
 def _near(
     states: Sequence[JointState], robot: RobotPoints | None, cameras: Sequence[CameraMotion]
 ) -> tuple[list[JointState], RobotPoints | None]:
-    """The states, and the robot's points at them, that an offset within `MAX_OFFSET` can bring to a frame."""
+    """The states, and the robot's points at them, that an offset within `OFFSET_REACH` can bring to a frame."""
     first, last = _span(cameras)
     near = [index for index, state in enumerate(states) if first <= state.stamp_ns <= last]
     points = None if robot is None else RobotPoints(centers=robot.centers[near], radii=robot.radii)
@@ -278,7 +264,7 @@ def _sum_scores(seconds: Float64, position: Float64, camera: CameraMotion, start
 def _kept(is_inside: "np.ndarray[tuple[int], np.dtype[np.bool_]]") -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
     """Times between frames (K,) that lie in the log of joints, none where these are too few to judge."""
     keep = is_inside[1:] & is_inside[:-1]
-    return keep if keep.sum() >= max(MIN_INTERVALS // 2, len(keep) // 2) else np.zeros_like(keep)
+    return keep if keep.sum() >= max(limits.MOTION_INTERVALS // 2, len(keep) // 2) else np.zeros_like(keep)
 
 
 def _at(seconds: Float64, curve: Float64, at: Float64) -> Float64:
@@ -300,14 +286,14 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
     best = int(np.argmax(score))
     inner = score[1:-1]
     peaks = np.flatnonzero((inner >= score[:-2]) & (inner > score[2:])) + 1
-    others = score[peaks[np.abs(peaks - best) > STEPS_PER_INTERVAL]]
+    others = score[peaks[np.abs(peaks - best) > limits.OFFSET_STEPS]]
     top, runner_up = float(score[best]), float(others.max(initial=0.0))
     reason = ""
     if top < least:
         reason = f"images and joints do not move alike (correlation {top:.2f})"
     elif best in {0, len(score) - 1}:
         reason = f"it exceeds the {offsets[-1]:.2f} s that are searched"
-    elif top - runner_up < MIN_LEAD:
+    elif top - runner_up < limits.OFFSET_LEAD:
         reason = f"the motion repeats: offsets of {offsets[best]:+.2f} s and another fit alike"
     if reason:
         return _unknown(num, reason, top, runner_up)
@@ -324,7 +310,7 @@ def _peak(offsets: Float64, scores: Float64, num: int, least: float, error: floa
 
 def _vertex(offsets: Float64, score: Float64, best: int) -> float:
     """Of the parabola through the scores within half a time between frames of the best."""
-    reach = min(max(STEPS_PER_INTERVAL // 2, 2), best, len(score) - 1 - best)
+    reach = min(max(limits.OFFSET_STEPS // 2, 2), best, len(score) - 1 - best)
     if reach == 0:
         return float(offsets[best])
     near = slice(best - reach, best + reach + 1)

@@ -9,7 +9,6 @@ from typing import Any
 
 from splatctrl_cli.evaluate.verdict import Verdict
 
-MAX_REASONS = 10  # printed; --json and summary.json have all
 _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
@@ -50,7 +49,7 @@ class Console:
             self.result({"exit_code": code, "verdict": verdict.as_dict(), **result}, ())
         else:
             print(verdict.sentence)
-            for reason in () if has_findings else verdict.decisive[1:MAX_REASONS]:
+            for reason in () if has_findings else verdict.decisive[1:10]:  # --json and summary.json have all
                 print(f"  {reason.outcome}: {reason}")
             for reason in () if has_findings else verdict.said:
                 print(f"  note: {reason}")

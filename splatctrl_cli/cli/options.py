@@ -8,8 +8,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from splatctrl_cli.cli.parser import MAX_LENGTH, MAX_SEED, Options, Parser, real, several, whole
-from splatctrl_cli.config.ranges import shown
+from splatctrl_cli.cli.parser import Options, Parser, real, several, whole
+from splatctrl_cli.config.fixed import POSE_JUMP
+from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, shown
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.gates import gate
 from splatctrl_cli.logs.source_options import CameraTopics, PoseTopic, SourceOptions
@@ -99,7 +100,7 @@ def add_scan(add: Options) -> None:
 def add_disagreement(add: Options) -> None:
     """``--max-pose-jump`` and ``--allow-disagreement``: by how much a log may contradict itself."""
     jump = "how far a camera may move between frames less than a second apart"
-    add("--max-pose-jump M", jump, real(1e-3, MAX_LENGTH, "m"), 1.0)
+    add("--max-pose-jump M", jump, real(1e-3, MAX_PLACE, "m"), POSE_JUMP)
     add("--allow-disagreement", "continue although cameras disagree about surfaces")
 
 

@@ -10,14 +10,12 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn, TypeVar
 
-from splatctrl_cli.config.ranges import OneOf, Section, Within, shown
+from splatctrl_cli.config.ranges import MAX_PLACE, OneOf, Section, Within, shown
 from splatctrl_cli.errors import UsageError
 
 T = TypeVar("T", int, float)
 
 MAX_SECONDS = 1e8  # [s] of a recording: three years
-MAX_LENGTH = 1e6  # [m, px] of a place: as of poses in files
-MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
 MOST_WIDTH = 100  # columns of help
 
 
@@ -222,12 +220,12 @@ def words(section: type[Section], key: str) -> tuple[str, ...]:
 
 
 def several(text: str) -> tuple[float, ...]:
-    """Numbers joined by commas; none where one of them is not a number, or not within `MAX_LENGTH`."""
+    """Numbers joined by commas; none where one of them is not a number, or not within `MAX_PLACE`."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         return ()
-    return values if all(abs(value) <= MAX_LENGTH for value in values) else ()
+    return values if all(abs(value) <= MAX_PLACE for value in values) else ()
 
 
 def _bounded(kind: Callable[[str], T], declared: Within) -> Callable[[str], T]:

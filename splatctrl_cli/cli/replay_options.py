@@ -18,10 +18,10 @@ from splatctrl_cli.cli.options import (
     pose,
 )
 from splatctrl_cli.cli.parser import MAX_SECONDS, Options, Parser, real, whole
+from splatctrl_cli.config.fixed import GOLDEN_TOLERANCE
 
 MODES = ("audit", "open-loop", "closed-loop")
 BASELINES = ("standstill", "birrt", "birrt-ik")
-GOLDEN_TOLERANCE = 1e-6  # [rad/s]: steps.csv keeps nine digits; another machine or solver needs more
 
 
 def replay_options(add: Options, parser: Parser) -> None:

@@ -5,8 +5,8 @@ import math
 
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import locked_joints, request_of
+from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.jobs.robot import (
-    DEFAULT_SPHERES,
     CoverageResult,
     PairsResult,
     RobotRequest,

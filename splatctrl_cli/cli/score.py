@@ -12,8 +12,8 @@ from splatctrl_cli.evaluate.score_report import PREFIX, counted
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.score_cloud import CloudSettings
 from splatctrl_cli.jobs.score_fit import EACH, METHODS, FitRequest, score_fits
+from splatctrl_cli.records import MILLIMETRE
 
-MILLIMETRE = 0.001  # [m], the unit of DTU's clouds
 OF_FITS: dict[str, object] = {
     "config": None,
     "set": [],

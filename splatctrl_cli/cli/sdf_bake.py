@@ -9,8 +9,9 @@ from typing import Any
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import names_of, request_of
 from splatctrl_cli.config import load_config
+from splatctrl_cli.config.fixed import PROBABILITY_NEAR
 from splatctrl_cli.evaluate.field_accuracy import BandAccuracy
-from splatctrl_cli.evaluate.field_truth import NEAR, TruthComparison
+from splatctrl_cli.evaluate.field_truth import TruthComparison
 from splatctrl_cli.field.baker import CHANNELS
 from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.jobs.bake import BakeResult, bake
@@ -117,8 +118,9 @@ def _truth_lines(compared: TruthComparison) -> list[str]:
     if compared.error_mean is not None and compared.error_sigma:
         mean, sigma = compared.error_mean, compared.error_sigma
         expected.append(
-            f"within {NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- {sigma * 1e3:.1f} mm: "
-            f"calibrate the probability with --set field.error_mean={mean:.4f} --set field.error={sigma:.4f}"
+            f"within {PROBABILITY_NEAR * 100:g} cm of seen surfaces sdf errs by {mean * 1e3:.1f} +- "
+            f"{sigma * 1e3:.1f} mm: calibrate the probability with --set "
+            f"field.error_mean={mean:.4f} --set field.error={sigma:.4f}"
         )
     return [
         "error = field - truth, positive where clearance is over-estimated",

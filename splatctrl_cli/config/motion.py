@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from splatctrl_cli.config.ranges import OneOf, Section, Within, check
+from splatctrl_cli.config.ranges import MAX_SEED, OneOf, Section, Within, check
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ class ControlConfig(Section, section="control"):
 class PlannerConfig(Section, section="planner"):
     """IV: the sampling-based planner (BiRRT) that the controller is compared with."""
 
-    seed: Annotated[int, Within(0, 2**31 - 1, "", "of samples and shortcuts")] = 0
+    seed: Annotated[int, Within(0, MAX_SEED, "", "of samples and shortcuts")] = 0
     goal_postures: Annotated[
         int, Within(1, 1000, "", "configurations sought for a goal pose; a path ends in any")
     ] = 8

@@ -7,6 +7,8 @@ from typing import Any, ClassVar
 from splatctrl_cli.errors import UsageError
 
 MOST_SHOWN = 60  # characters of a refused value
+MAX_PLACE = 1e6  # [m] of a place from the world's origin
+MAX_SEED = 2**31 - 1  # fits every 32-bit integer, signed or not
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from splatctrl_cli.containers.mcap_log import ros_type_name
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.unpacking import BadBlockError, Budget, unpacked_start
-
-_SECOND = 1_000_000_000
+from splatctrl_cli.records import SECOND_NS
 
 
 class Bag1Log:
@@ -93,7 +92,7 @@ class Bag1Log:
                 damage.add(f"{self.path.name}: a message without a connection or time")
             elif names is None or topic.name in names:
                 seconds, nanoseconds = int.from_bytes(time[:4], "little"), int.from_bytes(time[4:], "little")
-                at = seconds * _SECOND + nanoseconds
+                at = seconds * SECOND_NS + nanoseconds
                 yield RawMessage(topic=topic, log_time_ns=at, data=body, file=self.path.name, offset=offset)
 
     def _connect(self, fields: Fields, body: bytes, damage: Damage) -> None:

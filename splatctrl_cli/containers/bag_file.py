@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from splatctrl_cli.containers.raw_log import Damage
-from splatctrl_cli.files.unpacking import MAX_BLOCK
+from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 _KINDS = frozenset({MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION})
 _U32 = struct.Struct("<I")
-_PIECE = 1 << 20
 _MOST_HEADER = 1 << 20  # bytes of a record's header; those of connections hold a name
 _MARK = b"compression="  # of a chunk's header, behind its length and perhaps the fields `op` and `size`
 _MARK_OFFSETS = (8, 16, 21, 29)
@@ -103,7 +102,7 @@ class BagFile:
         """Where behind `offset` a whole chunk begins, by the fields of its header."""
         stream.seek(offset + 1)
         kept = b""
-        while block := stream.read(_PIECE):
+        while block := stream.read(PIECE):
             here = stream.tell()
             base, block = here - len(block) - len(kept), kept + block
             at = block.find(_MARK)

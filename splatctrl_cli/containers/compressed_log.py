@@ -12,12 +12,12 @@ from splatctrl_cli.files.unpacking import (
     FREE_BYTES,
     MAX_BLOCK,
     MAX_WINDOW,
+    PIECE,
     BadBlockError,
     Budget,
     unpacked_start,
 )
 
-_PIECE = 1 << 20
 _MOST_RATIO = 100  # of an unpacked file, on disk, to the compressed one
 
 
@@ -29,7 +29,7 @@ def unpack(path: Path, target: Path) -> str:
         stream = decompressor.stream_reader(source, read_across_frames=True)
         while True:
             try:
-                piece = stream.read(_PIECE)
+                piece = stream.read(PIECE)
             except zstandard.ZstdError:
                 return "cannot be decompressed further"
             if not piece:

@@ -15,7 +15,6 @@ from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.unpacking import MAX_BLOCK
 
-_MOST_HOLES = 1000
 _WIDEST_HOLE = 1 << 40
 
 
@@ -54,7 +53,7 @@ class Db3Log:
 
     def _rows(self, database: sqlite3.Connection, damage: Damage) -> Iterator[tuple[object, object, object]]:
         last, hole = -(1 << 62), 1  # hole: how many rows to pass over next
-        for _ in range(_MOST_HOLES):
+        for _ in range(1000):
             try:
                 query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id"
                 for number, *row in database.execute(query, (last,)):

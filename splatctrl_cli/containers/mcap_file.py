@@ -27,10 +27,9 @@ from splatctrl_cli.containers.mcap_records import (
     parse_record,
 )
 from splatctrl_cli.containers.raw_log import Damage
-from splatctrl_cli.files.unpacking import MAX_BLOCK
+from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE
 
 MAX_SUMMARY = 64 << 20  # bytes of a summary that are read
-_PIECE = 1 << 20
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _ATTACHMENT_HEAD = 1 << 16  # bytes in which name and media type of an attachment must end
@@ -93,7 +92,7 @@ class McapFile:
         with self.path.open("rb") as stream:
             stream.seek(min(index.chunk_start_offset, self.size))
             opcode, length = HEAD.unpack((stream.read(HEAD.size) + bytes(HEAD.size))[: HEAD.size])
-            return stream.read(min(length, MAX_BLOCK + _PIECE)) if opcode == CHUNK else b""
+            return stream.read(min(length, MAX_BLOCK + PIECE)) if opcode == CHUNK else b""
 
     def _places(self) -> list[int]:
         """Where records are known to begin: chunks, and the end of the data."""
@@ -150,7 +149,7 @@ class _Walk:
         if opcode == ATTACHMENT:
             self._check_attachment(offset, length)
             return Part(offset, opcode, b"")
-        if opcode <= DATA_END and length <= MAX_BLOCK + _PIECE:
+        if opcode <= DATA_END and length <= MAX_BLOCK + PIECE:
             return Part(offset, opcode, self._take(length))
         if opcode <= DATA_END:
             self._add(f"the record at byte {offset} was left out: {length} bytes, at most {MAX_BLOCK} are read")
@@ -179,7 +178,7 @@ class _Walk:
         before = _CHUNK_HEAD.size
         self._stream.seek(offset + 1)
         kept = b""
-        while block := self._stream.read(_PIECE):
+        while block := self._stream.read(PIECE):
             base = self._stream.tell() - len(block) - len(kept)
             block = kept + block
             found = min((at for at in self._chunks_in(block, base) if base + at > offset), default=None)
@@ -204,7 +203,7 @@ class _Walk:
 
     def _check_data(self, opcode: int, length: int) -> None:
         """Compare the checksum of the data section with what its last record says."""
-        if opcode != DATA_END or length > _PIECE:
+        if opcode != DATA_END or length > PIECE:
             return
         here = self._stream.tell()
         try:
@@ -260,7 +259,7 @@ class _Walk:
 
     def _pass_over(self, length: int, crc: int = 0) -> int:
         """Read over `length` bytes; their checksum, going on from `crc`."""
-        while length > 0 and (piece := self._take(min(length, _PIECE))):
+        while length > 0 and (piece := self._take(min(length, PIECE))):
             crc = zlib.crc32(piece, crc)
             length -= len(piece)
         return crc

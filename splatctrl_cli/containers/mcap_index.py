@@ -19,7 +19,6 @@ from splatctrl_cli.containers.mcap_records import (
 )
 
 MOST_HEADS = 100_000  # records that are visited: a second or so
-_CHUNK_HEAD = 64  # bytes that hold the fields of a chunk before its records
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +41,7 @@ def index_by_heads(file: McapFile) -> LogIndex:
     with file.path.open("rb") as stream:
         while offset + HEAD.size <= file.size and num_heads < MOST_HEADS:
             stream.seek(offset)
-            head = stream.read(HEAD.size + _CHUNK_HEAD)
+            head = stream.read(HEAD.size + 64)  # bytes that hold the fields of a chunk before its records
             opcode, length = HEAD.unpack_from(head)
             if opcode < FIRST_OPCODE or opcode == FOOTER or offset + HEAD.size + length > file.size:
                 break

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import BRAKING_SHARE, IMMOVABLE_ROW
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.control.limits import braking_speed
 from splatctrl_cli.control.terms import Barrier, BarrierTerm, RowKind, State
@@ -12,8 +13,6 @@ from splatctrl_cli.kernels.chain import pair_gaps
 from splatctrl_cli.records import DistanceField, Float64
 
 MARGIN = "margin"
-IMMOVABLE = 1e-9  # [m/s] a row that the fastest allowed motion changes by less than this cannot be acted on
-BRAKING_SHARE = 0.5  # of what a row alone could brake with; 1 lost up to 6 mm where several rows brake at once
 
 
 class SceneRows(BarrierTerm):
@@ -219,4 +218,4 @@ def fastest_spheres(jacobians: Float64, lowest: Float64, highest: Float64) -> Fl
 
 def is_immovable(G: Float64, velocity_limit: Float64) -> NDArray[np.bool_]:
     """Rows (M,) that no joint velocity changes: no sphere of theirs moves, or the field is flat there."""
-    return np.asarray(np.abs(G) @ velocity_limit < IMMOVABLE)
+    return np.asarray(np.abs(G) @ velocity_limit < IMMOVABLE_ROW)

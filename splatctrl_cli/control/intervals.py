@@ -9,12 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import HALVED_DOWN_TO, MAX_HALVINGS
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.records import Bool, Float64
-
-MAX_HALVINGS = 10
-RESOLUTION = 5e-4  # [m] of travel: shorter pieces are not halved any more
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +118,7 @@ def _refined(
     for level in range(MAX_HALVINGS + 1):
         travel = np.abs(q_last - q_first) @ reach.levers.T
         bound = (0.5 * (first + last - travel)).min(axis=1)
-        is_done = (bound >= margin) | (travel.max(axis=1) < RESOLUTION) | (level == MAX_HALVINGS)
+        is_done = (bound >= margin) | (travel.max(axis=1) < HALVED_DOWN_TO) | (level == MAX_HALVINGS)
         np.minimum.at(least, owner[is_done], bound[is_done])
         open_ = np.flatnonzero(~is_done)
         if not len(open_):

@@ -5,10 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
 from splatctrl_cli.records import Float64, Stamps
-
-WINDOW = 0.05  # [s] over which a motion is averaged, so that an encoder's steps are not taken for speed
-ENCODER = 1e-3  # [rad or m] that each position may be off
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +22,8 @@ class Strain:
 
 
 class MotionLimits:
-    """Velocities from the last state, and from `WINDOW` earlier, each less what the encoder may be off; accelerations
-    from three places `WINDOW` apart. A sample is of the time before it.
+    """Velocities from the last state, and from `MOTION_WINDOW` earlier, each less what the encoder may be off;
+    accelerations from three places `MOTION_WINDOW` apart. A sample is of the time before it.
     """
 
     def __init__(self, velocity_limit: Float64, acceleration_limit: Float64 | None) -> None:
@@ -41,7 +39,7 @@ class MotionLimits:
         everything = np.concatenate([self._positions, positions])
         first = len(all_stamps) - num
         share = np.zeros((num, positions.shape[1]))
-        window = np.int64(WINDOW * 1e9)
+        window = np.int64(MOTION_WINDOW * 1e9)
         last = np.arange(first, first + num) - 1
         for before in (last, np.minimum(last, np.searchsorted(all_stamps, stamps - window, "right") - 1)):
             has = np.flatnonzero(before >= 0)
@@ -68,9 +66,9 @@ class MotionLimits:
         seconds = (all_stamps - all_stamps[0]) * 1e-9
         now = (stamps - all_stamps[0]) * 1e-9
         found = np.zeros((len(stamps), everything.shape[1]))
-        old = now >= 2 * WINDOW
+        old = now >= 2 * MOTION_WINDOW
         for joint in range(everything.shape[1]):
-            at = [np.interp(now[old] - k * WINDOW, seconds, everything[:, joint]) for k in range(3)]
+            at = [np.interp(now[old] - k * MOTION_WINDOW, seconds, everything[:, joint]) for k in range(3)]
             second = np.abs(at[0] - 2 * at[1] + at[2]) - 4 * ENCODER
-            found[old, joint] = np.maximum(second, 0.0) / WINDOW**2
+            found[old, joint] = np.maximum(second, 0.0) / MOTION_WINDOW**2
         return found

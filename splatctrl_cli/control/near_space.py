@@ -12,16 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.records import Bool, Float64
-
-EVERY_NS = 200_000_000  # between states that are looked at: cameras that stop are stale five times as late
-APART = 0.01  # [m] a point of a shell is at least so far from every other sphere of the arm
-NEW = 0.05  # [m] from the arm at the first state: space that the motion comes to
-FRESH_SHARE = 0.75  # of the seen points; the arm itself hides up to a quarter of its shell for seconds
-BLIND = 0.9  # of the new points of a sphere's shell, at least FEWEST of them, never seen: it comes to the unknown
-FEWEST = 5
-LEAST_SHARE = 0.05  # of the shell: fewer points say nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +32,9 @@ class Seen:
 @dataclass(frozen=True, kw_only=True)
 class NearFigures:
     """Of one state: unseen, the share of the points in space that is new to the motion that no camera had ever seen;
-    blind, the share of the moving spheres about which nearly all (`BLIND`) of that space was never seen; age [s]
-    within which `FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen after
-    the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
+    blind, the share of the moving spheres about which nearly all (`NEAR_BLIND`) of that space was never seen; age [s]
+    within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
+    after the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
     cameras looked at without an answer, and its place (3,) [m]; infinite and NaN where there is none.
     """
 
@@ -71,7 +64,7 @@ class NearSpace:
         for index, stamp_ns in enumerate(stamps.tolist()):
             if stamp_ns >= self._next_ns:
                 chosen.append(index)
-                self._next_ns = stamp_ns + EVERY_NS
+                self._next_ns = stamp_ns + fixed.NEAR_EVERY_NS
         return chosen
 
     def look(self, stamp_ns: int, q: Float64, known: Seen) -> NearFigures:
@@ -80,21 +73,22 @@ class NearSpace:
         if self._first is None:
             self._first = centers
         points = (centers[self._moving][:, None] + self._offsets).reshape(-1, 3)
-        is_outside = _is_outside(points, centers, self._radii + APART, self._owners)
+        is_outside = _is_outside(points, centers, self._radii + fixed.NEAR_APART, self._owners)
         points, owners = points[is_outside], self._owners[is_outside]
-        fewest = LEAST_SHARE * len(self._owners)
+        fewest = fixed.NEAR_LEAST_SHARE * len(self._owners)
         seen = known.last_ns(points)
         is_never = seen < 0
-        is_new = _is_outside(points, self._first, self._radii + NEW)
+        is_new = _is_outside(points, self._first, self._radii + fixed.NEAR_NEW)
         unseen = blind = age = ahead = np.nan
         if is_new.sum() >= fewest:
             unseen = float(is_never[is_new].mean())
             num_new, num_never = (np.bincount(owners[which]) for which in (is_new, is_new & is_never))
             num_never = np.pad(num_never, (0, len(num_new) - len(num_never)))
-            blind = float(np.sum((num_new >= FEWEST) & (num_never >= BLIND * num_new))) / len(self._moving)
+            is_blind = (num_new >= fixed.NEAR_FEWEST) & (num_never >= fixed.NEAR_BLIND * num_new)
+            blind = float(np.sum(is_blind)) / len(self._moving)
         if (~is_never).sum() >= fewest:
             ages = (stamp_ns - seen[~is_never]) * 1e-9
-            age, ahead = float(np.quantile(ages, FRESH_SHARE)), max(-float(ages.min()), 0.0)
+            age, ahead = float(np.quantile(ages, fixed.NEAR_FRESH_SHARE)), max(-float(ages.min()), 0.0)
         distance, place = self._nearest(known.unanswered, centers)
         distance = max(distance - known.voxel / 2, 0.0)  # from its nearest face
         return NearFigures(unseen=unseen, blind=blind, age=age, ahead=ahead, unanswered=distance, place=place)
@@ -102,7 +96,7 @@ class NearSpace:
     def _nearest(self, points: Float64, centers: Float64) -> tuple[float, Float64]:
         """The least distance [m] of points (K, 3) near the arm to its moving spheres, and that point (3,)."""
         moving, radii = centers[self._moving], self._radii[self._moving]
-        reach = radii.max() + NEW
+        reach = radii.max() + fixed.NEAR_NEW
         points = points[np.all((points > moving.min(axis=0) - reach) & (points < moving.max(axis=0) + reach), axis=1)]
         if not len(points):
             return np.inf, np.full(3, np.nan)

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import MAX_RESUME, ZONE_RESOLUTION
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.errors import UsageError
@@ -14,8 +15,6 @@ from splatctrl_cli.records import Bool, Box, Float64, Stamps
 
 DistanceToPeople = Callable[[Float64, int], Float64]
 """points (Q, 3) [m], world, and a stamp [ns] -> distance (Q,) [m] to the nearest person, inf where nobody is."""
-
-MAX_RESUME = 100.0  # [m] a zone wider than any hall would hold the arm for ever
 
 
 def remembered(people: DistanceToPeople, age_s: Callable[[int], float], memory: float) -> DistanceToPeople:
@@ -30,7 +29,6 @@ def remembered(people: DistanceToPeople, age_s: Callable[[int], float], memory: 
     return distance
 
 
-RESOLUTION = 0.01  # [m] a person this near to a box counts as inside
 EIGHTHS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
@@ -84,7 +82,7 @@ class BoxZone:
 
 
 def is_anybody_in(box: Box, people: DistanceToPeople, stamp_ns: int) -> bool:
-    """Whether a person reaches into a box, or comes as near as `RESOLUTION`.
+    """Whether a person reaches into a box, or comes as near as `ZONE_RESOLUTION`.
 
     A distance changes by no more than a metre per metre: a cell whose middle is farther from everybody than from its
     own corners holds nobody, one whose middle is inside somebody does; the others are cut into eight.
@@ -95,7 +93,7 @@ def is_anybody_in(box: Box, people: DistanceToPeople, stamp_ns: int) -> bool:
         if np.any(distance <= 0):
             return True
         is_open = distance < np.linalg.norm(half)
-        if np.linalg.norm(half) < RESOLUTION:
+        if np.linalg.norm(half) < ZONE_RESOLUTION:
             return bool(np.any(is_open))
         middles = (middles[is_open, None] + EIGHTHS * half).reshape(-1, 3)
         half = half / 2

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import MULTIPLIER, STEP_SCALES, WITHIN_SHARE
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.fallbacks import Choice, Rung, descend
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
@@ -16,10 +17,6 @@ from splatctrl_cli.control.qp import QpSolver, solver_named
 from splatctrl_cli.control.qp_rows import RowBuilder, Rows
 from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
 from splatctrl_cli.records import Bool, DistanceField, Float64
-
-SCALES = (0.5, 0.25, 0.125, 0.0625)  # of a step that turns out worse than its rows promised; then none
-WITHIN_SHARE = 0.01  # of `promise_tolerance`, for a sphere that is within its margin
-MULTIPLIER = 1e-4  # above which a row counts as intervening; an idle row's multiplier ends below 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,12 +232,12 @@ class QpIkController:
         return np.asarray(broken)
 
     def _kept_scale(self, q: Float64, choice: Choice, rows: Rows, rest: Float64) -> float:
-        """The largest of SCALES whose next distances are no worse than the rows promised, else 0: how much of a
+        """The largest of STEP_SCALES whose next distances are no worse than the rows promised, else 0: how much of a
         velocity that breaks a promise there is, the remainder being `rest` (J,).
         """
         if choice.rung is Rung.HOLD:
             return 0.0
-        for scale in SCALES:
+        for scale in STEP_SCALES:
             later = self._builder.distances(q + self._config.period * _blend(choice.velocity, rest, scale))
             if not np.any(self._broken(choice, rows, later)):
                 return scale

@@ -17,17 +17,14 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.pfm import read_pfm, write_pfm
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
+from splatctrl_cli.records import MILLIMETRES, Bool, Float32, Float64, Intrinsics, UInt8
 
-MILLIMETRES = 1000.0
 LIGHT = 3  # of seven; the one MVSNet's own lists test with
 RAW = (1600, 1200)  # pixels of DTU's cameras; 640x512 is half of that, cropped about the middle
 CROPPED = (640, 512)
 CROP = (80, 44)  # pixels cut off left and top of the half-size image
-VISIBLE_ABOVE = 10  # of depth_visual
 PLAUSIBLE_DEPTH = (0.02, 20.0)  # [m] median of a scan
 LEAST_SPREAD = 0.005  # of the depth, by which the cameras stand apart
-BRIGHT = 128  # from which a mask says yes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +242,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool:
                 f"{path}: expected a mask of {width}x{height} or of that shape, got {image.shape[1]}x{image.shape[0]}"
             )
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
-    return np.asarray((image >= BRIGHT).all(axis=2))
+    return np.asarray((image >= 128).all(axis=2))
 
 
 def _mask_file(folder: Path, number: int) -> Path:
@@ -336,7 +333,7 @@ def read_depth(path: Path, visual: Path, size: tuple[int, int]) -> Float32:
         shown = cv2.cvtColor(read_image(visual), cv2.COLOR_RGB2GRAY)
         if shown.shape != depth.shape:
             raise InputError(f"{visual}: expected a grey image of {depth.shape[1]}x{depth.shape[0]}")
-        depth = np.where(shown > VISIBLE_ABOVE, depth, np.float32(0))
+        depth = np.where(shown > 10, depth, np.float32(0))
     width, height = size
     if depth.shape == (height, width):
         return depth

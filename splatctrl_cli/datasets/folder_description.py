@@ -14,7 +14,6 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.registration import DISTORTION_MODELS
 from splatctrl_cli.records import Float64, Intrinsics
 
-SMALLEST = 1e-2  # [px] of a size or focal length
 DEPTH_ENCODINGS = ("uint16", "uint16-rotated3", "float32")
 
 
@@ -252,7 +251,7 @@ def check_camera(camera: CameraTable, where: str) -> None:
     """Raises InputError naming a size or focal length that no camera has."""
     for name in ("width", "height", "fx", "fy"):
         value = getattr(camera, name)
-        if not SMALLEST <= value < 1e5:
+        if not 1e-2 <= value < 1e5:
             raise _refused(f"{where}.{name}: expected a positive number of pixels, got {value}")
     for name in ("cx", "cy"):
         if not abs(getattr(camera, name)) < 1e5:

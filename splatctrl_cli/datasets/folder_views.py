@@ -19,10 +19,9 @@ from splatctrl_cli.datasets.poses import (
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.logs.source_options import SourceOptions, still_note
-from splatctrl_cli.records import Float64, LossReport
+from splatctrl_cli.records import SECOND_NS, Float64, LossReport
 
 HOLDOUT = "holdout"
-_SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,8 +255,8 @@ def _stamp_ns(description: Description, view: ListedView, position: int) -> int:
             )
         return stamp_ns
     if stamps.rate is not None:
-        return round(_number(view.name) * _SECOND / stamps.rate)
-    return position * _SECOND
+        return round(_number(view.name) * SECOND_NS / stamps.rate)
+    return position * SECOND_NS
 
 
 def _number(name: str) -> int:

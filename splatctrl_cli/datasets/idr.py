@@ -15,21 +15,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatctrl_cli.datasets.dtu import (
-    MILLIMETRES,
-    DtuScan,
-    DtuView,
-    Shrink,
-    check_lengths,
-    chosen_scan,
-    read_views,
-    write_png,
-)
+from splatctrl_cli.datasets.dtu import DtuScan, DtuView, Shrink, check_lengths, chosen_scan, read_views, write_png
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.pfm import write_pfm
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.records import Float64, Intrinsics
+from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 _MOST = 1 << 24  # bytes of cameras: 500 each

@@ -26,7 +26,6 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 CAMERA = "camera"  # the name of a layout's only lens
-SAME = 1e-6  # largest entry of a matrix that is the identity
 Key = TypeVar("Key", int, str)
 _WHOLE = "check that the folder is whole"
 _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
@@ -189,7 +188,7 @@ def read_K(path: Path) -> tuple[float, float, float, float]:
 
 def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Float64) -> CameraTable | None:
     """The depth camera with its place in the colour camera; None where it is the colour camera."""
-    if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= SAME:
+    if depth == color and np.abs(T_color_depth - np.eye(4)).max() <= 1e-6:
         return None
     return replace(depth, depth_to_color=T_color_depth.tolist())
 

@@ -21,7 +21,6 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
 TRAJECTORY = "lowres_wide.traj"
-_CLOSE_NS = 5_000_000  # between an image's name and that of its lens, which are rounded apart
 
 
 def matches(folder: Path) -> bool:
@@ -90,7 +89,7 @@ def _lens(pincams: dict[int, Path], view: ListedView) -> CameraTable:
     assert view.stamp_ns is not None
     stamp_ns = view.stamp_ns
     near = min(pincams, key=lambda stamp: abs(stamp - stamp_ns), default=None)
-    if near is None or abs(near - stamp_ns) > _CLOSE_NS:
+    if near is None or abs(near - stamp_ns) > 5_000_000:  # the two names are rounded apart
         raise InputError(
             f"{view.color}: no .pincam of its stamp in lowres_wide_intrinsics",
             remedy="download lowres_wide_intrinsics",

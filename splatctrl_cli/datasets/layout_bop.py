@@ -22,9 +22,8 @@ from splatctrl_cli.datasets.layout import (
     read_json,
 )
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import MILLIMETRE, Float64
 
 FILE = "scene_camera.json"
 _REMEDY = "see BOP's format of datasets"

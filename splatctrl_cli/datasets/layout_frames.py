@@ -30,9 +30,8 @@ from splatctrl_cli.datasets.layout import (
 from splatctrl_cli.datasets.layout_scannet import find_info, read_info
 from splatctrl_cli.datasets.poses import rigid
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import MILLIMETRE, Float64
 
 DEPTH_LENS = (585.0, 585.0, 320.0, 240.0)
 COLOR_LENS = (525.0, 525.0, 320.0, 240.0)
@@ -47,7 +46,6 @@ T_COLOR_DEPTH = rigid(
     ),
     "7-Scenes",
 )
-NO_DEPTH = 65535
 _SEQUENCES = ("", "seq-*/", "data/", "sequence/")
 _NOTE = (
     "7-Scenes publishes no calibration of colour: depth (585, 585, 320, 240, whose poses these are) is registered to"
@@ -85,7 +83,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
         poses=PosesTable(format="matrix-files", file=f"{sequence}frame-*.pose.txt"),
         lens=lambda _: cameras.color,
         depth_camera=cameras.depth,
-        depth=DepthTable(scale=cameras.depth_scale, invalid=NO_DEPTH),
+        depth=DepthTable(scale=cameras.depth_scale, invalid=65535),
         notes=cameras.notes,
     )
 

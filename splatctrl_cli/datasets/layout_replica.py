@@ -24,8 +24,8 @@ from splatctrl_cli.datasets.layout import (
 )
 from splatctrl_cli.datasets.poses import read_matrix_lines
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.records import MILLIMETRE
 
 PARAMETERS = "cam_params.json"
 NICE_SLAM: Mapping[str, float] = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}

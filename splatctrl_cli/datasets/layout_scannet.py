@@ -28,12 +28,10 @@ from splatctrl_cli.datasets.layout import (
 from splatctrl_cli.datasets.poses import read_matrix_file, rigid
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.logs.messages import MILLIMETRE
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import Float64
+from splatctrl_cli.records import MILLIMETRE, Float64
 
 INFO_NAMES = ("_info.txt", "info.txt")
-_TOO_FAR = 0.25  # of the width, between the principal point and the middle of an image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +115,7 @@ def read_info(path: Path) -> SensCalibration:
 
 def _lens(K: Float64, image: Path, where: str) -> CameraTable:
     lens = pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), image)
-    if abs(2 * lens.cx - lens.width) > _TOO_FAR * lens.width:
+    if abs(2 * lens.cx - lens.width) > 0.25 * lens.width:
         raise InputError(
             f"{where}: cx {lens.cx:g} is not near the middle of {image.name}, {lens.width} columns wide",
             remedy="scale the intrinsics with the images, or give --intrinsics camera=FX,FY,CX,CY",

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import POSE_TOLERANCE_NS
+from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, quat_from_rotation, transform_from
 from splatctrl_cli.logs.tf_tree import TfTree
@@ -19,8 +21,6 @@ CONVENTIONS = ("camera_to_world", "world_to_camera")
 AXES = ("opencv", "opengl")
 OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 _MOST_NS = 1 << 62
-MAX_ENTRY = 1e6  # [m] of a pose
-POSE_TOLERANCE_NS = 20_000_000  # before the first and after the last pose of a trajectory
 _MSVC_NAN = re.compile(r"[+-]?1\.#(INF|IND|QNAN|SNAN)\d*")  # how Windows writes NaN and infinity (12-Scenes)
 MAX_SKEW = 1e-3  # largest entry of R^T R - I that is rounding of a text file
 _CORRECT = "correct the file, or [poses] where a .toml names it"
@@ -42,7 +42,7 @@ def rigid(matrix: Float64, where: str) -> Float64:
 
     Raises InputError where it is none: scale, shear, mirror, NaN.
     """
-    is_finite = matrix.shape == (4, 4) and bool((np.abs(matrix) < MAX_ENTRY).all())
+    is_finite = matrix.shape == (4, 4) and bool((np.abs(matrix) < MAX_PLACE).all())
     if not is_finite or np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max() > MAX_SKEW:
         raise InputError(
             f"{where}: expected a rigid transform (4x4), got one with scale, shear or NaN",
@@ -88,7 +88,7 @@ def read_tum(path: Path) -> dict[str, Float64]:
     """``stamp tx ty tz qx qy qz qw`` lines, by stamp [s] as written."""
     poses: dict[str, Float64] = {}
     for where, words, values in read_rows(path):
-        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_ENTRY).all())
+        is_pose = len(values) == 8 and bool((np.abs(values[1:]) < MAX_PLACE).all())
         if not is_pose or not any(values[4:]):
             raise InputError(
                 f"{where}: expected 'stamp tx ty tz qx qy qz qw', got {' '.join(words)!r}",

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import CLEARANCE_NEAR, MAP_ALLOWANCE
 from splatctrl_cli.evaluate.views import seen_by
+from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Bool, Float64, FloatRows, RgbdFrame
-
-NEAR = 0.10  # [m] true clearance below which a state takes part in the comparison
-BLOCK = 4096  # states at once
-ALLOWANCE = 0.01  # [m] the clearance may be off by this and the median splat radius
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +30,8 @@ def clearance_agreement(
     clearance: Float64, truth: Float64, is_seen: Bool, median_radius: float
 ) -> ClearanceAgreement:
     """Clearance (T,) against the truth (T,) [m], over states nearer than 10 cm to a surface that was seen (T,)."""
-    tolerance = ALLOWANCE + median_radius
-    compared = (truth < NEAR) & is_seen & np.isfinite(clearance)
+    tolerance = MAP_ALLOWANCE + median_radius
+    compared = (truth < CLEARANCE_NEAR) & is_seen & np.isfinite(clearance)
     error = clearance[compared] - truth[compared]
     if not len(error):
         return ClearanceAgreement(

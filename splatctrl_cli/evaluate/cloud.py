@@ -8,18 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_GOOD_OVERLAP, CLOUD_NO_OVERLAP
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Bool, Float64
 
-MAX_DISTANCE = 0.020  # [m] of DTU's evaluation: what is farther off counts in a share, not in a mean
-SPACING = 0.0002  # [m] of DTU's evaluation
 MAX_POINTS = 2_000_000  # on a mesh
 MAX_SPACED = 6_000_000
 NO_PAIRS = np.empty((0, 2), np.int64)
 OTHER_UNITS = (1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
 ENOUGH = 20_000  # points to find a cloud's box from
-NO_OVERLAP, GOOD_OVERLAP = 0.001, 0.05  # shares of two boxes' volume
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +47,7 @@ def cloud_score(
     reference: Float64,
     seen: Bool,
     *,
-    max_distance: float = MAX_DISTANCE,
+    max_distance: float = CLOUD_DISTANCE,
     counts: Bool | None = None,
     unit: float = 1.0,
     threads: int = 1,
@@ -96,7 +94,7 @@ def _check_unit(points: Float64, reference: Float64, margin: float, unit: float)
     some, others = (p[:: max(1, len(p) // ENOUGH)] for p in (points, reference))
     fits = {factor: _overlap(some, factor * others, margin) for factor in (1.0, *OTHER_UNITS)}
     best = max(fits, key=lambda factor: fits[factor])
-    if fits[1.0] < NO_OVERLAP and fits[best] > GOOD_OVERLAP:
+    if fits[1.0] < CLOUD_NO_OVERLAP and fits[best] > CLOUD_GOOD_OVERLAP:
         raise NotEvaluableError(
             f"the reference cloud: expected the size of the scene's surface, which spans {_box(points)} m, got"
             f" {_box(reference)} m; {best:g} times as large it overlaps by {100 * fits[best]:.0f}%",

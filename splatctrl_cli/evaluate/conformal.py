@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import FEWEST_STRETCHES
 from splatctrl_cli.records import Float64
 
 Index = NDArray[np.int64]
-FEWEST = 2  # stretches: a single one allows a confidence of one half
 ROUNDING = 1e-9  # of (n + 1) * confidence, which is a whole number where it should be
 
 
@@ -42,14 +42,14 @@ class ConformalBound:
 
 def conformal_bound(misses: Float64, confidence: float) -> ConformalBound | None:
     """The bound of misses (T,) [m] by time, one a frame set, NaN where a set has none; None where they make fewer
-    than FEWEST stretches. `confidence` is lowered to what their number allows.
+    than FEWEST_STRETCHES stretches. `confidence` is lowered to what their number allows.
     """
     if not np.isfinite(misses).any():
         return None
     length = autocorrelation_time(misses)
     stretch = stretches(len(misses), length)
     scores, deciding = stretch_scores(misses, stretch)
-    if len(scores) < FEWEST:
+    if len(scores) < FEWEST_STRETCHES:
         return None
     allowed = min(confidence, len(scores) / (len(scores) + 1))
     chosen = int(np.argsort(scores, kind="stable")[conformal_rank(len(scores), allowed) - 1])

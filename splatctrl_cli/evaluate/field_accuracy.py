@@ -6,11 +6,9 @@ from dataclasses import asdict, dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import BANDS, MAP_ALLOWANCE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Bool, DistanceGrid, Float64
-
-BANDS: tuple[tuple[float, float], ...] = ((0.0, 0.02), (0.02, 0.05), (0.05, 0.10), (0.10, 0.20))  # [m], true distance
-ALLOWANCE = 0.01  # [m] beyond the median radius that the exact field may over-estimate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +109,7 @@ def field_accuracy(
     return FieldAccuracy(
         everywhere={name: _bands(error, truth, everyone) for name, error in errors.items()},
         seen={} if seen is None else {name: _bands(error, truth, seen) for name, error in errors.items()},
-        over_estimate=_over_estimate(errors["hard"][is_near & counted], ALLOWANCE + median_radius),
+        over_estimate=_over_estimate(errors["hard"][is_near & counted], MAP_ALLOWANCE + median_radius),
     )
 
 

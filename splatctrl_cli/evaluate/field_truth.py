@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import BANDS, PROBABILITY_NEAR
 from splatctrl_cli.errors import NotEvaluableError
-from splatctrl_cli.evaluate.field_accuracy import BANDS, FieldAccuracy, field_accuracy, grid_distances, median_radius
+from splatctrl_cli.evaluate.field_accuracy import FieldAccuracy, field_accuracy, grid_distances, median_radius
 from splatctrl_cli.evaluate.views import seen_by
 from splatctrl_cli.mesh_distance import MeshDistance, load_mesh
 from splatctrl_cli.records import Box, DistanceGrid, Float64, RgbdFrame
 from splatctrl_cli.report.reliability import Reliability, reliability
 
 FIELDS = ("hard", "sdf")  # the exact distance, and what a controller uses
-NEAR = 0.05  # [m] where a probability is neither 0 nor 1
 _CURVES = ("edges", "predicted", "observed")
 REACH = BANDS[-1][1]  # [m] of true distance that is compared
 
@@ -41,7 +41,7 @@ class TruthComparison:
     outside the objects and within 20 cm, num_seen of those with a nearest true surface point that a training camera
     saw inside the workspace; num_outside_workspace more were seen, but their surface lies where the scene keeps no
     splats. reliability: of each form of the probability, at seen cells within 20 cm of a surface, inside or out.
-    error_mean, error_sigma [m]: of sdf at seen cells within `NEAR` of a surface, None without any.
+    error_mean, error_sigma [m]: of sdf at seen cells within `PROBABILITY_NEAR` of a surface, None without any.
     """
 
     accuracy: FieldAccuracy
@@ -88,7 +88,7 @@ def compare_with_truth(
     if workspace is not None:
         in_workspace[is_around] = workspace.contains(cells.surface[is_around])
     is_counted = seen & in_workspace
-    error = (sdf - distance)[is_counted & (np.abs(distance) < NEAR)]
+    error = (sdf - distance)[is_counted & (np.abs(distance) < PROBABILITY_NEAR)]
     return TruthComparison(
         accuracy=field_accuracy(
             {name: cells.fields[name][is_near] for name in FIELDS},

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.evaluate.field_accuracy import (
-    BANDS,
     BandAccuracy,
     FieldAccuracy,
     GridDistance,
@@ -30,12 +30,7 @@ from splatctrl_cli.kernels.field import interpolate
 from splatctrl_cli.records import Bool, Box, DistanceGrid, Float64, RgbdFrame
 
 REFERENCE = "nearest measured depth point"
-REACH = BANDS[-1][1]  # [m] before the surface that points are put on a ray
-EDGE_STEP = 0.03  # of its depth: a pixel that differs more from a neighbour may lie between two surfaces
-FREE_TOLERANCE = 0.005  # [m] behind the measured depth that still counts as seen free: the noise of a depth camera
-PROBES = (0.3, 0.6, 0.9)  # of the ball's radius; an object thinner than the gaps between them may be missed
-NUM_DIRECTIONS = 96  # of each
-ROBOT_MARGIN = 0.03  # [m] about the robot's spheres in which a measured point may be the robot itself
+REACH = fixed.BANDS[-1][1]  # [m] before the surface that points are put on a ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +122,7 @@ def counted_pixels(frame: RgbdFrame, workspace: Box | None, spheres: tuple[Float
     points = transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth)[is_deep])
     is_wanted = np.ones(len(points), np.bool_) if workspace is None else workspace.contains(points)
     for center, radius in () if spheres is None else zip(*spheres, strict=True):
-        is_wanted &= np.square(points - center).sum(axis=1) > (radius + ROBOT_MARGIN) ** 2
+        is_wanted &= np.square(points - center).sum(axis=1) > (radius + fixed.ROBOT_MARGIN) ** 2
     counted = np.ones(frame.depth.shape, np.bool_)
     counted[is_deep] = is_wanted
     return counted
@@ -160,7 +155,7 @@ def depth_edges(depth: NDArray[np.float32]) -> Bool:
         here, there = [slice(None)] * 2, [slice(None)] * 2
         here[axis], there[axis] = slice(None, -1), slice(1, None)
         a, b = depth[tuple(here)], depth[tuple(there)]
-        steps = (a > 0) & (b > 0) & (np.abs(a - b) > EDGE_STEP * np.minimum(a, b))
+        steps = (a > 0) & (b > 0) & (np.abs(a - b) > fixed.HELD_OUT_EDGE * np.minimum(a, b))
         is_edge[tuple(here)] |= steps
         is_edge[tuple(there)] |= steps
     return is_edge
@@ -177,12 +172,12 @@ def _interpolated(grid: DistanceGrid, distances: dict[str, GridDistance], points
 
 def _ball_is_free(points: Float64, radius: Float64, frames: Sequence[RgbdFrame]) -> Bool:
     """(Q,) True where every probe in the ball about a point was seen to be free."""
-    index = np.arange(NUM_DIRECTIONS)
-    height, turn = 1 - (2 * index + 1) / NUM_DIRECTIONS, index * np.pi * (3 - np.sqrt(5))  # Fibonacci's spiral
+    index = np.arange(fixed.FREE_DIRECTIONS)
+    height, turn = 1 - (2 * index + 1) / fixed.FREE_DIRECTIONS, index * np.pi * (3 - np.sqrt(5))  # Fibonacci's spiral
     flat = np.sqrt(1 - height**2)
     directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
     is_free = np.ones(len(points), dtype=np.bool_)
-    for share in PROBES:
+    for share in fixed.FREE_PROBES:
         for direction in directions:
             asked = np.flatnonzero(is_free)
             is_free[asked] = _seen_free(points[asked] + share * radius[asked, None] * direction, frames)
@@ -202,5 +197,5 @@ def _seen_free(points_world: Float64, frames: Sequence[RgbdFrame]) -> Bool:
         inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
         u, v = pixels[inside].astype(np.int64).T
         depth = frame.depth[v, u]
-        is_free[asked[inside]] = (depth > 0) & (points_camera[inside, 2] <= depth + FREE_TOLERANCE)
+        is_free[asked[inside]] = (depth > 0) & (points_camera[inside, 2] <= depth + fixed.FREE_TOLERANCE)
     return is_free

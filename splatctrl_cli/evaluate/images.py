@@ -8,14 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, uniform_filter
 
+from splatctrl_cli.config.fixed import SSIM_BOX, SSIM_BOX_RANGE, SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from splatctrl_cli.records import Bool, Float64
-
-SSIM_WINDOW = 11  # pixels
-SSIM_SIGMA = 1.5  # pixels
-BOX = 7  # pixels: the window of scikit-image's default
-BOX_RANGE = 2.0  # what it takes for images of floats, [-1, 1], when no range is given
-SSIM_C1 = 0.01**2
-SSIM_C2 = 0.03**2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,19 +84,19 @@ def published_ssim(image: NDArray[np.floating], reference: NDArray[np.floating],
     That range lifts the figure: compare it only with figures of the same kind. nan for images below 7 pixels and for
     an empty mask.
     """
-    if min(mask.shape) < BOX or not mask.any():
+    if min(mask.shape) < SSIM_BOX or not mask.any():
         return math.nan
     x, y = (filled(picture, mask, fill) for picture in (image, reference))
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = (
-        uniform_filter(picture, size=(BOX, BOX, 1)) for picture in (x, y, x * x, y * y, x * y)
+        uniform_filter(picture, size=(SSIM_BOX, SSIM_BOX, 1)) for picture in (x, y, x * x, y * y, x * y)
     )
-    sample = BOX**2 / (BOX**2 - 1)
+    sample = SSIM_BOX**2 / (SSIM_BOX**2 - 1)
     variance_x, variance_y = sample * (mean_xx - mean_x**2), sample * (mean_yy - mean_y**2)
     covariance = sample * (mean_xy - mean_x * mean_y)
-    c1, c2 = (0.01 * BOX_RANGE) ** 2, (0.03 * BOX_RANGE) ** 2
+    c1, c2 = (0.01 * SSIM_BOX_RANGE) ** 2, (0.03 * SSIM_BOX_RANGE) ** 2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     similarity /= (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
-    border = BOX // 2
+    border = SSIM_BOX // 2
     return float(similarity[border:-border, border:-border].mean())
 
 

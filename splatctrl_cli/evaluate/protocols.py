@@ -19,11 +19,9 @@ import numpy as np
 from scipy.io import loadmat
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.records import Bool, Float64
+from splatctrl_cli.records import MILLIMETRES, Bool, Float64
 
-MILLIMETRES = 1000.0
 MaskRule = Literal["given", "object", "depth"]
-EVERY = 8
 REGNERF_INPUTS = (25, 22, 28, 40, 44, 48, 0, 8, 13)  # the first 3, 6 or 9 train
 REGNERF_EXCLUDED = (3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 36, 37, 38, 39)
 REGNERF_SCANS = (8, 21, 30, 31, 34, 38, 40, 41, 45, 55, 63, 82, 103, 110, 114)
@@ -31,7 +29,6 @@ MVSNERF_TRAINING = (25, 21, 33, 22, 14, 15, 26, 30, 31, 35, 34, 43, 46, 29, 16, 
 MVSNERF_SCORED = (32, 24, 23, 44)
 MVSNERF_SCANS = (1, 8, 21, 103, 114)
 SURFACE_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)  # those IDR has masks for
-DTU_VIEWS = 49
 RULES = "expected holdout:everyN, holdout:everyN+FIRST or holdout:2,5"
 MARGIN = 10  # [mm] of the masks that are used, the number in their names
 BEFORE, BEYOND = 0.060, 0.120  # [m] outside the box within which points are kept (eval.py: patch_size, twice that)
@@ -122,7 +119,7 @@ def _regnerf(num_training: int) -> ScoreProtocol:
         size=(400, 300),
         scans=REGNERF_SCANS,
         training=REGNERF_INPUTS[:num_training],
-        scored=tuple(n for n in range(DTU_VIEWS) if n not in unused),
+        scored=tuple(n for n in range(49) if n not in unused),
         source="google-research/google-research, regnerf/internal/datasets.py, regnerf/eval.py",
     )
 
@@ -136,7 +133,7 @@ _FIXED = (
     ),
     ScoreProtocol(  # ``llffhold = 8``
         name="dtu-holdout8",
-        every=EVERY,
+        every=8,
         is_zero_padded=True,
         source="every 8th view from view 0 on (graphdeco-inria/gaussian-splatting, scene/dataset_readers.py)",
     ),

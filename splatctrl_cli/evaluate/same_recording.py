@@ -9,14 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import SAME_LENS_PIXELS, SAME_PICTURE_LEVELS, SAME_POSE_DEGREES, SAME_POSE_METRES
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Record, RgbdFrame, UInt8
 
 TILES = (6, 8)  # rows and columns of the picture that is kept of a first frame
-MAX_PIXELS = 0.5  # [px] by which focal lengths and principal points may differ
-MAX_METRES = 0.002
-MAX_DEGREES = 0.2
-MAX_LEVELS = 3.0  # of 255, of a tile: another JPEG of the same picture differs by less than one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +88,7 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
     if then[4:].tolist() != now[4:].tolist():
         return [f"{camera}: images of {now[4]:g}x{now[5]:g}, not {then[4]:g}x{then[5]:g}"]
     gap = float(np.abs(then[:4] - now[:4]).max())
-    if gap > MAX_PIXELS:
+    if gap > SAME_LENS_PIXELS:
         lines.append(f"{camera}: intrinsics differ by {gap:.1f} px")
     apart = (frame.stamp_ns - int(first["stamp_ns"])) * 1e-9
     if apart:
@@ -101,10 +98,10 @@ def _differences(first: Mapping[str, Any], frame: RgbdFrame) -> list[str]:
     between = invert_transform(then_pose) @ frame.T_world_camera
     metres = float(np.linalg.norm(between[:3, 3]))
     degrees = float(np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))))
-    if metres > MAX_METRES or degrees > MAX_DEGREES:
+    if metres > SAME_POSE_METRES or degrees > SAME_POSE_DEGREES:
         lines.append(f"{camera}: the pose differs by {1e3 * metres:.0f} mm and {degrees:.1f} degrees")
     levels = float(np.abs(np.array(first["tiles"]) - np.array(_tiles(frame.color))).max())
-    if levels > MAX_LEVELS:
+    if levels > SAME_PICTURE_LEVELS:
         lines.append(f"{camera}: the picture differs by up to {levels:.0f} of 255 levels")
     return lines
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import IN_FRONT
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, filled, psnr, published_ssim, ssim_map
 from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, SplatSet
@@ -16,7 +17,6 @@ from splatctrl_cli.voxels import OccupancyGrid
 Perceptual = Callable[[Float64, Float64], float]
 """Render and photo (H, W, 3) in [0, 1] -> LPIPS."""
 
-IN_FRONT = 0.03  # [m] by which a rendered depth stands before the measured one: more than sensor noise and radius
 PROTOCOL = {
     "average": "mean over views of each view's own figure; a view without a pixel of the region is left out",
     "all": "every pixel of the view that its lens saw",

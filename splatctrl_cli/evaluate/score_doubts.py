@@ -7,14 +7,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import OTHER_VIEW_CLEARLY, SAME_PLACE_DEGREES, SAME_PLACE_METRES
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.views import View
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Bool, Float64
 
-SAME_METRES, SAME_DEGREES = 0.001, 0.1  # within which two cameras stand in one place
 THUMBNAIL = (16, 12)  # pixels
-CLEARLY = 3.0  # [dB] by which a photo has to be nearer another view's render than its own
 
 
 @dataclass(kw_only=True)
@@ -92,7 +91,7 @@ def _twin(view: View) -> list[str]:
         between = T_camera_world @ other.T_world_camera
         metres = float(np.linalg.norm(between[:3, 3]))
         degrees = float(np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))))
-        if metres <= SAME_METRES and degrees <= SAME_DEGREES:
+        if metres <= SAME_PLACE_METRES and degrees <= SAME_PLACE_DEGREES:
             return [f"{view.name} stands {1e3 * metres:.1f} mm and {degrees:.2f} degrees from a training view"]
     return []
 
@@ -115,5 +114,5 @@ def _strangers(names: Sequence[str], photos: Sequence[Float64], renders: Sequenc
         f"{name}'s photo is nearer the render of {names[j]} ({decibels[i, j]:.1f} dB at {size}) than its own"
         f" ({own[i]:.1f} dB)"
         for i, (name, j) in enumerate(zip(names, best, strict=True))
-        if decibels[i, j] > own[i] + CLEARLY
+        if decibels[i, j] > own[i] + OTHER_VIEW_CLEARLY
     ]

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
 from splatctrl_cli.records import Bool, Float64, RecordSource, RgbdFrame
 
-MIN_Z = 1e-6  # [m] in front of the camera
-
 
 @dataclass(frozen=True, kw_only=True)
 class View:
@@ -116,7 +114,7 @@ def seen_pixels(frame: RgbdFrame, others: Sequence[RgbdFrame], tolerance: float 
 
 def _agrees(points_world: NDArray[np.floating], frame: RgbdFrame, tolerance: float) -> Bool:
     points_camera = transform_points(invert_transform(frame.T_world_camera), points_world)
-    agrees = points_camera[:, 2] > MIN_Z
+    agrees = points_camera[:, 2] > 1e-6
     candidates = np.flatnonzero(agrees)
     pixels = np.floor(project(frame.intrinsics, points_camera[candidates]) + 0.5)
     height, width = frame.depth.shape

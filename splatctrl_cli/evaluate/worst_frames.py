@@ -12,7 +12,6 @@ from splatctrl_cli.errors import WriteError
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame, UInt8
 
 APART = 0.5  # [s] between the moments of two events, at least
-WIDTH = 960  # [px] of a picture, at least
 NEAR = 0.05  # [m] in front of a camera below which nothing is drawn
 HIDDEN = 0.03  # [m] by which a surface must stand before a sphere to hide it
 OUTLINE = np.linspace(0.0, 2.0 * np.pi, 49)
@@ -94,7 +93,7 @@ def sights_of(moments: Sequence[Moment], frames: Iterable[RgbdFrame]) -> list[Si
 def draw_sight(path: Path, sight: Sight) -> None:
     """Write the image with every sphere's outline, the worst one bold, a line to its obstacle, and the caption."""
     moment, frame = sight.moment, sight.frame
-    zoom = max(1, -(-WIDTH // frame.intrinsics.width))
+    zoom = max(1, -(-960 // frame.intrinsics.width))  # [px] of a picture, at least
     image = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
     picture = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     T_camera_world = np.linalg.inv(frame.T_world_camera)

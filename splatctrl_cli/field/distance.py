@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.config.fixed import MARCH_STEPS, SIGNED_CARE
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clustered_splats import Spheres, checked_points, not_finite, shaped_points
 from splatctrl_cli.field.kernel import Matern12, SquaredExponential
@@ -19,9 +20,6 @@ from splatctrl_cli.field.weights import weights_named
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan
 from splatctrl_cli.records import DistanceField, Float32, Float64
-
-MARCH_STEPS = 5  # III-D: 3 to 5
-SIGNED_CARE = 1e-3  # of the truncation where weights have signs: what is left of a cancelling sum needs more of it
 
 
 class SphereField:

@@ -8,15 +8,11 @@ from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from splatctrl_cli.config.fixed import CG_FLOOR, CG_ITERATIONS, CG_MAX_SPREAD, CG_TOLERANCE, KERNEL_REACH
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field.grid_cells import available_memory
-from splatctrl_cli.field.kernel import REACH
 from splatctrl_cli.records import Float64
 
-MAX_ITERATIONS = 5000
-TOLERANCE = 1e-6  # largest residual of a row, of the smallest value asked for
-FLOOR = 1e-13  # of the largest value asked for: what float64 can do
-MAX_SPREAD = 16.0  # of a group's log values: beyond, the smaller drown in the rounding of the larger
 BYTES_PER_PAIR = 44  # of the matrix and of the pairs that it is made of; 40 were measured
 
 KernelValue = Callable[[Float64], Float64]
@@ -50,13 +46,13 @@ def solve_process(
     np.maximum.at(largest, group, log_values)
     np.minimum.at(smallest, group, log_values)
     spread = float((largest - smallest).max())
-    if spread > MAX_SPREAD:
+    if spread > CG_MAX_SPREAD:
         raise UsageError(
-            f"field.weights = cg: expected radii that differ by at most {MAX_SPREAD:g} length scales between splats "
-            f"within {REACH} of each other, got {spread:.1f}",
+            f"field.weights = cg: expected radii that differ by at most {CG_MAX_SPREAD:g} length scales between "
+            f"splats within {KERNEL_REACH} of each other, got {spread:.1f}",
             remedy="set a larger field.length_scale, or field.weights = rowsum",
         )
-    tolerance = max(TOLERANCE * float(np.exp(-spread)), FLOOR)
+    tolerance = max(CG_TOLERANCE * float(np.exp(-spread)), CG_FLOOR)
     scaled, num_iterations, residual = conjugate_gradients(matrix, np.exp(log_values - largest[group]), tolerance)
     return Solution(scaled=scaled, log_scale=largest[group], num_iterations=num_iterations, residual=residual)
 
@@ -65,12 +61,12 @@ def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) 
     """x (N,) with ``max |A x - y| <= tolerance``, the iterations, and that largest residual.
 
     A of unit diagonal needs no preconditioner. Raises NotEvaluableError where A shows a direction of no curvature,
-    or the residual stays above the tolerance for `MAX_ITERATIONS`.
+    or the residual stays above the tolerance for `CG_ITERATIONS`.
     """
     x = np.zeros(len(values))
     rest = values.copy()
     direction, squared = rest.copy(), float(rest @ rest)
-    for iteration in range(MAX_ITERATIONS):
+    for iteration in range(CG_ITERATIONS):
         if float(np.abs(rest).max()) <= tolerance:
             rest = values - matrix @ x  # the recurrence drifts from the true residual
             residual = float(np.abs(rest).max())
@@ -87,7 +83,7 @@ def conjugate_gradients(matrix: "csr_array", values: Float64, tolerance: float) 
         before, squared = squared, float(rest @ rest)
         direction = rest + squared / before * direction
     residual = float(np.abs(values - matrix @ x).max())
-    raise _not_solved(f"expected a residual of {tolerance:.1e} after {MAX_ITERATIONS} iterations, got {residual:.1e}")
+    raise _not_solved(f"expected a residual of {tolerance:.1e} after {CG_ITERATIONS} iterations, got {residual:.1e}")
 
 
 def _not_solved(what: str) -> NotEvaluableError:
@@ -100,15 +96,15 @@ def _not_solved(what: str) -> NotEvaluableError:
 def _kernel_matrix(centers: Float64, length: float, kernel: KernelValue, noise: float) -> "csr_array":
     """``K + noise I`` (N, N), zero between centres further than 8 l apart."""
     tree = cKDTree(centers)
-    num_pairs = int(tree.count_neighbors(tree, REACH * length))
+    num_pairs = int(tree.count_neighbors(tree, KERNEL_REACH * length))
     needed, free = BYTES_PER_PAIR * num_pairs, available_memory()
     if needed > free:
         raise UsageError(
-            f"field.weights = cg: {num_pairs} pairs of splats within {REACH} length scales need "
+            f"field.weights = cg: {num_pairs} pairs of splats within {KERNEL_REACH} length scales need "
             f"{needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB is free",
             remedy="set a smaller field.length_scale, or field.weights = rowsum",
         )
-    pairs = tree.query_pairs(REACH * length, output_type="ndarray").astype(np.int32)
+    pairs = tree.query_pairs(KERNEL_REACH * length, output_type="ndarray").astype(np.int32)
     distance = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
     upper = csr_array((kernel(distance), (pairs[:, 0], pairs[:, 1])), shape=(len(centers), len(centers)))
     return csr_array(upper + upper.T + (1.0 + noise) * eye_array(len(centers), format="csr"))

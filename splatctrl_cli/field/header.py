@@ -9,7 +9,6 @@ from splatctrl_cli.field.health import field_health
 from splatctrl_cli.field.obstacles import label_counts
 from splatctrl_cli.records import Label, SplatSet
 
-FORMAT_VERSION = 2
 MEANING = {
     "safe": "min(se, hard)",
     "safe_gpdf": "min(gpdf, hard)",
@@ -40,7 +39,7 @@ def field_header(
     }
     header: dict[str, object] = {
         "format": "splatctrl distance grid",
-        "version": FORMAT_VERSION,
+        "version": 2,
         "sign": "positive outside",
         "frame": "world",
         "units": "m",

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-ROUGH_LENGTH = 10.0  # [m] from which on float32 costs the Gaussian kernel's distance 0.2 mm; at 100 m 5 cm
-MAX_SPREAD = 30.0  # of the radii: the largest over the smallest above zero
+from splatctrl_cli.config.fixed import MAX_RADIUS_SPREAD, ROUGH_LENGTH
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +85,7 @@ def _set_warnings(
     if has_kernel and length >= ROUGH_LENGTH:
         yield f"the length scale {length:g} m is so large that rounding shows in the kernel fields"
     thick = radii[radii > 0]
-    if len(thick) and thick.max() > MAX_SPREAD * thick.min():
+    if len(thick) and thick.max() > MAX_RADIUS_SPREAD * thick.min():
         yield (
             f"radii from {thick.min() * 1e3:.3g} to {thick.max() * 1e3:.3g} mm in one set: "
             "the median radius and its ratios stand for neither end"

@@ -5,12 +5,10 @@ from typing import Protocol
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import KERNEL_MAX_SHARE
 from splatctrl_cli.field.clusters import ClusteredPoints
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.records import Float64
-
-REACH = 8  # l, beyond which a kernel counts as zero: 0.3 % of the sum on a plane
-MAX_SHARE = 1e-2  # of a kernel sum that is ever left out
 
 
 class Kernel(Protocol):
@@ -44,7 +42,7 @@ class Matern12:
 
     def share(self, tolerance: float) -> float:
         """The share of the sum whose loss raises the distance by t [m], ``1 - exp(-t / l)``; 0.01 at most."""
-        return min(-float(np.expm1(-tolerance / self.length)), MAX_SHARE)
+        return min(-float(np.expm1(-tolerance / self.length)), KERNEL_MAX_SHARE)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.config.fixed import CERTAIN_OCCUPANCY, LEAST_VARIANCE, VARIANCE_DIVISOR
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.field.clustered_splats import Spheres, checked_points
 from splatctrl_cli.field.distance import GpdfField
@@ -15,10 +16,6 @@ from splatctrl_cli.field.kernel import Matern12
 from splatctrl_cli.kernels import field as native
 from splatctrl_cli.kernels.field import GridSpan
 from splatctrl_cli.records import Float32, Float64
-
-VARIANCE_DIVISOR = 9.0  # III-D
-LEAST_VARIANCE = 1e-6  # before the division: what float32 leaves of 1 - sum
-CERTAIN = 50.0  # log occupancy beyond which every probability is 1
 
 
 class CollisionProbability(Protocol):
@@ -127,7 +124,7 @@ class PaperProbability:
 
     def _combined(self, gpdf: Float64, half: Float64) -> Float64:
         explained = np.exp(np.minimum(-half / self._half.length, 0.0))  # the sum never exceeds 1 but by rounding
-        occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, CERTAIN))
+        occupancy = np.exp(np.minimum(-gpdf / self._gpdf.kernel.length, CERTAIN_OCCUPANCY))
         return probability_of_occupancy(occupancy, explained)
 
 

@@ -6,16 +6,15 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import NEAR_ONE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.field.grid_cells import RESOLUTION
 from splatctrl_cli.field.grid_field import exact_channel
 from splatctrl_cli.records import DistanceGrid, Float32
 from splatctrl_cli.voxels import VoxelState
 
-CHUNK_CELLS = 1 << 20  # that are looked at together
 BIN = 0.05  # of the histogram of the gradient's length: bin k is about k times this
 NUM_BINS = 41  # about 0 to 2; the last one holds what is longer, too
-NEAR_ONE = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +167,7 @@ def _floats(part: DistanceGrid, channel: str) -> Float32:
 
 def _parts(grid: DistanceGrid) -> Iterator[DistanceGrid]:
     num_planes, *rest = grid.channels["sdf"].shape
-    step = max(1, CHUNK_CELLS // int(np.prod(rest)))
+    step = max(1, (1 << 20) // int(np.prod(rest)))
     for first in range(0, num_planes, step):
         channels = {name: values[first : first + step] for name, values in grid.channels.items()}
         yield DistanceGrid(origin=grid.origin, voxel=grid.voxel, channels=channels, header=grid.header)

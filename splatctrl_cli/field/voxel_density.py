@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfftn, rfftn
 
+from splatctrl_cli.config.fixed import KERNEL_REACH, VOXELS_PER_LENGTH
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.field.kernel import REACH
 from splatctrl_cli.records import Float64
 
-VOXELS_PER_LENGTH = 2  # h = l / 2
 NODES = 96  # of a block along each axis: a size that transforms fast, 7 MiB
 MAX_BLOCKS = 2000
 
@@ -30,7 +29,7 @@ def voxel_row_sums(centers: Float64, length: float, kernel: KernelValue) -> Floa
     The grid is made in blocks of `NODES`, those alone in which two centres can meet. Raises UsageError for more than
     `MAX_BLOCKS` of them.
     """
-    voxel, reach = length / VOXELS_PER_LENGTH, REACH * VOXELS_PER_LENGTH
+    voxel, reach = length / VOXELS_PER_LENGTH, KERNEL_REACH * VOXELS_PER_LENGTH
     nodes = (centers - centers.min(axis=0)) / voxel
     cells = np.floor(nodes).astype(np.int64)
     share = nodes - cells

@@ -15,11 +15,12 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.files.unpacking import PIECE
+
 DAMAGE = (  # what reading a damaged or foreign .npz raises; an OSError where a place in it lies before its start
     *(zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError),
     *(SyntaxError, tokenize.TokenError, OverflowError),
 )
-_PIECE = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +106,7 @@ def _array(member: IO[bytes], name: str, file_size: int, most: int) -> NDArray[n
         raise ValueError(f"{name}: announces {size} bytes, holds {file_size - member.tell()}")
     content = bytearray(size)
     view, at = memoryview(content), 0
-    while at < size and (piece := member.read(min(size - at, _PIECE))):
+    while at < size and (piece := member.read(min(size - at, PIECE))):
         view[at : at + len(piece)] = piece
         at += len(piece)
     if at < size or member.read(1):  # reading to the end is what checks the sum

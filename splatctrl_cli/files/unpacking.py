@@ -5,6 +5,7 @@ import bz2
 import lz4.frame
 import zstandard
 
+PIECE = 1 << 20  # bytes that are read at a time
 MAX_BLOCK = 128 << 20  # bytes; of one chunk or record, as stored and as unpacked
 FREE_BYTES = 256 << 20  # that the blocks of any file may unpack to, and beside it:
 MOST_RATIO = 1000  # times the file's size; colour and depth as recorded compress 2 to 20 times

@@ -24,7 +24,6 @@ from splatctrl_cli.records import DistanceGrid
 
 PREFIX = "splatctrl."
 _TYPES = {"<f4": "float", "|u1": "uint8"}
-_HEAD_LIMIT = 1 << 20  # bytes in which the header must end
 
 
 def write_nrrd(path: Path, grid: DistanceGrid, channel: str) -> None:
@@ -66,7 +65,7 @@ def read_nrrd_head(path: Path) -> tuple[dict[str, str], dict[str, str]]:
     Raises InputError for a file of another kind, or whose header does not end.
     """
     with path.open("rb") as stream:
-        text = stream.read(_HEAD_LIMIT)
+        text = stream.read(1 << 20)  # bytes in which the header must end
     head, end, _ = text.partition(b"\n\n")
     lines = head.decode("utf-8", errors="replace").replace("\r\n", "\n").split("\n")
     if not lines[0].startswith("NRRD000") or not end:

@@ -38,7 +38,6 @@ _TYPES = {"<f4": "Float32", "|u1": "UInt8"}
 _DTYPES = {name: dtype for dtype, name in _TYPES.items()}
 _FILE = {"type": "ImageData", "version": "1.0", "byte_order": "LittleEndian", "header_type": "UInt64"}
 _APPENDED = b'<AppendedData encoding="raw">'
-_HEAD_LIMIT = 1 << 22  # bytes in which the XML must end
 _REMEDY = "give a .vti that sdf-bake wrote, or bake it again"
 
 
@@ -117,7 +116,7 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _head(path: Path, stream: BinaryIO) -> tuple[GridHead, list[_Block]]:
-    text = stream.read(_HEAD_LIMIT)
+    text = stream.read(1 << 22)  # bytes in which the XML must end
     mark = text.find(_APPENDED)
     begin = text.find(b"_", mark) + 1
     if mark < 0 or begin == 0:

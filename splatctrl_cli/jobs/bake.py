@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import FAR_GRID
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_truth import FIELDS
@@ -44,7 +45,6 @@ SUMMARY_METRICS = (
     *("never_seen_share", "over_estimating_share", "num_warnings"),
 )
 EXACT = frozenset({"bound", "hard"})
-FAR = 1.0  # [m] a grid whose every cell is farther from the splats than this is warned about
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +265,7 @@ class FieldReport:
         """Those on the splats' health, and on a box that no splat is near."""
         health, lowest = self.grid.header["health"], self.statistics.lowest
         assert isinstance(health, dict)
-        if lowest is None or lowest <= FAR:
+        if lowest is None or lowest <= FAR_GRID:
             return tuple(health["warnings"])
         far = f"the box holds no splat: the nearest is {lowest:.3g} m from every cell; check --box"
         return (*health["warnings"], far)

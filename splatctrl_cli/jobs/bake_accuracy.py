@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import COMPARED_CELLS
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.field_accuracy import median_radius
 from splatctrl_cli.evaluate.field_truth import (
@@ -27,7 +28,6 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import load_truth
 from splatctrl_cli.sources.source import open_source
 
-MAX_CELLS = 200_000  # a larger grid is compared at this many cells, drawn with the seed
 POINTS_PER_CHUNK = 50_000  # of the truth's (points x primitives) arrays
 
 
@@ -70,7 +70,8 @@ def _beside_truth(grid: DistanceGrid, spheres: Spheres, source: BakeSource, requ
     stamp_ns = int(truth.stamps[-1]) if source.stamp_ns is None else source.stamp_ns
     shape = grid.channels["sdf"].shape
     num_cells = int(np.prod(shape))
-    drawn = np.sort(np.random.default_rng(request.seed).choice(num_cells, min(num_cells, MAX_CELLS), replace=False))
+    count = min(num_cells, COMPARED_CELLS)
+    drawn = np.sort(np.random.default_rng(request.seed).choice(num_cells, count, replace=False))
     points = grid.origin + grid.voxel * np.stack(np.unravel_index(drawn, shape), axis=1)
     chunks = np.array_split(points, -(-len(points) // POINTS_PER_CHUNK))
     distances, surfaces = zip(*(truth.closest(chunk, stamp_ns) for chunk in chunks), strict=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_source import check_source
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, error, note
+from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.geometry import transform_from
@@ -16,7 +17,6 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 from splatctrl_cli.sources.source import open_logs
 
-RANGE = (0.2, 6.0)  # [m] of depth that is compared between views
 NEVER = "never"
 
 
@@ -78,7 +78,7 @@ def _robot(request: CheckRequest) -> RobotModel | None:
 def _agreement(report: CheckReport) -> Iterator[Finding]:
     """Whether views agree on where the surfaces are that both see."""
     good: list[float] = []
-    for pair in agreements(list(report.frames), *RANGE):
+    for pair in agreements(list(report.frames), *VIEWS_RANGE):
         both = list(dict.fromkeys(pair.cameras))
         if pair.holds:
             good.append(pair.median)

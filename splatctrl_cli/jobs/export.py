@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import EXPORT_DIFFERENCE, EXPORT_MAX_COLOR, EXPORT_MIN_PSNR, EXPORT_VIEWS
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError, WriteError
 from splatctrl_cli.files.output import output_path, sha256
 from splatctrl_cli.geometry import look_at
@@ -21,10 +22,6 @@ from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, Spla
 from splatctrl_cli.splat_files.splats import as_gaussians, as_splats, nearest_splats, read_ply, write_ply
 
 LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
-MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measured: 107 and more, or the same
-MAX_PIXEL_DIFFERENCE = 3 / 255  # there; the last bit can take a splat across the renderer's cut-off of 1/255
-MAX_COLOR = 1e4  # of a sensor's 0 to 1, or of a harmonic; from 1e6 on an isotropic PLY looks otherwise
-NUM_VIEWS = 4  # around the scene
 IMAGE_SIZE = (320, 240)
 
 Splats = SplatSet | GaussianSet
@@ -67,7 +64,7 @@ class ExportResult:
     num_outside: int
     differences: Differences
     allowed: Differences
-    num_views_compared: int = NUM_VIEWS
+    num_views_compared: int = EXPORT_VIEWS
     largest_pixel_difference: float
     psnr: float | None
     covered_share: float
@@ -162,7 +159,7 @@ def _check_colors(source: Path, splats: Splats) -> None:
     """Raise InputError naming the first splat whose colour no picture has: beside it float32 loses the others."""
     colors = splats.colors if isinstance(splats, SplatSet) else splats.harmonics.reshape(len(splats), -1)
     largest = np.abs(colors).max(axis=1, initial=0.0)
-    refuse(str(source), "colour", largest, largest > MAX_COLOR, f"at most {MAX_COLOR:g}")
+    refuse(str(source), "colour", largest, largest > EXPORT_MAX_COLOR, f"at most {EXPORT_MAX_COLOR:g}")
 
 
 def _written(partial: Path, kind: SplatFormat, splats: Splats, comments: Mapping[str, str]) -> Splats:
@@ -191,11 +188,11 @@ def _checked_differences(out: Path, held: GaussianSet, back: GaussianSet, bound:
 
 def _checked_look(out: Path, kind: SplatFormat, source: Splats, back: Splats) -> _Look:
     look = _look(source, back)
-    looks_the_same = look.psnr is None or look.psnr >= MIN_PSNR
-    if not kind.is_rounded and not (looks_the_same and look.largest <= MAX_PIXEL_DIFFERENCE):
+    looks_the_same = look.psnr is None or look.psnr >= EXPORT_MIN_PSNR
+    if not kind.is_rounded and not (looks_the_same and look.largest <= EXPORT_DIFFERENCE):
         raise WriteError(
             f"{out}: does not render as its source: PSNR {look.psnr} dB, largest pixel difference "
-            f"{look.largest:.3g}, expected at least {MIN_PSNR:g} dB and at most {MAX_PIXEL_DIFFERENCE:.3g}"
+            f"{look.largest:.3g}, expected at least {EXPORT_MIN_PSNR:g} dB and at most {EXPORT_DIFFERENCE:.3g}"
         )
     return look
 
@@ -243,6 +240,6 @@ def _views(centers: Float32) -> tuple[Intrinsics, Sequence[Float64], float]:
     middle, size = (lower + upper) / 2, max(float(np.linalg.norm(upper - lower)), 0.1)
     width, height = IMAGE_SIZE
     intrinsics = Intrinsics(fx=width, fy=width, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height)
-    angles = 2 * np.pi * (np.arange(NUM_VIEWS) + 0.5) / NUM_VIEWS
-    directions = np.column_stack([np.cos(angles), np.sin(angles), np.full(NUM_VIEWS, 0.7)])
+    angles = 2 * np.pi * (np.arange(EXPORT_VIEWS) + 0.5) / EXPORT_VIEWS
+    directions = np.column_stack([np.cos(angles), np.sin(angles), np.full(EXPORT_VIEWS, 0.7)])
     return intrinsics, [look_at(middle + size * direction, middle) for direction in directions], size

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatctrl_cli.captures.capture_header import is_capture
+from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.containers.log_formats import is_bag_folder
 from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
 from splatctrl_cli.errors import InputError, UsageError
@@ -13,8 +14,6 @@ from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.scene.recording_consistency import largest_jump
 from splatctrl_cli.sources.source import open_source
-
-DEFAULT_POSE_JUMP = 1.0  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +36,7 @@ class RecordingRequest:
 
 
 def open_to_train(
-    recording: RecordingRequest, *, max_pose_jump: float = DEFAULT_POSE_JUMP, needs_depth: bool = True
+    recording: RecordingRequest, *, max_pose_jump: float = POSE_JUMP, needs_depth: bool = True
 ) -> RecordSource:
     """The recording without the views that it holds out. Raises UsageError for options that do not belong to it, and
     InputError for a scan without depth and for a camera that jumps farther than `max_pose_jump` [m].

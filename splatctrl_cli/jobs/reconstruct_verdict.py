@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import MASK_PIXELS
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.audit_row import AuditRow
-from splatctrl_cli.scene.self_mask import MIN_PIXELS
 
 GATED = (
     *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet", "evicted"),
@@ -58,7 +58,7 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
     return dict.fromkeys(GATED, len(made.rows)) | {
         "robot_splats": sum(seen),
         "inside_robot_points": sum(seen),
-        "self_mask_residual_mm": sum(num for num in seen if num >= MIN_PIXELS),
+        "self_mask_residual_mm": sum(num for num in seen if num >= MASK_PIXELS),
         "loss": sum(row.loss is not None for row in made.rows),
         "psnr": sum(row.psnr is not None for row in made.rows),
     }
@@ -145,7 +145,7 @@ def longest_blind(rows: Sequence[AuditRow]) -> dict[str, tuple[int, int]]:
 def _calibration(made: Reconstructed) -> Iterator[Reason]:
     """Measured against rendered depth of the robot."""
     told = {
-        link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["num_pixels"] >= MIN_PIXELS
+        link: row["median_mm"] for link, row in made.metrics["self_mask"].items() if row["num_pixels"] >= MASK_PIXELS
     }
     if not told:
         return

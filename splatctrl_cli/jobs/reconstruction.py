@@ -10,6 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.jobs.progress import Progress
@@ -29,7 +30,6 @@ from splatctrl_cli.scene_files.scene_writer import Checkpoint, SceneWriter
 from splatctrl_cli.splat_files.points import read_points
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
-SAME_MOMENT_NS = 20_000_000  # frames of one time step are at most so far apart
 
 
 def training_cameras(source: RecordSource) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
@@ -26,7 +27,6 @@ from splatctrl_cli.robot.spheres import are_links_renamed, matched_links
 from splatctrl_cli.robot.srdf import read_srdf
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
-DEFAULT_SPHERES = 64  # as many as the public sets for the Panda have
 METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths in metres, None where no figure bounds it
     "max_deficit": lambda report: report.max_deficit,
     "uncovered_share": lambda report: report.uncovered_share,

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.evaluate.cloud import MAX_DISTANCE, SPACING, cloud_score, points_on, spaced, thinned
+from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
+from splatctrl_cli.evaluate.cloud import cloud_score, points_on, spaced, thinned
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
 from splatctrl_cli.evaluate.views import seen_by, surface_points
 from splatctrl_cli.jobs.score_views import final_splats, rendered
@@ -25,8 +26,8 @@ class CloudSettings:
 
     path: Path
     unit: float = 1.0
-    max_distance: float = MAX_DISTANCE
-    spacing: float = SPACING
+    max_distance: float = CLOUD_DISTANCE
+    spacing: float = CLOUD_SPACING
     masks: Path | None = None
     space: ObservedSpace | None = None
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.config.fixed import COMPARED_FIRST, COMPARED_SPLATS
 from splatctrl_cli.datasets.dtu import scan_folders
 from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
@@ -26,9 +27,7 @@ from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, Scoring, chosen,
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.report.view_picture import renders_picture
 
-NUM_SPLATS = 10_000  # IV-A: what both methods begin with, and the budget of ours
 PROTOCOL = "dtu-holdout8"  # the paper names neither scans nor views
-FIRST_ITERATIONS = 300  # of ours: on the first time step, the rest refines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +67,7 @@ class FitRequest(Scoring):
     settings: tuple[str, ...] = ()
     seed: int = 0
     iterations: int | None = None
-    num_splats: int = NUM_SPLATS
+    num_splats: int = COMPARED_SPLATS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,7 +230,7 @@ def _peak_memory() -> float:
 def _config(request: FitRequest) -> Config:
     """That of both methods: what the request sets outranks its iterations, but not its splats."""
     iterations = request.iterations or 0
-    first = min(FIRST_ITERATIONS, iterations)
+    first = min(COMPARED_FIRST, iterations)
     settings = (
         *(f"gaussians.iterations={iterations}", f"scene.first_iterations={first}"),
         f"scene.refine_iterations={iterations - first}",

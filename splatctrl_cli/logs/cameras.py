@@ -16,7 +16,6 @@ from splatctrl_cli.logs.source_options import CameraTopics
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
 
 _TRANSPORTS = {"compressed", "compressedDepth"}
-_LONGEST_NAME = 80  # characters of a camera's name; a file system has 255 bytes
 _REGISTERED_WORDS = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")
 _ENCODINGS = ("cdr", "ros1", "protobuf", "json")  # of messages
 
@@ -165,7 +164,7 @@ def _with_unique_names(cameras: list[CameraTopics]) -> tuple[CameraTopics, ...]:
 
 
 def _folder_name(name: str) -> str:
-    return re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:_LONGEST_NAME] or "camera"
+    return re.sub(r"[^\w.-]", "_", name).lstrip(".-")[:80] or "camera"
 
 
 def no_camera(log: RawLog, survey: Survey) -> InputError:

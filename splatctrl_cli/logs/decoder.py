@@ -27,7 +27,6 @@ _KNOWN = frozenset(  # what is read by its fields
 )
 _MOST_TEXT = 1 << 20  # characters of a definition
 _MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is not a number
-_MOST_STORES = 32  # of definitions that were compiled and are kept
 _ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
 
 
@@ -111,7 +110,7 @@ def _type_store(topic: Topic) -> Any:
     return _store_of(topic.definition, topic.definition_format, topic.schema or topic.type_name)
 
 
-@lru_cache(maxsize=_MOST_STORES)
+@lru_cache(maxsize=32)
 def _store_of(definition: str, form: str, type_name: str) -> Any:
     """The types of a definition; kept, as to compile them takes some ten milliseconds."""
     store = get_typestore(Stores.EMPTY)

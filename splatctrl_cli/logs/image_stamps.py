@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import IMAGES_BACK_NS, IMAGES_FEWEST, IMAGES_FEWEST_BACK, IMAGES_GAP, IMAGES_STEADY
+
 Stamps = Sequence[int] | NDArray[np.int64]
 _BLOCK = 1 << 14  # pairs that are Python's numbers at once
 
@@ -39,13 +41,6 @@ def paired(color_ns: Stamps, depth_ns: Stamps, tolerance_ns: int) -> NDArray[np.
     return np.stack([found, partner[found]], axis=1)
 
 
-STEADY = 0.25  # largest departure from the period, in periods, of an interval that counts as steady
-GAP = 1.5  # [periods] from which on an interval is a gap
-BACK_NS = 1_000_000_000  # so far behind an earlier stamp the clock went back
-FEWEST_BACK = 3
-FEWEST = 5  # intervals that a rate is judged by
-
-
 @dataclass(kw_only=True)
 class StampClock:
     """Whether the clock of a topic's headers went back while the recording went on: a bag in a loop, a reset.
@@ -64,7 +59,7 @@ class StampClock:
         """The next message in the order of the file."""
         if self._latest_ns is None or stamp_ns > self._latest_ns:
             self._latest_ns, self._latest_log_ns = stamp_ns, log_time_ns
-        elif self._latest_ns - stamp_ns > BACK_NS and log_time_ns > self._latest_log_ns:
+        elif self._latest_ns - stamp_ns > IMAGES_BACK_NS and log_time_ns > self._latest_log_ns:
             if not self.num_back:
                 self.back_ns, self.back_log_ns = self._latest_ns - stamp_ns, log_time_ns
             self.num_back += 1
@@ -72,7 +67,7 @@ class StampClock:
     @property
     def went_back(self) -> bool:
         """Whether it did: a stamp or two may be wrong by themselves."""
-        return self.num_back >= FEWEST_BACK
+        return self.num_back >= IMAGES_FEWEST_BACK
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,11 +90,11 @@ def dropped(stamps_ns: Stamps) -> Drops:
     The period is the median interval, and steady within a quarter of it must be three intervals of four.
     """
     intervals = np.diff(np.unique(stamps_ns)).astype(np.float64)
-    if len(intervals) < FEWEST:
+    if len(intervals) < IMAGES_FEWEST:
         return Drops(num_gaps=0, num_images=0, period_ns=0.0)
     period = float(np.median(intervals))
-    is_steady = np.abs(intervals - period) <= STEADY * period
-    gaps = intervals[intervals > GAP * period]
+    is_steady = np.abs(intervals - period) <= IMAGES_STEADY * period
+    gaps = intervals[intervals > IMAGES_GAP * period]
     if is_steady.mean() < 0.75:
         gaps = gaps[:0]
     return Drops(num_gaps=len(gaps), num_images=int((np.rint(gaps / period) - 1).sum()), period_ns=period)

@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from splatctrl_cli.geometry import quat_from_rotation
-from splatctrl_cli.records import Float32, Float64, Intrinsics, JointState, RgbdFrame
+from splatctrl_cli.records import MILLIMETRES, Float32, Float64, Intrinsics, JointState, RgbdFrame
 
-JPEG_QUALITY = 90
-MILLIMETRES = 1000.0
-CHUNK_BYTES = 4 * 1024 * 1024
 FOREVER = "    sec: 9223372036\n    nsec: 854775807\n"
 LATCHED = (  # rosbag2's form of reliable, transient local, keep the last one
     f"- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n{FOREVER}  lifespan:\n{FOREVER}"
@@ -35,7 +32,7 @@ Transform = tuple[str, str, Float64]  # parent frame, child frame, T_parent_chil
 def mcap_log(path: Path) -> Iterator["McapLog"]:
     """A log open for writing at `path`; complete and closed after the block."""
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer = Writer(stream, chunk_size=4 << 20, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="splatctrl")
         yield McapLog(writer)
         writer.finish()
@@ -80,7 +77,7 @@ class McapLog:
     def add_frame(self, frame: RgbdFrame) -> None:
         """Colour as JPEG, its CameraInfo, the depth and a mask if any, all of one stamp and one optical frame."""
         header = self._header(frame.stamp_ns, f"{frame.camera}_optical_frame")
-        jpeg = cv2.imencode(".jpg", frame.color[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+        jpeg = cv2.imencode(".jpg", frame.color[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
         color = self._new("sensor_msgs/msg/CompressedImage", header=header, format="jpeg", data=jpeg.reshape(-1))
         millimetres = np.rint(frame.depth.astype(np.float64) * MILLIMETRES).astype("<u2")
         self._add(f"/{frame.camera}/color/camera_info", self._camera_info(header, frame.intrinsics), frame.stamp_ns)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.files.image_file import JPEG, decode_file, image_head
 from splatctrl_cli.logs.decoder import IMAGE, UndecodableMessageError, stamp_ns
-from splatctrl_cli.records import Float32, UInt8
+from splatctrl_cli.records import MILLIMETRE, Float32, UInt8
 
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 BAYER = {  # OpenCV names a pattern by the second row's second and third pixel
@@ -64,7 +64,6 @@ _LAYOUT = {  # channels and dtype by encoding
     **dict.fromkeys(["16UC1", "mono16"], (1, "u2")),
     "32FC1": (1, "f4"),
 }
-MILLIMETRE = 1e-3  # what 16UC1 and mono16 depth counts (REP 118)
 _DEPTH_HEAD = 12  # bytes of compressed_depth_image_transport before its image
 _MOSAICS = frozenset({*BAYER, *BAYER_16})
 _MOST_PIXELS = 1 << 26  # of an image whose code can say it in a few bytes

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from splatctrl_cli.config.fixed import FARTHEST_RAY, REGISTERED_SHARE
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import back_project, transform_points
 from splatctrl_cli.records import Float32, Float64, Intrinsics, UInt8
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
 NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV takes
-LEAST_SEEN = 0.25  # of an undistorted image
-FARTHEST = 20.0  # from the optical axis, at a depth of one: 87 degrees
 SAME_MODELS = {  # what others call them
     "Brown Conrady": "plumb_bob",
     "radtan": "plumb_bob",
@@ -79,10 +78,10 @@ class Undistortion:
         is_seen = (self._map_u >= 0) & (self._map_u <= intrinsics.width - 1)
         is_seen &= (self._map_v >= 0) & (self._map_v <= intrinsics.height - 1)
         is_seen &= _radii(intrinsics) < _largest_radius(model, coefficients)
-        if is_seen.mean() < LEAST_SEEN:
+        if is_seen.mean() < REGISTERED_SHARE:
             raise InputError(
                 f"distortion {model} {np.round(coefficients, 6).tolist()}: the camera saw {is_seen.mean():.0%} of the"
-                f" pinhole's image, expected at least {LEAST_SEEN:.0%}",
+                f" pinhole's image, expected at least {REGISTERED_SHARE:.0%}",
                 remedy="correct the calibration, or undistort the images first",
             )
         self.valid = None if is_seen.all() else is_seen
@@ -120,7 +119,7 @@ def _radii(camera: Intrinsics) -> Float64:
 
 def _largest_radius(model: str, coefficients: Float64) -> float:
     """Up to which distance from the axis a lens's polynomial still grows: beyond, it would show things twice."""
-    r = np.linspace(0.0, FARTHEST, 20001)
+    r = np.linspace(0.0, FARTHEST_RAY, 20001)
     k = np.zeros(8)
     k[: min(len(coefficients), 8)] = coefficients[:8]
     if model == "equidistant":

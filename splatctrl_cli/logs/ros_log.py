@@ -31,9 +31,7 @@ from splatctrl_cli.logs.stored_frame import (
     is_png,
 )
 from splatctrl_cli.logs.survey import Survey, survey
-from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, UInt8, by_stamp
-
-_SECOND = 1_000_000_000
+from splatctrl_cli.records import SECOND_NS, Float32, Float64, JointState, LossReport, Record, UInt8, by_stamp
 
 
 @dataclass(kw_only=True)
@@ -109,10 +107,10 @@ class RosLogSource:
             (color, color_ns), (depth, depth_ns) = (
                 self._images(found, topic) for topic in (camera.color_topic, camera.depth_topic)
             )
-            tolerance_ns = round(self._options.pairing_tolerance_s * _SECOND)
+            tolerance_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
             pairs = paired(color_ns, depth_ns, tolerance_ns)
             if not len(pairs):
-                gap = nearest_gap_ns(color_ns.tolist(), depth_ns.tolist()) / _SECOND
+                gap = nearest_gap_ns(color_ns.tolist(), depth_ns.tolist()) / SECOND_NS
                 raise InputError(
                     f"{self._log.path}: camera {camera.name}: no colour and depth image within"
                     f" {tolerance_ns / 1e6:g} ms of each other, the closest are {gap * 1e3:.4g} ms apart",
@@ -146,8 +144,8 @@ class RosLogSource:
         self, plan: FramePlan, found: Survey, camera: Camera, stamp_ns: Index, color: Index, depth: Index
     ) -> None:
         """Plan the pairs of a camera, those without a pose counted. Raises InputError where none has one."""
-        tolerance_ns = round(self._options.pose_tolerance_s * _SECOND)
-        pairing_ns = round(self._options.pairing_tolerance_s * _SECOND)
+        tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
+        pairing_ns = round(self._options.pairing_tolerance_s * SECOND_NS)
         masks = _mask_by_color(found, camera.color_topic, camera.human_topic, pairing_ns, camera.name, self._loss)
         poses = (camera.pose_at(found.tf, stamp, tolerance_ns) for stamp in map(int, stamp_ns))
         num = plan.add(camera, stamp_ns, color, depth, masks, poses)

@@ -2,15 +2,10 @@
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import CLOCK_DRIFT, CLOCK_MIXED, CLOCK_NEIGHBOURS, CLOCK_OTHER, CLOCK_STEP
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import ranges
 from splatctrl_cli.records import Float64, LossReport, Stamps
-
-OTHER_CLOCK = 1.0  # [s] between stamp and logging above which they are two clocks
-STEP = 1.0  # [s] by which a clock was set
-MIXED = 60.0  # [s] a step beyond which states of two clocks were joined
-DRIFT = 0.005  # [s] over the log
-_NEIGHBOURS = 5  # states over which a step must persist: one message logged late is none
 
 
 def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossReport) -> Stamps:
@@ -22,7 +17,7 @@ def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossRepor
     if is_unset.all():
         loss.notes.append(f"{where}: no state has a stamp; the times of logging are used")
         return log_ns
-    if is_unset.any() and stamp_ns[~is_unset].min() > MIXED * 1e9:  # a simulation may begin at 0
+    if is_unset.any() and stamp_ns[~is_unset].min() > CLOCK_MIXED * 1e9:  # a simulation may begin at 0
         raise InputError(
             f"{where}: mixed clocks: {int(is_unset.sum())} of {len(stamp_ns)} states have no stamp",
             remedy="leave them out of the log, or give another --joint-topic",
@@ -30,13 +25,13 @@ def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossRepor
     late = np.asarray((log_ns - stamp_ns) * 1e-9, dtype=np.float64)
     _check_steps(late, where, loss)
     median = float(np.median(late))
-    if abs(median) > OTHER_CLOCK:
+    if abs(median) > CLOCK_OTHER:
         loss.notes.append(
             f"{where}: stamps are {abs(median):.3f} s {'before' if median > 0 else 'after'} the time of logging: "
             "two clocks; are the cameras stamped by the same one?"
         )
     drift, span = _drift(late, np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64))
-    if abs(drift) > DRIFT:
+    if abs(drift) > CLOCK_DRIFT:
         loss.notes.append(
             f"{where}: stamps and times of logging drift apart by {1e3 * abs(drift):.1f} ms over {span:.1f} s "
             f"({1e6 * abs(drift) / span:.0f} ppm)"
@@ -45,9 +40,9 @@ def checked_stamps(stamp_ns: Stamps, log_ns: Stamps, where: str, loss: LossRepor
 
 
 def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
-    n = _NEIGHBOURS
+    n = CLOCK_NEIGHBOURS
     if len(late) < 2 * n:
-        if np.ptp(late) > MIXED:
+        if np.ptp(late) > CLOCK_MIXED:
             raise _mixed(where, float(np.ptp(late)), int(np.argmax(np.abs(np.diff(late)))) + 1)
         return
     windows = np.empty(len(late) - n + 1)
@@ -56,11 +51,11 @@ def _check_steps(late: Float64, where: str, loss: LossReport) -> None:
         windows[first:last] = np.median(np.lib.stride_tricks.sliding_window_view(near, n), axis=1)
     change = np.abs(windows[n:] - windows[:-n])  # the n states before i + n against those from it on
     step = float(change.max(initial=0.0))
-    if step <= STEP:
+    if step <= CLOCK_STEP:
         return
     at = int(np.argmax(change))
     state = at + 1 + int(np.argmax(np.abs(np.diff(late[at : at + 2 * n]))))
-    if step > MIXED:
+    if step > CLOCK_MIXED:
         raise _mixed(where, step, state)
     loss.notes.append(f"{where}: stamps step by {step:.3f} s against the time of logging at state {state}")
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import STATES_BRIDGED, STATES_STILL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, absent, ranges
 from splatctrl_cli.logs.decoder import JOINT_STATE
@@ -17,9 +18,6 @@ from splatctrl_cli.logs.state_messages import NAMELESS, STANDARD_TYPES, STATE_TY
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.survey import Survey, TopicSurvey
 from splatctrl_cli.records import Bool, LossReport
-
-BRIDGED = 0.5  # [s] at most between the states of another topic that a position is interpolated over
-STILL = 1e-3  # [rad or m] by which a joint may differ across a longer gap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +100,7 @@ def track_of_joints(topics: Sequence[TopicSurvey], wanted: Sequence[str], loss: 
 
     The topic with the most of them gives the stamps, of equals one with end-effector poses, then /joint_states; other
     joints are interpolated between the states of their topics. States outside of these, or in a gap of more than
-    `BRIDGED` over which a joint moved, are left out with a note.
+    `STATES_BRIDGED` over which a joint moved, are left out with a note.
     """
     streams = _renamed(_streams(topics), wanted, loss)
 
@@ -177,7 +175,7 @@ def _filled(track: RawTrack, other: RawTrack, loss: LossReport) -> RawTrack:
     before = after - 1
     gap = (at[after] - at[before]) * 1e-9
     is_still = _is_still(other.position, order[before], order[after])
-    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= BRIDGED) | is_still)
+    keep = (stamps >= at[0]) & (stamps <= at[-1]) & ((gap <= STATES_BRIDGED) | is_still)
     share = np.clip((stamps - at[before]) / np.maximum(at[after] - at[before], 1), 0.0, 1.0)[:, None]
 
     names = ", ".join(other.names)
@@ -215,5 +213,5 @@ def _is_still(table: Table, before: NDArray[np.int64], after: NDArray[np.int64])
     is_still = np.zeros(len(before), dtype=np.bool_)
     for first, last in ranges(len(before)):
         change = np.abs(table[after[first:last]] - table[before[first:last]])
-        is_still[first:last] = change.max(axis=1) < STILL
+        is_still[first:last] = change.max(axis=1) < STATES_STILL
     return is_still

@@ -5,16 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, Table, ranges
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.state_velocity import differentiated, gaps_of, slopes_by_block
 from splatctrl_cli.records import Bool, Float64, LossReport
-
-STILL = 1e-3  # [rad or m] of motion under which a velocity of zero is believed
-CONFLICT = 1e-6  # [rad or m] between states of one stamp
-SPEED_RATIO = 3.0  # of logged to differentiated speeds beyond which their units differ
-COMPARED = 5000  # states at most, spread over the log
-MOVING = 0.05  # [1/s] speeds that are compared
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,7 +98,7 @@ def _in_order(raw: RawTrack, loss: LossReport) -> RawTrack:
     again, num_other = np.flatnonzero(is_again), 0
     for first, last in ranges(num_again):
         part = again[first:last]
-        differs = np.abs(raw.position[part] - raw.position[part - 1]).max(axis=1) > CONFLICT
+        differs = np.abs(raw.position[part] - raw.position[part - 1]).max(axis=1) > fixed.STATES_CONFLICT
         num_other += int(differs.sum())
     loss.duplicate_states += num_again
     loss.conflicting_states += num_other
@@ -116,7 +111,7 @@ def _with_velocity(raw: RawTrack, loss: LossReport) -> Table:
     """velocity (T, J) with what is missing taken from the positions."""
     found = _looked_at(raw)
     if not found.num_taken:
-        thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // COMPARED))
+        thinned = raw.select(np.arange(0, len(raw.stamp_ns), 1 + len(raw.stamp_ns) // fixed.STATES_COMPARED))
         _compare_units(thinned, loss)
         return raw.velocity
     loss.differentiated_velocities += found.num_taken
@@ -141,7 +136,7 @@ def _looked_at(raw: RawTrack) -> _Velocities:
         is_missing |= missing.any(axis=0)
         is_there |= ~missing.all(axis=0)
         num_missing += int(missing.any(axis=1).sum())
-    is_zero = np.asarray(is_still & is_there & (high - low > STILL))
+    is_zero = np.asarray(is_still & is_there & (high - low > fixed.STATES_STILL))
     return _Velocities(
         is_missing=is_missing,
         is_all_missing=not is_there.any(),
@@ -165,11 +160,11 @@ def _compare_units(raw: RawTrack, loss: LossReport) -> None:
     """Of states that are few enough to be read at once."""
     position, velocity = raw.position[: len(raw.stamp_ns)], raw.velocity[: len(raw.stamp_ns)]
     slopes: Float64 = differentiated(raw.stamp_ns, position)
-    is_fast = np.abs(slopes) > MOVING
+    is_fast = np.abs(slopes) > fixed.STATES_SPEED
     if is_fast.sum() < 10:
         return
     ratio = float(np.median(np.abs(velocity[is_fast])) / np.median(np.abs(slopes[is_fast])))
-    if not 1 / SPEED_RATIO < ratio < SPEED_RATIO:
+    if not 1 / fixed.STATES_SPEED_RATIO < ratio < fixed.STATES_SPEED_RATIO:
         loss.notes.append(
             f"{raw.where}: logged velocities are {ratio:.3g} times the change of the positions: other units, "
             "or stamps of another rate"

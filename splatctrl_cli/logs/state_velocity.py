@@ -7,15 +7,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.files.spilled_rows import Table, ranges
 from splatctrl_cli.records import Float64, Stamps
-
-GAP_PERIODS = 5.0  # a step of the stamps this many times the usual one is a gap
-GAP_SECONDS = 0.1  # and of at least this length
-PERIOD_SAMPLES = 20  # states over which the period is measured
-CLOCK_GAIN = 0.05  # of a stamp's deviation by which the clock that counts states follows
-CLOCK_SAMPLES = 50  # states before and after that a stamp is smoothed over
-POSITION_SAMPLES = 2  # states before and after that a velocity is fitted to
 
 
 def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
@@ -23,7 +17,7 @@ def gaps_of(stamp_ns: Stamps) -> NDArray[np.intp]:
     steps = np.diff(stamp_ns)
     if not len(steps):
         return np.zeros(0, dtype=np.intp)
-    longest = max(GAP_PERIODS * float(np.median(steps)), GAP_SECONDS * 1e9)
+    longest = max(fixed.STATES_GAP_PERIODS * float(np.median(steps)), fixed.STATES_GAP_SECONDS * 1e9)
     return np.flatnonzero(steps > longest)
 
 
@@ -36,21 +30,21 @@ def smoothed_seconds(stamp_ns: Stamps) -> Float64:
     seconds = np.asarray((stamp_ns - stamp_ns[0]) * 1e-9, dtype=np.float64)
     if len(seconds) < 3:
         return seconds
-    lag = min(PERIOD_SAMPLES, len(seconds) - 1)
+    lag = min(fixed.STATES_PERIOD_SAMPLES, len(seconds) - 1)
     period = float(np.median(seconds[lag:] - seconds[:-lag])) / lag
     number = _numbers(seconds, period)
     smooth = np.empty_like(seconds)
     sums = _Sums()
     for begin, end in ranges(len(seconds)):
         index = np.arange(begin, end)
-        first = np.maximum(index - CLOCK_SAMPLES, 0)
-        last = np.minimum(index + CLOCK_SAMPLES, len(seconds) - 1) + 1
+        first = np.maximum(index - fixed.STATES_CLOCK_SAMPLES, 0)
+        last = np.minimum(index + fixed.STATES_CLOCK_SAMPLES, len(seconds) - 1) + 1
         k, residual = number[: last[-1]], seconds[sums.num : last[-1]] - period * number[sums.num : last[-1]]
         sums.add(k[sums.num :], residual)  # small numbers: the sums below keep their digits
         mean_k, mean_r, mean_kk, mean_kr = sums.means(first, last)
         slope = (mean_kr - mean_k * mean_r) / np.maximum(mean_kk - mean_k**2, 1e-12)
         smooth[begin:end] = period * number[begin:end] + mean_r + slope * (number[begin:end] - mean_k)
-        sums.forget(end - CLOCK_SAMPLES)
+        sums.forget(end - fixed.STATES_CLOCK_SAMPLES)
     is_regular = float(np.sqrt(np.mean((smooth - seconds) ** 2))) < 0.25 * period
     return smooth if is_regular and bool(np.all(np.diff(smooth) > 0)) else seconds
 
@@ -96,7 +90,7 @@ def _numbers(seconds: Float64, period: float) -> Float64:
             ticks = max(round((second - clock) / period), 1) if first or block else 0
             number += ticks
             clock += ticks * period
-            clock += CLOCK_GAIN * (second - clock)
+            clock += fixed.STATES_CLOCK_GAIN * (second - clock)
             block.append(number)
         numbers[first:last] = block
     return numbers
@@ -119,7 +113,7 @@ def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Fl
             yield start, np.zeros((1, *position.shape[1:]))
             continue
         seconds = smoothed_seconds(stamp_ns[start:end])
-        size = min(2 * POSITION_SAMPLES + 1, end - start)
+        size = min(2 * fixed.STATES_POSITION_SAMPLES + 1, end - start)
         for first, last in ranges(end - start):
             low, high = max(min(first - size // 2, end - start - size), 0), min(last + size // 2, end - start)
             high = max(high, min(low + size, end - start))
@@ -128,7 +122,7 @@ def slopes_by_block(stamp_ns: Stamps, position: Table) -> Iterator[tuple[int, Fl
 
 
 def _slopes(seconds: Float64, position: Float64) -> Float64:
-    size = min(2 * POSITION_SAMPLES + 1, len(seconds))
+    size = min(2 * fixed.STATES_POSITION_SAMPLES + 1, len(seconds))
     starts = np.clip(np.arange(len(seconds)) - size // 2, 0, len(seconds) - size)
     since = sliding_window_view(seconds, size)[starts] - seconds[:, None]  # (T, size)
     scale = np.ptp(since, axis=1, keepdims=True)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
 from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.image_file import JPEG, PNG
@@ -25,8 +26,6 @@ from splatctrl_cli.records import (
     RgbdFrame,
     UInt8,
 )
-
-PLAUSIBLE_DEPTH = (0.05, 20.0)  # [m] median of the valid pixels
 
 
 @dataclass(frozen=True, kw_only=True)

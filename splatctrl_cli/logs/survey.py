@@ -31,9 +31,7 @@ from splatctrl_cli.logs.tf_tree import TfTree
 from splatctrl_cli.records import Float64
 
 LARGE = 1 << 30  # bytes from which on an MCAP is described by its index
-_MOST_CHUNKS = 24
 _MOST_BYTES = 64 << 20  # of chunks that are unpacked
-_MOST_MESSAGES = 2000  # of a file without chunks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +193,7 @@ def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
 def _sampled(log: McapLog, index: LogIndex) -> Survey:
     found, decoder = Survey(), MessageDecoder()
     chunks = _first_chunks(index)
-    messages = log.messages_of(chunks, found.damage) if chunks else islice(log.messages(Damage()), _MOST_MESSAGES)
+    messages = log.messages_of(chunks, found.damage) if chunks else islice(log.messages(Damage()), 2000)
     for message in messages:
         add_message(found, decoder, message)
     for topic in log.topics():
@@ -221,7 +219,7 @@ def _first_chunks(index: LogIndex) -> list[ChunkIndex]:
             wanted[first.chunk_start_offset] = first
     chosen: list[ChunkIndex] = []
     size = 0
-    for _, chunk in sorted(wanted.items())[:_MOST_CHUNKS]:
+    for _, chunk in sorted(wanted.items())[:24]:
         size += max(chunk.uncompressed_size, chunk.compressed_size)
         if size <= _MOST_BYTES or not chosen:
             chosen.append(chunk)

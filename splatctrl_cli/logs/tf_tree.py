@@ -5,13 +5,10 @@ from bisect import bisect_left
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import TF_GAP_NS, TF_STILL_POSITION, TF_STILL_ROTATION
 from splatctrl_cli.files.spilled_rows import BLOCK, RowFile
 from splatctrl_cli.geometry import interpolate_transform, invert_transform, transform_from
 from splatctrl_cli.records import Float64
-
-MAX_GAP_NS = 1_000_000_000  # samples farther apart than this bracket no pose, unless nothing moved between them
-STILL_POSITION = 1e-3  # [m]
-STILL_ROTATION = 2e-3  # largest change of a rotation entry
 
 
 class _Transforms:
@@ -67,7 +64,7 @@ class _Edge:
             return self._at(0) if self.stamps[0] - stamp_ns <= tolerance_ns else None
         gap = self.stamps[after] - self.stamps[after - 1]
         T_before, T_after = self._at(after - 1), self._at(after)
-        if gap > MAX_GAP_NS and not _is_still(T_before, T_after):
+        if gap > TF_GAP_NS and not _is_still(T_before, T_after):
             return None
         return interpolate_transform(T_before, T_after, (stamp_ns - self.stamps[after - 1]) / gap)
 
@@ -84,7 +81,7 @@ class _Edge:
 
 def _is_still(T_a: Float64, T_b: Float64) -> bool:
     change = np.abs(T_a - T_b)
-    return bool(change[:3, 3].max() <= STILL_POSITION and change[:3, :3].max() <= STILL_ROTATION)
+    return bool(change[:3, 3].max() <= TF_STILL_POSITION and change[:3, :3].max() <= TF_STILL_ROTATION)
 
 
 class TfTree:

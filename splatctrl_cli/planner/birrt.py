@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import PlannerConfig
+from splatctrl_cli.config.fixed import SHORTCUT_WORTH
 from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.edges import check_edges
 from splatctrl_cli.records import Float64
-
-WORTH = 1e-3  # [rad] that a shortcut has to save
 
 Index = NDArray[np.int64]
 
@@ -287,7 +286,7 @@ def _random_cuts(path: Float64, num: int, random: np.random.Generator) -> Float6
     way = np.interp(places, np.arange(len(path)), along)
     saved = way[:, 1] - way[:, 0] - np.linalg.norm(_points(path, places[:, 1]) - _points(path, places[:, 0]), axis=1)
     order = np.argsort(-saved, kind="stable")
-    return np.asarray(places[order[saved[order] > WORTH]])
+    return np.asarray(places[order[saved[order] > SHORTCUT_WORTH]])
 
 
 def _cut(path: Float64, cut: Float64) -> Float64:

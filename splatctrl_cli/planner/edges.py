@@ -9,13 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import SHORTEST_EDGE, STILL_ROW
 from splatctrl_cli.planner.configuration_clearance import Clearance
 from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Bool, Float64
 
 ROUNDING = 1e-9  # [m] taken off every clearance: far above the rounding of the distances
-STILL = 1e-9  # [m] a row that an edge does not move is taken to lose this much
-SHORTEST = 1e-9  # [rad] that the search for where an edge stops being free goes down to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +54,9 @@ def check_edges(
         start,
         end,
         contact=contact,
-        give_up=max(give_up, SHORTEST),
+        give_up=max(give_up, SHORTEST_EDGE),
         rounding=ROUNDING,
-        still=STILL,
+        still=STILL_ROW,
         only_whole=only_whole,
     )
     return EdgeCheck(free_share=share, num_checks=int(num_checks.sum()))
@@ -68,7 +67,7 @@ def check_sampled_edges(
 ) -> EdgeCheck:
     """`check_edges` by the clearance's own postures, of any scene: what the kernel is held to."""
     motion = end - start
-    speeds = np.maximum(clearance.speeds(motion), STILL)
+    speeds = np.maximum(clearance.speeds(motion), STILL_ROW)
     length = np.linalg.norm(motion, axis=1)
     free = np.ones(len(start))
     edge, low, high = np.arange(len(start)), np.zeros(len(start)), np.ones(len(start))
@@ -86,7 +85,7 @@ def check_sampled_edges(
         high = np.minimum(high, free[edge])
         is_open = low < high
         is_last = (high >= free[edge]) & (free[edge] < 1.0)  # what is left before a collision
-        is_short = is_open & is_last & ((high - low) * length[edge] < max(give_up, SHORTEST))
+        is_short = is_open & is_last & ((high - low) * length[edge] < max(give_up, SHORTEST_EDGE))
         np.minimum.at(free, edge[is_short], 0.0 if only_whole else low[is_short])
         keep = is_open & ~is_short & (low < free[edge])
         edge, low, high = edge[keep], low[keep], high[keep]

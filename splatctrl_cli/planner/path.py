@@ -9,15 +9,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import FRAME_SPACING, STILL_ROW
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.goals import rotation_vector
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.edges import ROUNDING, STILL
+from splatctrl_cli.planner.edges import ROUNDING
 from splatctrl_cli.records import Float64
 
 MAX_PIECES = 200_000  # of a path, when its clearance is proved
-SPACING = 0.05  # [rad] of the samples that the speed of a frame is looked at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ def least_clearance(clearance: Clearance, waypoints: Float64, *, tolerance: floa
     advancement, here as branch and bound. Raises InputError where the tolerance asks for too many pieces.
     """
     motion = np.diff(waypoints, axis=0)
-    speeds = np.maximum(clearance.speeds(motion), STILL)
+    speeds = np.maximum(clearance.speeds(motion), STILL_ROW)
     edge, low, high = np.arange(len(motion)), np.zeros(len(motion)), np.ones(len(motion))
     upper, num_checks = float(np.min(clearance.at(waypoints))), len(waypoints)
     lower = upper
@@ -113,11 +113,11 @@ def effector_rates(
     model: ArmModel, waypoints: Float64, frame: str, *, max_linear: float, max_angular: float
 ) -> Float64:
     """(W - 1,) shares of each edge per second at which a frame keeps to speeds [m/s] and [rad/s], at samples
-    `SPACING` apart; infinite where an edge does not move it.
+    `FRAME_SPACING` apart; infinite where an edge does not move it.
     """
     rates = np.full(len(waypoints) - 1, np.inf)
     for edge, ends in enumerate(pairwise(waypoints)):
-        for q in resampled(np.array(ends), SPACING):
+        for q in resampled(np.array(ends), FRAME_SPACING):
             twist = model.frame_jacobian(q, frame) @ (ends[1] - ends[0])
             for part, limit in ((twist[:3], max_linear), (twist[3:], max_angular)):
                 speed = float(np.linalg.norm(part))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config import ControlConfig, PlannerConfig
+from splatctrl_cli.config import ControlConfig, PlannerConfig, fixed
 from splatctrl_cli.control.arm import ArmModel
 from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import Detour, PlanDetour, pose_error
@@ -21,13 +21,6 @@ from splatctrl_cli.planner.path import TimedPath, effector_rates, timed
 from splatctrl_cli.records import Float64
 
 NO_POSTURE, START_BLOCKED, GOAL_BLOCKED = "no-goal-posture", "start-in-collision", "goal-in-collision"
-ROOM = 1e-3  # [m] left to move in where the start or goal stands within a margin
-GUESSES = 2  # per goal posture that is looked for
-MAX_STEPS = 30  # of a guess: with 100, a fifth more guesses end at the pose, in 2.6 times the time
-DAMPING = 1e-4  # of the squared Jacobian's diagonal, as it begins; grows where a step does not help
-LONGEST = 0.3  # [rad] of a step, in any joint
-SHARE = 0.1  # of the goal's tolerances that a posture keeps to
-DISTINCT = 0.05  # [rad] that two postures differ by at least, in some joint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +54,7 @@ def planned_path(
     extra = scene_margin(model, control) - control.margin  # what the spheres leave uncovered, where that is kept too
     room = Clearance.of(model, scene, margin=extra)
     random = np.random.default_rng(planner.seed)
-    drawn = random.uniform(model.lower, model.upper, (GUESSES * planner.goal_postures, len(start)))
+    drawn = random.uniform(model.lower, model.upper, (fixed.GOAL_GUESSES * planner.goal_postures, len(start)))
     guesses = np.vstack([model.middle if task.home is None else task.home, start, drawn])
     goals = goal_postures(model, frame, task.T_world_goal, guesses, control, at_most=planner.goal_postures)
     margin, own, outcome = np.nan, np.nan, NO_POSTURE
@@ -97,7 +90,7 @@ def _margins(room: Clearance, start: Float64, goals: Float64, control: ControlCo
     """The margins to the scene and of the pairs that the start and a goal (G, J) keep, and the goals that keep them;
     where a margin is not above 0, the goals are none if none of them is free.
     """
-    rows = room.rows(np.vstack([start, goals])) - ROOM
+    rows = room.rows(np.vstack([start, goals])) - fixed.START_ROOM
     num = len(room.moving)
     scene, own = rows[:, :num].min(axis=1), rows[:, num:].min(axis=1, initial=np.inf)
     margin, self_margin = min(control.margin, float(scene[0])), min(control.self_margin, float(own[0]))
@@ -139,7 +132,7 @@ def goal_postures(
     found: list[Float64] = []
     for guess in guesses:
         q = _solved(model, frame, T_world_goal, guess, config)
-        if q is not None and all(np.max(np.abs(q - other)) > DISTINCT for other in found):
+        if q is not None and all(np.max(np.abs(q - other)) > fixed.GOAL_DISTINCT for other in found):
             found.append(q)
         if len(found) == at_most:
             break
@@ -150,16 +143,16 @@ def _solved(
     model: ArmModel, frame: str, T_world_goal: Float64, guess: Float64, config: ControlConfig
 ) -> Float64 | None:
     """Levenberg's method, every step cut off at the limits; None where it comes to no end."""
-    scale = 1.0 / np.repeat([SHARE * config.goal_position, SHARE * config.goal_rotation], 3)
-    q, damping = np.clip(guess, model.lower, model.upper), DAMPING
+    scale = 1.0 / np.repeat([fixed.GOAL_SHARE * config.goal_position, fixed.GOAL_SHARE * config.goal_rotation], 3)
+    q, damping = np.clip(guess, model.lower, model.upper), fixed.GOAL_DAMPING
     error = scale * pose_error(model.frame_pose(q, frame), T_world_goal)
-    for _ in range(MAX_STEPS):
+    for _ in range(fixed.GOAL_STEPS):
         if max(np.linalg.norm(error[:3]), np.linalg.norm(error[3:])) <= 1.0:
             return q
         J = scale[:, None] * model.frame_jacobian(q, frame)
         square = J.T @ J
         step = np.linalg.solve(square + damping * np.trace(square) * np.eye(len(q)), J.T @ error)
-        step *= min(1.0, LONGEST / max(float(np.max(np.abs(step))), 1e-12))
+        step *= min(1.0, fixed.GOAL_LONGEST_STEP / max(float(np.max(np.abs(step))), 1e-12))
         following = np.clip(q + step, model.lower, model.upper)
         next_error = scale * pose_error(model.frame_pose(following, frame), T_world_goal)
         if np.linalg.norm(next_error) < np.linalg.norm(error):

@@ -23,7 +23,6 @@ from splatctrl_cli.report.pictures import (
 )
 from splatctrl_cli.voxels import VoxelState
 
-LONGEST_SIDE = 600  # cells of a slice that are drawn along a side: a larger one is thinned out
 MAX_LENGTH = 1.5  # of a gradient, top of its colour bar
 BAR, MARK = "#0072b2", "#d55e00"
 
@@ -165,7 +164,7 @@ def _cuts(grid: DistanceGrid, point: Sequence[float], *, axes: Sequence[int]) ->
     for axis in axes:
         index = int(np.clip(round((point[axis] - float(grid.origin[axis])) / grid.voxel), 0, shape[axis] - 1))
         first, second = (other for other in range(3) if other != axis)
-        step = max(1, -(-max(shape[first], shape[second]) // LONGEST_SIDE))
+        step = max(1, -(-max(shape[first], shape[second]) // 600))
         right, up = (grid.origin[i] + grid.voxel * np.arange(0, shape[i], step) for i in (first, second))
         plane = float(grid.origin[axis]) + grid.voxel * index
         cuts.append(

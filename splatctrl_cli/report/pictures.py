@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.libraries import mpl
 from splatctrl_cli.records import DistanceGrid, Float32, Float64, UInt8
+from splatctrl_cli.voxels import VoxelState
 
 WIDTH = 12.0  # inches; at DPI 100 the width is 1200 pixels
 DPI = 100
@@ -23,7 +24,6 @@ MAX_DEPTH_ERROR = 0.05  # [m] top of the depth error's colour bar
 MAX_DISTANCE = 0.20  # [m] both ends of the distance's colour bar
 CONTOURS = (0.0, 0.02, 0.05, 0.10)  # [m]
 CURVE_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-NEVER_SEEN = 0  # of the grid's `observed` channel
 INK = "#222222"
 SPHERE_FILL, SPHERE_EDGE = "#e69f00b0", "#8a5a00"
 STYLE: Any = {  # matplotlib types its keys as one long literal
@@ -104,7 +104,7 @@ def field_slice_picture(
         image = draw_distance(axes, coordinates, distance, grid.voxel)
         figure.colorbar(image, ax=axes, extend="both", label="distance [cm]", fraction=0.05, pad=0.02)
         if "observed" in grid.channels:
-            never_seen = np.take(grid.channels["observed"], index, axis=axis).T == NEVER_SEEN
+            never_seen = np.take(grid.channels["observed"], index, axis=axis).T == VoxelState.NEVER_SEEN
             draw_never_seen(axes, coordinates, never_seen, grid.voxel)
         if spheres is not None:
             _draw_cut_spheres(axes, spheres, axis, plane)

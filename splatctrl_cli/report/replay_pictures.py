@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.records import Float64, FloatRows
 from splatctrl_cli.report.pictures import CURVE_COLORS, INK, drawn_figure, save_figure, span_of
 
@@ -19,8 +20,6 @@ Intervals = Sequence[tuple[float, float]]
 """First and last time [s] of each interval."""
 
 SMALLEST = 0.01  # [rad/s] half the height of a velocity's axis, at least: rounding shows no difference
-STRIP = 0.28  # inches of height for each kind of event
-THIN = 0.05  # of a curve's range: a band is a line with something around it
 QUIET = "#9a9a9a"
 KIND_COLORS = {  # by what happened; Okabe and Ito
     "below-margin": "#e69f00",
@@ -50,8 +49,6 @@ FIELD_NAMES = {
     "certified": "certified bound",
     "truth": "truth",
 }
-COLUMNS = 1000  # of a picture; more states than twice as many become ranges
-BLOCK = 4096  # rows at once
 SHORTEST = 1.0 / 400.0  # share of the axis: an interval is drawn no shorter
 
 
@@ -205,7 +202,7 @@ def _curve(
     of = envelope(seconds, values)
     there = np.isfinite(of.lowest)
     height = float(np.max(of.highest[there]) - np.min(of.lowest[there])) if there.any() else 0.0
-    is_thin = not there.any() or float(np.median((of.highest - of.lowest)[there])) <= THIN * height
+    is_thin = not there.any() or float(np.median((of.highest - of.lowest)[there])) <= 0.05 * height
     if is_thin:
         axes.plot(of.seconds, of.lowest, linestyle=style, color=color, linewidth=width, label=label or "_")
     if not of.is_exact:
@@ -254,7 +251,7 @@ def _limit_axis(axes: Any, joint: str, limit: float, peak: float, beneath: float
 
 
 def _strip_height(events: Mapping[str, Intervals]) -> float:
-    return STRIP * len(events) + 0.55 if events else 0.4
+    return 0.28 * len(events) + 0.55 if events else 0.4
 
 
 def _with_strip(figure: Any, height: float, events: Mapping[str, Intervals]) -> tuple[Any, Any]:
@@ -327,7 +324,7 @@ class Envelope:
         return self.lowest is self.highest
 
 
-def envelope(seconds: Float64, values: Float64, columns: int = COLUMNS) -> Envelope:
+def envelope(seconds: Float64, values: Float64, columns: int = 1000) -> Envelope:
     """The range of values (T,) in each of `columns` equal parts of the time (T,); the values themselves where there
     are at most two states to a column. A column without a state is left out, as a gap.
     """

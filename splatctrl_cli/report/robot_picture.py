@@ -18,8 +18,6 @@ VIEWS = (  # title, axis to the right, axis upwards, where the viewer stands
 )
 BODY, UNCOVERED = np.array([0.66, 0.74, 0.79]), np.array([0.84, 0.37, 0.0])
 SPHERE = "#e69f0020"
-LONGEST = 0.01  # [m] edge of the triangles that are painted, each by its middle
-HEIGHT = 6.0  # inches
 EDGE = 0.02  # [m] of empty space around all
 
 
@@ -28,13 +26,13 @@ def robot_picture(path: Path, surfaces: Sequence[Float64], centers: Float64, rad
 
     surfaces: triangles (F, 3, 3) [m]; centers (S, 3) [m], radii (S,) [m], all in one frame.
     """
-    triangles = np.concatenate([refined(surface, LONGEST)[0] for surface in surfaces])
+    triangles = np.concatenate([refined(surface, 0.01)[0] for surface in surfaces])
     triangles = triangles[areas(triangles) > 0]
     is_bare = _is_outside(triangles.mean(axis=1), centers, radii)
     corners = [triangles.reshape(-1, 3), centers - radii[:, None], centers + radii[:, None]]
     lower = np.min([points.min(axis=0) for points in corners], axis=0) - EDGE
     upper = np.max([points.max(axis=0) for points in corners], axis=0) + EDGE
-    with drawn_figure(HEIGHT) as figure:
+    with drawn_figure(6.0) as figure:
         widths = [float(upper[across] - lower[across]) for _, across, _, _ in VIEWS]
         axes = figure.subplots(1, len(VIEWS), width_ratios=widths)
         for view, (title, across, along, viewer) in zip(axes, VIEWS, strict=True):

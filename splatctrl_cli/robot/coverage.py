@@ -16,14 +16,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from splatctrl_cli.config.fixed import COVERED_EDGE, DEFICIT_GAP
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Bool, Float64, SphereSet
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance, read_solids
 from splatctrl_cli.robot.urdf import UrdfFile
 
-TOLERANCE = 1e-5  # [m] between the proven and the found deficit
-RESOLUTION = 2e-3  # [m] longest edge of a triangle that is counted as covered or not by its middle
 PAIRS_PER_CHUNK = 1_000_000  # of corners and spheres
 
 
@@ -109,7 +108,7 @@ class CoverageReport:
 
 
 def coverage_deficit(
-    urdf: UrdfFile, spheres: SphereSet, *, folders: Sequence[Path] = (), resolution: float = RESOLUTION
+    urdf: UrdfFile, spheres: SphereSet, *, folders: Sequence[Path] = (), resolution: float = COVERED_EDGE
 ) -> CoverageReport:
     """How `spheres` (links by the URDF's names) cover the collision surface of each link of `urdf`.
 
@@ -120,7 +119,7 @@ def coverage_deficit(
 
 
 def coverage_of_solids(
-    urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, *, resolution: float = RESOLUTION
+    urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, *, resolution: float = COVERED_EDGE
 ) -> CoverageReport:
     """As `coverage_deficit`, of collision geometry that is already read."""
     bodies = urdf.rigid_bodies()
@@ -164,7 +163,7 @@ def deficit_by_sphere(urdf: UrdfFile, spheres: SphereSet, report: CoverageReport
 
 
 def largest_deficit(
-    triangles: Float64, centers: Float64, radii: Float64, *, tolerance: float = TOLERANCE, floor: float = 0.0
+    triangles: Float64, centers: Float64, radii: Float64, *, tolerance: float = DEFICIT_GAP, floor: float = 0.0
 ) -> Deficit:
     """The largest phi on `triangles`, between bounds that agree to `tolerance` [m].
 
@@ -185,7 +184,7 @@ def largest_deficit(
 
 
 def uncovered_area(
-    triangles: Float64, centers: Float64, radii: Float64, *, resolution: float = RESOLUTION
+    triangles: Float64, centers: Float64, radii: Float64, *, resolution: float = COVERED_EDGE
 ) -> tuple[float, float, float]:
     """Area [m2] with phi > 0: the best guess, and the bounds that hold for certain.
 

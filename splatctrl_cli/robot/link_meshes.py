@@ -10,14 +10,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
+from splatctrl_cli.config.fixed import CYLINDER_SIDES, SPHERE_ROUNDS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh, load_mesh
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.urdf import MeshShape, Shape, UrdfFile
-
-SIDES = 96  # of the prism that stands for a cylinder: 0.05 % of its radius
-ROUNDS = 4  # of splitting an octahedron's faces by four: 2048 faces stand for a sphere, 0.3 % of its radius
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +123,7 @@ def _primitive(shape: Shape) -> Solid:
         vertices, faces, slack = *_box(np.array(shape.size)), 0.0
     elif shape.kind == "cylinder":
         vertices, faces = _prism(*shape.size)
-        slack = shape.size[0] * (1 - np.cos(np.pi / SIDES))
+        slack = shape.size[0] * (1 - np.cos(np.pi / CYLINDER_SIDES))
     else:
         vertices, faces, slack = _ball(shape.size[0])
     mesh = TriangleMesh(vertices=transform_points(shape.T_link_shape, vertices), faces=faces, is_closed=True)
@@ -192,20 +190,20 @@ def _box(size: Float64) -> tuple[Float64, NDArray[np.int64]]:
 
 
 def _prism(radius: float, length: float) -> tuple[Float64, NDArray[np.int64]]:
-    """A prism of SIDES sides inside a cylinder along z, edges on its surface."""
-    angle = 2 * np.pi * np.arange(SIDES) / SIDES
-    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(SIDES)], axis=1)
+    """A prism of CYLINDER_SIDES sides inside a cylinder along z, edges on its surface."""
+    angle = 2 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(CYLINDER_SIDES)], axis=1)
     up = np.array([0.0, 0.0, length / 2])
     vertices = np.concatenate([ring - up, ring + up, [-up, up]])
-    i = np.arange(SIDES)
-    j = (i + 1) % SIDES
-    low, high = np.full(SIDES, 2 * SIDES), np.full(SIDES, 2 * SIDES + 1)
+    i = np.arange(CYLINDER_SIDES)
+    j = (i + 1) % CYLINDER_SIDES
+    low, high = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES), np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES + 1)
     faces = np.concatenate(
         [
-            np.stack([i, j, j + SIDES], axis=1),
-            np.stack([i, j + SIDES, i + SIDES], axis=1),
+            np.stack([i, j, j + CYLINDER_SIDES], axis=1),
+            np.stack([i, j + CYLINDER_SIDES, i + CYLINDER_SIDES], axis=1),
             np.stack([low, j, i], axis=1),
-            np.stack([high, i + SIDES, j + SIDES], axis=1),
+            np.stack([high, i + CYLINDER_SIDES, j + CYLINDER_SIDES], axis=1),
         ]
     )
     return vertices, faces.astype(np.int64)
@@ -216,7 +214,7 @@ def _ball(radius: float) -> tuple[Float64, NDArray[np.int64], float]:
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     corners = axes[np.array(faces)]
-    for _ in range(ROUNDS):
+    for _ in range(SPHERE_ROUNDS):
         a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
         ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))
         corners = np.concatenate(

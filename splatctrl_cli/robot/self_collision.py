@@ -7,13 +7,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import NEVER_MARGIN
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.srdf import DisabledPair
 
 Int64 = NDArray[np.int64]
 CHUNK = 200  # postures at a time
-NEVER_MARGIN = 0.02  # [m] a pair that comes nearer than this in a sample is kept, though it never collides there
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,19 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from splatctrl_cli.config.fixed import DEFICIT_GAP, FIT_BISECTIONS, FIT_MIN_PATCH, FIT_ROUNDS, FIT_STEPS, FIT_TIE
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.records import Bool, Float64, SphereSet
-from splatctrl_cli.robot.coverage import TOLERANCE, areas, largest_deficit, refined
+from splatctrl_cli.robot.coverage import areas, largest_deficit, refined
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 
 Int64 = NDArray[np.int64]
 
-MIN_PATCH = 2e-3  # [m] longest edge of a patch, at the least
-BISECTIONS = 10
-ROUNDS = 12  # of assignment and recentring
-STEPS = (0.5, 0.25, 0.125, 0.0625)  # of the lattice spacing, tried about each centre
 DIGITS = 6  # of a written sphere: micrometres
-TIE = 0.05  # a candidate within this share of the best gain may be picked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +89,7 @@ def _shared_out(links: Sequence["_Link"], budget: int) -> list[tuple[Float64, Fl
     """
     low, high = 0.0, max(link.single for link in links)
     chosen = [np.array([link.middle]) for link in links]
-    for _ in range(BISECTIONS):
+    for _ in range(FIT_BISECTIONS):
         t = 0.5 * (low + high)
         covers = _covers(links, t, budget)
         if covers is None:
@@ -134,7 +130,7 @@ class _Link:
         area = float(areas(surface).sum())
         if not area > 0:
             raise InputError(f"link '{name}': expected a collision surface, got none of any area")
-        longest = max(MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))
+        longest = max(FIT_MIN_PATCH, 2 * float(np.sqrt(area / options.num_patches)))
         cut = [refined(part.surface.corners, longest)[0] for part in parts]
         self._slack = np.concatenate([np.full(len(t), p.slack) for t, p in zip(cut, parts, strict=True)])
         patches = np.concatenate(cut)
@@ -178,7 +174,7 @@ class _Link:
     def best(self, count: int, state: tuple[Float64, float]) -> tuple[Float64, float]:
         """Centres (n, 3), n <= count, and their protrusion: the best found, not worse than `state`."""
         low, high = 0.0, state[1]
-        for _ in range(BISECTIONS // 2):
+        for _ in range(FIT_BISECTIONS // 2):
             t = 0.5 * (low + high)
             cover = self.cover(t, at_most=count)
             if cover is None:
@@ -193,7 +189,7 @@ class _Link:
     def improved(self, chosen: Int64) -> tuple[Float64, float]:
         """Centres (n, 3) after alternating assignment and recentring, and their protrusion [m]."""
         centers = self._candidates[chosen]
-        for _ in range(ROUNDS):
+        for _ in range(FIT_ROUNDS):
             owner, worst = self._assigned(centers)
             moved = centers.copy()
             for ball in range(len(centers)):
@@ -219,14 +215,14 @@ class _Link:
             largest_deficit(part.surface.corners, centers, radii - part.slack, floor=-np.inf).proven
             for part in self._parts
         )
-        allowed = max(self._options.max_deficit - TOLERANCE, 0.0)  # so that what is proven keeps to it
+        allowed = max(self._options.max_deficit - DEFICIT_GAP, 0.0)  # so that what is proven keeps to it
         radii = np.maximum(radii - max(spare, 0.0) - allowed, 10**-DIGITS)
         return centers, np.ceil(radii * 10**DIGITS + 1e-3) / 10**DIGITS
 
     def _polished(self, centers: Float64) -> tuple[Float64, float]:
         """Each centre moved by fractions of the lattice spacing while that lowers what its patches need."""
         offsets = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.float64)
-        for step in STEPS:
+        for step in FIT_STEPS:
             owner, worst = self._assigned(centers)
             tried = (centers[:, None] + step * self._spacing * offsets).reshape(-1, 3)
             cost = (self._reach(tried) + self._distance(tried)[:, None]).reshape(len(centers), len(offsets), -1)
@@ -286,7 +282,7 @@ def _greedy(by_patch: Bool, rng: np.random.Generator | None, at_most: int) -> li
         if rng is None:
             choice = int(np.argmax(gain))
         else:
-            choice = int(rng.choice(np.flatnonzero(gain >= (1 - TIE) * gain.max())))
+            choice = int(rng.choice(np.flatnonzero(gain >= (1 - FIT_TIE) * gain.max())))
         picked.append(choice)
         newly = pending & by_patch[:, choice]
         gain = gain - by_patch[newly].sum(axis=0, dtype=np.int32)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import DEAD_LOGIT
 from splatctrl_cli.kernels.raster import Moments, unpack_parameters
 from splatctrl_cli.records import Bool, Columns, Float32, Float64, Label, SplatSet
 
-DEAD_LOGIT = -6.9  # opacity 0.001, below what the rasteriser blends
 CENTER, LOG_RADIUS, COLOR, LOGIT = slice(0, 3), 3, slice(4, 7), 7
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import CONTACT_REACH, CONTACT_THICKNESS
 from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Bool, Label, RgbdFrame, SplatSet
 from splatctrl_cli.robot.declared_contact import Declarations
@@ -17,24 +18,21 @@ from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.seeding import gap_seeds, world_points_at
 from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, farthest_within, nearest_within, pixels_of
 
-THICKNESS = 0.2  # [m] of a link at most: so far behind what a camera sees of it something may touch it
-CONTACT = 0.02  # [m] an object so near to the robot may touch it where the robot hides it
-
 
 def is_in_contact(points_world: NDArray[np.floating], robot: RobotPosture) -> Bool:
-    """Points (N, 3) [m] within `CONTACT` of the robot's moving links."""
-    return np.asarray(robot.distance_to_moving(points_world) < CONTACT)
+    """Points (N, 3) [m] within `CONTACT_REACH` of the robot's moving links."""
+    return np.asarray(robot.distance_to_moving(points_world) < CONTACT_REACH)
 
 
 def contact_pixels(frame: RgbdFrame, mask: SelfMask, robot: RobotPosture) -> Bool:
-    """Pixels (H, W) of objects within `CONTACT` of the robot's moving links."""
+    """Pixels (H, W) of objects within `CONTACT_REACH` of the robot's moving links."""
     is_robot: Bool = mask.robot_depth > 0
     chosen: Bool = mask.kinds == PixelKind.OBJECT
     if not is_robot.any():
         return np.zeros_like(chosen)
-    shown, reach = mask.robot_depth, pixels_of(CONTACT, frame, mask.robot_depth)
-    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT  # few, and all that may be
-    chosen &= frame.depth < farthest_within(shown, reach) + CONTACT + THICKNESS
+    shown, reach = mask.robot_depth, pixels_of(CONTACT_REACH, frame, mask.robot_depth)
+    chosen &= frame.depth > nearest_within(shown, is_robot, reach) - CONTACT_REACH  # few, and all that may be
+    chosen &= frame.depth < farthest_within(shown, reach) + CONTACT_REACH + CONTACT_THICKNESS
     chosen[chosen] = is_in_contact(world_points_at(frame, chosen), robot)
     return chosen
 
@@ -48,7 +46,7 @@ def count_carried(
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     poses = dict(zip(surface.links, T_world_link, strict=True))
     points = world_points_at(frame, mask.kinds == PixelKind.ROBOT)
-    is_own = bare.distance(bare.poses(poses), points) < CONTACT / 2
+    is_own = bare.distance(bare.poses(poses), points) < CONTACT_REACH / 2
     for link in dict.fromkeys(link for link, _ in declared.carried_at(time_s)):
         declared.is_carried(link, transform_points(invert_transform(poses[link]), points[~is_own]), time_s)
 
@@ -87,7 +85,7 @@ def contact_seeds(
 def hidden_objects(
     buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
 ) -> NDArray[np.intp]:
-    """Slots (K,) of objects within `CONTACT` of the moving robot that no pixel shows.
+    """Slots (K,) of objects within `CONTACT_REACH` of the moving robot that no pixel shows.
 
     What an image shows there is the robot; fitting them to it would pull them out of their object.
     """

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import GaussianConfig
+from splatctrl_cli.config.fixed import SPLIT_PARTS
 from splatctrl_cli.kernels.gaussians import (
     CENTER,
     GRADIENT_SUM,
@@ -21,8 +22,6 @@ from splatctrl_cli.kernels.gaussians import (
     GaussianArrays,
 )
 from splatctrl_cli.records import Bool, Float32, Float64
-
-NUM_PARTS = 2  # Gaussians that a split one becomes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +77,7 @@ def densify(
 
 def split_parts(parameters: Float32, shrink: float, rng: np.random.Generator) -> Float32:
     """Two Gaussians for each of parameters (N, 59): centres drawn from it, sigmas divided by `shrink`; (2N, 59)."""
-    parts = np.repeat(parameters, NUM_PARTS, axis=0)
+    parts = np.repeat(parameters, SPLIT_PARTS, axis=0)
     local = rng.standard_normal((len(parts), 3)) * np.exp(parts[:, LOG_SCALE])
     parts[:, CENTER] += np.einsum("nij,nj->ni", rotations(parts[:, QUAT]), local).astype(np.float32)
     parts[:, LOG_SCALE] -= np.float32(np.log(shrink))

@@ -11,10 +11,9 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config.fixed import NARROW_HOLE
 from splatctrl_cli.geometry import back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
-
-NARROW = 2.0  # voxels: holes that are not wider are common beside edges
 
 MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundred million
 
@@ -23,7 +22,7 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     """Points (K, 3) [m], world, on the rays of a frame's holes, half a voxel [m] apart along each; some at a time.
 
     From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
-    holes up to `NARROW` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none; a gap
+    holes up to `NARROW_HOLE` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none; a gap
     beside the robot may show what is far behind it, and is not a hole.
     """
     blank = _holes(frame, robot_depth)
@@ -32,7 +31,7 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
     voxel = config.voxel
     behind = _nearest_depth(frame.depth)
     width = voxel * frame.intrinsics.fx / float(np.median(behind[blank]))  # pixels
-    narrow, apart = int(NARROW * width) | 1, max(int(width), 1)  # OpenCV shifts an even window
+    narrow, apart = int(NARROW_HOLE * width) | 1, max(int(width), 1)  # OpenCV shifts an even window
     wide = cv2.morphologyEx(blank.view(np.uint8), cv2.MORPH_OPEN, np.ones((narrow, narrow), np.uint8))
     v, u = np.nonzero(wide[::apart, ::apart])
     v, u = v * apart, u * apart

@@ -4,13 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from splatctrl_cli.config.fixed import EVICT_ASKED, EVICT_NEARER, EVICT_NEAREST
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, SplatSet
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
-
-NEAREST = 8  # splats that are asked whether they stand for a voxel
-ASKED_PER_SEED = 8  # splats that are looked at for each slot that is missing, those that show least
-NEARER = 0.3  # [m] by which a surface must be nearer to the robot's path than one that is given up for it
 
 
 def room_for(
@@ -24,7 +21,7 @@ def room_for(
     splats, live = buffer.splats(occupancy.num_threads), np.flatnonzero(buffer.is_alive)
     stands = splats.labels != Label.ROBOT
     others, may_go = live[stands], live[splats.labels == Label.OBJECT]
-    weakest = may_go[np.argsort(shown[may_go], kind="stable")][: ASKED_PER_SEED * num]
+    weakest = may_go[np.argsort(shown[may_go], kind="stable")][: EVICT_ASKED * num]
     order, voxels = np.searchsorted(others, weakest), occupancy.occupied_centers()
     chosen = others[redundant(order, num, splats.select(stands), voxels, tolerance, occupancy.num_threads)]
     is_evicted = np.zeros(len(shown), bool)
@@ -58,7 +55,7 @@ def redundant(
     of_splat = cKDTree(voxels).query_ball_point(splats.centers[order], reach, workers=num_threads)
     asked = np.unique(np.concatenate([np.asarray(found, np.intp) for found in of_splat]))
     count = np.zeros(len(voxels), np.int64)
-    ranks = np.arange(1, min(NEAREST, len(splats)) + 1)
+    ranks = np.arange(1, min(EVICT_NEAREST, len(splats)) + 1)
     distance, nearest = cKDTree(splats.centers).query(voxels[asked], k=ranks, workers=num_threads)
     count[asked] = (distance - splats.radii[nearest] <= tolerance).sum(axis=1)
     chosen: list[np.intp] = []
@@ -72,8 +69,8 @@ def redundant(
 
 
 def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> NDArray[np.intp]:
-    """At most `num_wanted` splats (N, 3), farthest first, each of which is NEARER or more farther from the robot's
-    path than a seed (K, 3) that gets its slot; seeds come nearest first.
+    """At most `num_wanted` splats (N, 3), farthest first, each of which is EVICT_NEARER or more farther from the
+    robot's path than a seed (K, 3) that gets its slot; seeds come nearest first.
 
     Farther by that much, so that no two surfaces ever take each other's slots in turn.
     """
@@ -81,7 +78,7 @@ def far_away(num_wanted: int, seeds: Float32, centers: Float32, path: Box) -> ND
     farthest = np.argsort(-to_splat, kind="stable")[:num_wanted]
     to_seed = np.sort(distance_to_box(seeds, path))[:num_wanted]
     pairs = min(len(farthest), len(to_seed))
-    is_worth_it = to_splat[farthest[:pairs]] >= to_seed[:pairs] + NEARER
+    is_worth_it = to_splat[farthest[:pairs]] >= to_seed[:pairs] + EVICT_NEARER
     return farthest[:pairs][np.logical_and.accumulate(is_worth_it)]
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
+from splatctrl_cli.config.fixed import EVICT_EVERY, NOT_COVERED, REFINE_BLOCKS, SEED_MUCH_MORE
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet
@@ -46,11 +47,6 @@ from splatctrl_cli.scene.self_mask import (
 )
 from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
 from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid
-
-MUCH_MORE = 4  # times the pixels to seed than when the density was chosen: it is chosen again
-NOT_COVERED = 0.05  # accumulated opacity below which the background shows
-EVICT_EVERY = 5  # time steps: it takes as long as a few iterations, and what has no splat is a ball until then
-NUM_BLOCKS = 10  # of refining; splats are removed after each, and seeded after each but the last two
 
 
 class SceneFitter:
@@ -140,9 +136,9 @@ class SceneFitter:
         with the block after the last one done.
         """
         views = [*self.window.newest, *self.window.keyframes]
-        for block in range(self.refined.num_blocks, NUM_BLOCKS):
+        for block in range(self.refined.num_blocks, REFINE_BLOCKS):
             self._refine_block(block, num_iterations, views)
-            progress(num_iterations * (block + 1) // NUM_BLOCKS)
+            progress(num_iterations * (block + 1) // REFINE_BLOCKS)
         removed = dict(self.refined.removed)
         masks = [object_mask(view.frame) for view in views]
         filled = self.refined.filled + self._fill_gaps(views, masks, removed)
@@ -151,14 +147,14 @@ class SceneFitter:
     def _refine_block(self, block: int, num_iterations: int, views: Sequence[View]) -> None:
         rng = np.random.default_rng([self.seed, self.num_steps, 1 + block])
         nowhere = np.zeros(self.config.max_splats, bool)
-        rate = self.config.final_rate ** (block / (NUM_BLOCKS - 1))
-        count = num_iterations * (block + 1) // NUM_BLOCKS - num_iterations * block // NUM_BLOCKS
+        rate = self.config.final_rate ** (block / (REFINE_BLOCKS - 1))
+        count = num_iterations * (block + 1) // REFINE_BLOCKS - num_iterations * block // REFINE_BLOCKS
         settings = self.descent.settings(rate, rate * self.config.refine_geometry)
         self.descent.run(self.window.schedule(count, rng), settings)
         # What one view sees through stays here: its removal costs 0.6 dB where poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
-        if block < NUM_BLOCKS - 2:
+        if block < REFINE_BLOCKS - 2:
             filled += self._seed(views, [object_mask(view.frame) for view in views])
             filled += self._use_idle(views, rng, removed)
         self.refined = Refined(
@@ -265,7 +261,7 @@ class SceneFitter:
         num_candidates = sum(len(source) for source in everything)
         if not num_candidates:
             return Filled()
-        if self.density is None or num_candidates > MUCH_MORE * self.density.num_candidates:
+        if self.density is None or num_candidates > SEED_MUCH_MORE * self.density.num_candidates:
             count = max(int(self.config.fill * self.config.max_splats), 1)
             self.density = density_for(everything, count, self.config)
         reserve = int(self.config.gap_reserve * self.config.max_splats)

@@ -16,9 +16,9 @@ from splatctrl_cli.kernels.gaussians import (
 from splatctrl_cli.records import Float32, Float64, GaussianSet, Intrinsics, Label
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering, camera_array
+from splatctrl_cli.splat_files.splat_format import SH_C0
 
 LARGEST_LOGIT = 16.0  # opacity 1 to float32
-SH_0 = 0.28209479177387814  # the constant harmonic, 1 / (2 sqrt(pi))
 PER_CHANNEL = 16  # harmonics
 
 
@@ -29,7 +29,7 @@ def seeded(seeds: Seeds, opacity: float) -> Float32:
     rows[:, LOG_SCALE] = np.log(seeds.radii)[:, None]
     rows[:, QUAT.start] = 1.0
     rows[:, LOGIT] = np.log(opacity / (1.0 - opacity))
-    rows[:, RED_0::PER_CHANNEL] = (seeds.colors - 0.5) / SH_0
+    rows[:, RED_0::PER_CHANNEL] = (seeds.colors - 0.5) / SH_C0
     return rows
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config.fixed import WELL_INSIDE
 from splatctrl_cli.geometry import invert_transform, project, transform_points
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.buffer import SplatBuffer
@@ -14,7 +15,6 @@ from splatctrl_cli.scene.self_mask import PixelKind, SelfMask, tolerance_at
 from splatctrl_cli.voxels import SOLID
 
 Seen = Sequence[tuple[RgbdFrame, SelfMask]]
-WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be an object there is the robot's own
 
 
 def relabel(buffer: SplatBuffer, occupancy: OccupancyMap, robot: RobotPosture | None, seen: Seen = ()) -> Bool:

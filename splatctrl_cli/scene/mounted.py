@@ -9,31 +9,20 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, label, uniform_filter
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
-
-MIN_VIEWS = 6  # from places this far apart ...
-MIN_DISTANCE = 0.02  # [m]
-MAX_VIEWS = 24  # more say nothing new
-BLUR = 2.0  # [px] against sensor noise
-MAX_DEVIATION = 0.055  # median absolute deviation of a colour over the views, of 1
-MAX_DEPTH_SHARE = 0.08  # of depths beyond the least range around a pixel: what is measured there is the world
-MIN_TEXTURE = 0.01  # standard deviation around a pixel: a flat colour without depth is the background
-NEIGHBOURHOOD = 15  # [px]
-MIN_AREA = 0.005  # of the image: a part that is smaller, or that does not enter at the border, is chance
-MARGIN = 4  # [px] around what was found
-MIN_BACKGROUND = 0.005  # share of the pixels that shows it; fewer are noise
 
 
 def spread_views(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
-    """Frames, in order, each from a place further than `MIN_DISTANCE` from all before it; at most `MAX_VIEWS`."""
+    """At most `MOUNTED_MAX_VIEWS` frames, in order, each farther than `MOUNTED_APART` from all before it."""
     chosen: list[RgbdFrame] = []
     places: list[Float64] = []
     for frame in frames:
         place = frame.T_world_camera[:3, 3]
-        if all(np.linalg.norm(place - other) > MIN_DISTANCE for other in places):
+        if all(np.linalg.norm(place - other) > fixed.MOUNTED_APART for other in places):
             chosen.append(frame)
             places.append(place)
-    return chosen[:MAX_VIEWS]
+    return chosen[: fixed.MOUNTED_MAX_VIEWS]
 
 
 def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None:
@@ -41,16 +30,17 @@ def mounted_pixels(frames: Sequence[RgbdFrame], min_range: float) -> Bool | None
 
     Such a pixel keeps its colour from view to view, is not flat, and has hardly a depth of `min_range` [m] or more.
     """
-    if len(frames) < MIN_VIEWS:
+    if len(frames) < fixed.MOUNTED_MIN_VIEWS:
         return None
     colors = np.stack([_blurred(frame) for frame in frames])
     median = np.median(colors, axis=0)
     deviation = np.median(np.abs(colors - median), axis=0).max(axis=-1)
     has_depth = np.mean([frame.depth >= min_range for frame in frames], axis=0, dtype=np.float64)
-    depth_share = uniform_filter(has_depth, NEIGHBOURHOOD)
-    found = (deviation < MAX_DEVIATION) & (depth_share < MAX_DEPTH_SHARE) & (_texture(frames[0]) > MIN_TEXTURE)
+    depth_share = uniform_filter(has_depth, fixed.MOUNTED_WINDOW)
+    found = (deviation < fixed.MOUNTED_DEVIATION) & (depth_share < fixed.MOUNTED_DEPTH)
+    found &= _texture(frames[0]) > fixed.MOUNTED_TEXTURE
     entering = _entering(binary_opening(found, np.ones((5, 5), bool)))
-    return np.asarray(binary_dilation(entering, np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), bool)))
+    return np.asarray(binary_dilation(entering, np.ones(2 * (2 * fixed.MOUNTED_MARGIN + 1,), bool)))
 
 
 def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tuple[float, float, float]:
@@ -61,11 +51,11 @@ def background_color(frames: Sequence[RgbdFrame], counted: Sequence[Bool]) -> tu
     """
     parts = []
     for frame, mask in zip(frames, counted, strict=True):
-        near_depth = uniform_filter((frame.depth > 0).astype(np.float32), NEIGHBOURHOOD) > 1e-4
+        near_depth = uniform_filter((frame.depth > 0).astype(np.float32), fixed.MOUNTED_WINDOW) > 1e-4
         parts.append(frame.color[mask & ~near_depth])
     colors = np.concatenate(parts)
     num_pixels = sum(frame.depth.size for frame in frames)
-    if len(colors) < MIN_BACKGROUND * num_pixels:
+    if len(colors) < fixed.MOUNTED_BACKGROUND * num_pixels:
         return (0.0, 0.0, 0.0)
     red, green, blue = (float(value) / 255.0 for value in np.median(colors, axis=0))
     return (red, green, blue)
@@ -76,15 +66,16 @@ def _entering(mask: Bool) -> Bool:
     parts, _ = label(mask)
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     area = np.bincount(parts.ravel())
-    kept = [part for part in border if part and area[part] >= MIN_AREA * mask.size]
+    kept = [part for part in border if part and area[part] >= fixed.MOUNTED_AREA * mask.size]
     return np.isin(parts, kept)
 
 
 def _blurred(frame: RgbdFrame) -> Float32:
-    return np.asarray(gaussian_filter(frame.color.astype(np.float32) / 255.0, (BLUR, BLUR, 0)), np.float32)
+    sigma = fixed.MOUNTED_BLUR
+    return np.asarray(gaussian_filter(frame.color.astype(np.float32) / 255.0, (sigma, sigma, 0)), np.float32)
 
 
 def _texture(frame: RgbdFrame) -> Float64:
     grey = frame.color.mean(axis=-1) / 255.0
-    mean = uniform_filter(grey, NEIGHBOURHOOD)
-    return np.asarray(np.sqrt(np.maximum(uniform_filter(grey * grey, NEIGHBOURHOOD) - mean**2, 0.0)))
+    mean = uniform_filter(grey, fixed.MOUNTED_WINDOW)
+    return np.asarray(np.sqrt(np.maximum(uniform_filter(grey * grey, fixed.MOUNTED_WINDOW) - mean**2, 0.0)))

@@ -10,10 +10,9 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.kernels.occupancy import DepthImage, integrate_depth, label_hits, mark_spheres, pack_grid
 from splatctrl_cli.records import Bool, Box, Float32, Float64, Label, RgbdFrame
-from splatctrl_cli.voxels import SOLID, SWEPT, UNANSWERED, Balls, KnownVoxels, OccupancyGrid
+from splatctrl_cli.voxels import MOST_VOXELS, SOLID, SWEPT, UNANSWERED, Balls, KnownVoxels, OccupancyGrid
 
-MAX_VOXELS = 400_000_000
-MAX_STEPS = 65_534  # time steps that `last_seen` tells apart
+MAX_STEPS = UNANSWERED - 1  # time steps that `last_seen` tells apart
 
 
 class OccupancyMap:
@@ -24,7 +23,7 @@ class OccupancyMap:
         self.num_threads = num_threads
         extent = workspace.upper - workspace.lower
         shape = tuple(int(n) for n in np.maximum(np.ceil(extent / config.voxel), 1))
-        if np.prod([float(n) for n in shape]) > MAX_VOXELS:
+        if np.prod([float(n) for n in shape]) > MOST_VOXELS:
             size = " x ".join(f"{e:.1f}" for e in extent)
             raise UsageError(
                 f"workspace of {size} m: too large for {config.voxel} m voxels",

@@ -6,16 +6,10 @@ from itertools import combinations
 
 import numpy as np
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project, transform_points
-from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.records import Float64, RgbdFrame, spread
 from splatctrl_cli.scene.seeding import world_points
-
-LIMIT = 0.03  # [m] at up to 1 m: beyond it a surface lies in two voxels, and each camera frees the other's
-SAME_SURFACE = 0.3  # [m] two views that differ by more see different surfaces: one hides the other's
-MIN_PIXELS = 200  # fewer that both see say nothing
-MAX_PAIRS = 100  # of views that are compared
-ROWS = 60  # of an image that are looked at, and as many pixels of a row in proportion
-CLOSE_NS = 1_000_000_000  # poses further apart in time may be anywhere
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +27,7 @@ class Agreement:
     @property
     def limit(self) -> float:
         """What two good cameras may differ by [m]: 3 cm, from 1 m on 3 % of the depth (2 % each, independent)."""
-        return LIMIT * max(1.0, self.depth)
+        return fixed.PAIR_LIMIT * max(1.0, self.depth)
 
     @property
     def holds(self) -> bool:
@@ -56,15 +50,14 @@ def agreements(frames: Sequence[RgbdFrame], min_range: float, max_range: float) 
 
     Views of one and the same camera are compared, too. Depth counts from `min_range` to `max_range` [m].
     """
-    pairs = list(combinations(range(len(frames)), 2))
-    pairs = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MAX_PAIRS)).astype(int))]
+    pairs = spread(list(combinations(range(len(frames)), 2)), fixed.PAIR_MOST)
     found: dict[tuple[str, str], list[Float64]] = {}
     for i, j in pairs:
         a, b = sorted((frames[i], frames[j]), key=lambda frame: frame.camera)
         both = [differences(a, b, min_range, max_range), differences(b, a, min_range, max_range)]
         found.setdefault((a.camera, b.camera), []).extend(both)
     rows = {cameras: np.concatenate(parts) for cameras, parts in sorted(found.items())}
-    return [_agreement(cameras, row) for cameras, row in rows.items() if len(row) >= MIN_PIXELS]
+    return [_agreement(cameras, row) for cameras, row in rows.items() if len(row) >= fixed.PAIR_MIN_PIXELS]
 
 
 def _agreement(cameras: tuple[str, str], rows: Float64) -> Agreement:
@@ -79,8 +72,8 @@ def _agreement(cameras: tuple[str, str], rows: Float64) -> Agreement:
 
 
 def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) -> Float64:
-    """|dz| and depth (K, 2) [m] in view b, at points of view a that land on a depth of b within `SAME_SURFACE`."""
-    stride = max(1, a.intrinsics.height // ROWS)
+    """|dz| and depth (K, 2) [m] in view b, at points of view a that land on depth of b within `PAIR_SAME_SURFACE`."""
+    stride = max(1, a.intrinsics.height // fixed.PAIR_ROWS)
     is_used = np.zeros(a.depth.shape, bool)
     is_used[::stride, ::stride] = True
     is_used &= (a.depth >= min_range) & (a.depth <= max_range)
@@ -91,7 +84,7 @@ def differences(a: RgbdFrame, b: RgbdFrame, min_range: float, max_range: float) 
     u, v = pixels[is_inside].astype(np.int64).T
     measured = b.depth[v, u].astype(np.float64)
     offset = np.abs(points[is_inside, 2] - measured)
-    is_same = (measured >= min_range) & (measured <= max_range) & (offset <= SAME_SURFACE)
+    is_same = (measured >= min_range) & (measured <= max_range) & (offset <= fixed.PAIR_SAME_SURFACE)
     return np.stack([offset[is_same], measured[is_same]], axis=1)
 
 
@@ -115,7 +108,7 @@ def largest_jump(poses: Iterable[tuple[int, str, Float64]]) -> PoseJump | None:
     for stamp_ns, camera, T_world_camera in poses:
         before_ns, position = last.get(camera, (stamp_ns, T_world_camera[:3, 3]))
         distance = float(np.linalg.norm(T_world_camera[:3, 3] - position))
-        if stamp_ns - before_ns <= CLOSE_NS and (largest is None or distance > largest.distance):
+        if stamp_ns - before_ns <= fixed.PAIR_CLOSE_NS and (largest is None or distance > largest.distance):
             largest = PoseJump(camera=camera, distance=distance, before_ns=before_ns, after_ns=stamp_ns)
         last[camera] = (stamp_ns, T_world_camera[:3, 3])
     return largest

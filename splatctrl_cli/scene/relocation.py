@@ -9,11 +9,10 @@ from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.fixed import SEED_OVERSAMPLING
 from splatctrl_cli.records import Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
 from splatctrl_cli.scene.seeding import NO_SEEDS, world_points
-
-OVERSAMPLING = 4  # pixels drawn per splat, before those too near to each other go
 
 
 def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
@@ -70,7 +69,7 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
         sizes.append((frame.depth[mask] / focal).astype(np.float32))
         weights.append(np.square(uniform_filter(misfit.error, 3)[mask] * frame.depth[mask], dtype=np.float64))
     weight = np.concatenate(weights)
-    count = min(OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
+    count = min(SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
     if count == 0:
         return NO_SEEDS
     drawn = rng.choice(len(weight), size=count, replace=False, p=weight / weight.sum())

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.fixed import OPAQUE_ENOUGH
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.raster import LossTerms, LossWeights, Rasteriser, pack_camera
@@ -14,7 +15,6 @@ from splatctrl_cli.records import Float32, Float64, Intrinsics, SplatSet
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
-OPAQUE_ENOUGH = 0.5  # accumulated opacity from which a pixel has a depth of its own
 
 
 @dataclass(frozen=True, kw_only=True)

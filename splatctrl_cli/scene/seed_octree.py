@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import SEED_BEND
 from splatctrl_cli.records import Bool, Float32, Float64
 
-BEND = 2.0  # weight of the thickness of a cube's points, in squared edges, beside squared colour differences
 Index = NDArray[np.int64]
 
 
@@ -24,7 +24,7 @@ class CubeLevel:
     A cube's point is the measured one nearest to the mean of its points: the mean itself would hang in the air of a
     concave corner.
 
-    detail is the number of points times (colour variance + BEND * least variance of position / edge^2): what one
+    detail is the number of points times (colour variance + SEED_BEND * least variance of position / edge^2): what one
     splat in the cube fails to explain. parent is the cube one level up that holds it.
     """
 
@@ -62,7 +62,7 @@ def _level(points: Float32, colors: Float32, cube: Index, parent: Index, edge: f
     upper = mean(offset[:, [0, 0, 0, 1, 1, 2]] * offset[:, [0, 1, 2, 1, 2, 2]])
     covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     thickness = np.maximum(np.linalg.eigvalsh(covariance)[:, 0], 0.0)
-    detail = count * (np.maximum(color_variance, 0.0) + BEND * thickness / edge**2)
+    detail = count * (np.maximum(color_variance, 0.0) + SEED_BEND * thickness / edge**2)
     nearest = _least(np.sum(offset**2, axis=1), cube, len(count))
     return CubeLevel(edge=edge, points=points[nearest], colors=color, detail=detail, parent=parent)
 

@@ -8,17 +8,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.fixed import SEED_CROWDED, SEED_LEVELS
 from splatctrl_cli.geometry import back_project, back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
 from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
 
-NUM_LEVELS = 3  # cubes of one edge, half and a quarter of it
 NO_SEEDS = Seeds(
     centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3), np.float32)
 )
-CROWDED = 0.7  # of the edge: nearer than this to a live splat nothing is seeded
 
 
 def world_points(frame: RgbdFrame) -> Float64:
@@ -96,7 +95,7 @@ def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig) 
     edge = config.max_radius / config.radius_per_edge
     while edge < extent and len(cube_levels(points, colors, edge, 1)[0].detail) > count:
         edge *= 1.05
-    tolerance = tolerance_for(cube_levels(points, colors, edge, NUM_LEVELS), count)
+    tolerance = tolerance_for(cube_levels(points, colors, edge, SEED_LEVELS), count)
     return SeedDensity(edge=edge, tolerance=tolerance, num_candidates=len(points))
 
 
@@ -112,7 +111,7 @@ def seeds_at(
     cube instead, so r = min(max(radius_per_edge * edge, D/f), r_max).
     """
     points, colors, pixel = _joined(sources)
-    levels = cube_levels(points, colors, density.edge, NUM_LEVELS)
+    levels = cube_levels(points, colors, density.edge, SEED_LEVELS)
     chosen = leaves(levels, density.tolerance)
     parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)][
         ::-1
@@ -214,7 +213,8 @@ def _joined(sources: Sequence[Candidates]) -> tuple[Float32, Float32, float]:
 def _seeds_of(level: CubeLevel, mask: Bool, pixel: float, live_centers: Float32, config: SceneConfig) -> Seeds:
     centers, colors = level.points[mask].astype(np.float32), level.colors[mask].astype(np.float32)
     if len(live_centers) and len(centers):
-        is_free = ~np.isfinite(cKDTree(live_centers).query(centers, distance_upper_bound=CROWDED * level.edge)[0])
+        reach = SEED_CROWDED * level.edge
+        is_free = ~np.isfinite(cKDTree(live_centers).query(centers, distance_upper_bound=reach)[0])
         centers, colors = centers[is_free], colors[is_free]
     radius = np.clip(max(config.radius_per_edge * level.edge, pixel), config.min_radius, config.max_radius)
     return Seeds(centers=centers, radii=np.full(len(centers), radius, np.float32), colors=colors)

@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config.fixed import MASK_FAR_OFF, MASK_PIXELS, MASK_SIGMAS
 from splatctrl_cli.records import Bool, Float32, Label, RgbdFrame, UInt8
 from splatctrl_cli.scene.audit_row import AuditRow
 from splatctrl_cli.scene.posture import RobotPosture
-
-SIGMAS = 2.0  # of the sensor's error that the robot's surface may explain
-FAR_OFF = 0.10  # [m] a residual beyond it is something else, before or behind the robot
-MIN_PIXELS = 100  # of a link, fewer say nothing of its residual
 
 
 class PixelKind(IntEnum):
@@ -31,9 +28,8 @@ class PixelKind(IntEnum):
 @dataclass(frozen=True, kw_only=True)
 class SelfMask:
     """kinds (H, W) uint8 of a frame's pixels (`PixelKind`); robot_depth (H, W) float32 [m] of the rendered robot, 0 =
-    none; residuals: by link, measured less rendered depth
-    (K,) [m] of pixels inside the robot's outline, up to `FAR_OFF`; num_inside: by link, measured points inside its
-    body that its surface does not explain.
+    none; residuals: by link, measured less rendered depth (K,) [m] of pixels inside the robot's outline, up to
+    `MASK_FAR_OFF`; num_inside: by link, measured points inside its body that its surface does not explain.
     """
 
     kinds: UInt8
@@ -59,7 +55,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
         frame.T_world_camera,
         frame.depth,
         tolerance=config.self_mask_tolerance,
-        quadratic=SIGMAS * config.depth_error,
+        quadratic=MASK_SIGMAS * config.depth_error,
     )
     kinds = object_mask(frame).kinds
     mask = SelfMask(kinds=kinds, robot_depth=shown.depth, residuals={}, num_inside={})
@@ -81,7 +77,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
     offset = depth - rendered
-    is_told = core & has_depth & (np.abs(offset) <= FAR_OFF) & (link < len(surface.links) - surface.num_carried)
+    is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
     return replace(
         mask,
@@ -137,7 +133,7 @@ def without_mixed(frame: RgbdFrame, mask: SelfMask) -> RgbdFrame:
 
 def tolerance_at(depth: Float32, config: OccupancyConfig) -> Float32:
     """By how much [m] a measured depth (...) [m] of the robot may differ from its rendered depth."""
-    return np.asarray(config.self_mask_tolerance + SIGMAS * config.depth_error * depth * depth, np.float32)
+    return np.asarray(config.self_mask_tolerance + MASK_SIGMAS * config.depth_error * depth * depth, np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +180,7 @@ def audited(masks: Sequence[SelfMask]) -> dict[str, Any]:
 
 def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
     """For ``run.json``, over the time steps: by link the median of its steps' residuals [mm] and its pixels
-    (`self_mask`); the largest of them by size where it rests on `MIN_PIXELS` (`self_mask_residual_mm`, None without
+    (`self_mask`); the largest of them by size where it rests on `MASK_PIXELS` (`self_mask_residual_mm`, None without
     any); points inside the robot (`inside_robot_points`), and the first step and link that had one.
     """
     links = dict.fromkeys(link for row in rows for link in row.self_mask)
@@ -196,7 +192,7 @@ def self_mask_metrics(rows: Sequence[AuditRow]) -> dict[str, Any]:
         middle = np.searchsorted(np.cumsum(np.array(counts)[order]), 0.5 * sum(counts))
         median = float(medians[order[middle]])
         found[link] = {"median_mm": median, "sign": int(np.sign(median)), "num_pixels": int(sum(counts))}
-    enough = [row["median_mm"] for row in found.values() if row["num_pixels"] >= MIN_PIXELS]
+    enough = [row["median_mm"] for row in found.values() if row["num_pixels"] >= MASK_PIXELS]
     first = next(((row.stamp_ns, link) for row in rows for link in row.inside_robot), (None, None))
     return {
         "self_mask": found,

@@ -7,13 +7,11 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import OCCUPIED_WITH_SPLATS, SPLATS_ON_SURFACE
 from splatctrl_cli.records import Label, SplatSet
 from splatctrl_cli.scene.seeding import SplatTree
 from splatctrl_cli.scene.unrepresented import representing_reach
 from splatctrl_cli.voxels import SWEPT, KnownVoxels, VoxelState
-
-LEAST_ON_SURFACE = 0.6  # measured: 0.98 on the sample, 1.00 on apc_shelf, 0.76 on office_sun3d (beyond max_range)
-LEAST_REPRESENTED = 0.95  # measured: 0.993 to 1; splats moved by 10 cm 0.83, those of 7 s before 0.88
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +28,7 @@ class GridAgreement:
     @property
     def holds(self) -> bool:
         """Whether both shares are what a reconstruction leaves; False where there is nothing to compare."""
-        return self.on_surface >= LEAST_ON_SURFACE and self.represented >= LEAST_REPRESENTED
+        return self.on_surface >= SPLATS_ON_SURFACE and self.represented >= OCCUPIED_WITH_SPLATS
 
 
 def agreement_with_grid(

@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import FRAMES_PER_STEP, JOINTS_GAP_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Box, Float64, JointState, PointCloud, Record, RgbdFrame
 from splatctrl_cli.scene.seeding import world_points
-
-LARGEST_STEP = 128  # frames of a scene without a clock that are taken in together; 640x480: 9 MiB each
-LARGEST_GAP_NS = 200_000_000  # a joint state older than this says nothing about a frame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +82,7 @@ def time_steps(
 
 def _is_complete(frames: Sequence[RgbdFrame], record: RgbdFrame, *, has_clock: bool, tolerance_ns: int) -> bool:
     if not has_clock:
-        return len(frames) >= LARGEST_STEP
+        return len(frames) >= FRAMES_PER_STEP
     is_later = record.stamp_ns - frames[0].stamp_ns > tolerance_ns
     return is_later or any(frame.camera == record.camera for frame in frames)
 
@@ -92,7 +90,7 @@ def _is_complete(frames: Sequence[RgbdFrame], record: RgbdFrame, *, has_clock: b
 def _time_step(frames: Sequence[RgbdFrame], joints: JointState | None) -> TimeStep:
     """Joint positions are carried to the frames' stamp by their velocities."""
     position = velocity = None
-    if joints is not None and abs(frames[-1].stamp_ns - joints.stamp_ns) <= LARGEST_GAP_NS:
+    if joints is not None and abs(frames[-1].stamp_ns - joints.stamp_ns) <= JOINTS_GAP_NS:
         elapsed = (frames[-1].stamp_ns - joints.stamp_ns) * 1e-9
         velocity = np.nan_to_num(joints.velocity)
         position = joints.position + elapsed * velocity

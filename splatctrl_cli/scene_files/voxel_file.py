@@ -13,9 +13,8 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.records import Label, UInt8
-from splatctrl_cli.voxels import UNANSWERED, Balls, KnownVoxels, OccupancyGrid, SeenVoxels, VoxelState
+from splatctrl_cli.voxels import MOST_VOXELS, UNANSWERED, Balls, KnownVoxels, OccupancyGrid, SeenVoxels, VoxelState
 
-MOST_VOXELS = 400_000_000  # as many as reconstruct makes
 _HEADER = 1 << 22  # bytes
 _SHORT = 0xFF  # `UNANSWERED` in one byte
 _GRID: Mapping[str, type[np.generic]] = {"log_odds": np.float32, "num_updates": np.uint16, "entity": np.uint8}

@@ -109,7 +109,6 @@ def _first(entry: TopicSurvey) -> str:
 
 
 _KNOWN_FILES = ("run.json", "splats.ply", "occupancy.npz", "field.json")
-_MOST_ROWS = 1000  # of a table of files
 
 
 def _describe_folder(path: Path, options: SourceOptions) -> Summary:
@@ -135,7 +134,7 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     kind = "MVSNet scan" if is_dtu else "scene folder" if "splats.ply" in names else "run folder"
     kind = "field folder" if field else kind
     rows: list[list[object]] = []
-    for name in names_in(path)[:_MOST_ROWS]:
+    for name in names_in(path)[:1000]:
         file = path / name
         rows.append([name + "/" if file.is_dir() else name, *files_below(file)])
     count, size = files_below(path)

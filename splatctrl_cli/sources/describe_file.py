@@ -22,7 +22,6 @@ from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.splat_files.splat_formats import describe_splats
 
-_HEAD = 1 << 16  # bytes in which a text header must end
 _MOST_SHOWN = 1 << 24  # bytes of texts and short lists
 _LIST_LIMIT = 12  # longer lists are counted, not shown
 
@@ -32,7 +31,7 @@ def describe_file(path: Path) -> Summary:
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty (0 bytes)", remedy="write or copy it again")
     with path.open("rb") as stream:
-        head = stream.read(_HEAD)
+        head = stream.read(1 << 16)  # bytes in which a text header must end
     for describe in _KINDS:
         if (summary := describe(path, head)) is not None:
             return summary

@@ -16,7 +16,6 @@ from splatctrl_cli.logs.state_messages import NAMELESS, pose_of_columns
 from splatctrl_cli.logs.state_track import RawTrack
 from splatctrl_cli.records import Float64, Stamps
 
-_MILLISECOND_NS = 1_000_000
 _DESCRIBE = "describe the columns in a .toml (docs/replay.md, Logs)"
 
 
@@ -150,7 +149,7 @@ def libfranka_track(table: CsvTable) -> RawTrack:
         "desired": desired if desired != sent else None,
         "pose": _block(table, "O_T_EE", 16),
     }
-    stamps, found = table.read(0, _MILLISECOND_NS, {name: of for name, of in wanted.items() if of is not None})
+    stamps, found = table.read(0, 1_000_000, {name: of for name, of in wanted.items() if of is not None})
     pose, velocity = found.get("pose"), found.get("velocity")
     has_sent = "sent" in found and any(np.nan_to_num(rows).any() for rows in blocks_of(found["sent"]))
     return RawTrack(

@@ -411,7 +411,7 @@ def test_files_that_were_logged_far_apart_are_found() -> None:
 
 
 def test_of_many_images_fewer_and_fewer_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatctrl_cli.checks.check_images.NUM_DECODED", 8)
+    monkeypatch.setattr("splatctrl_cli.checks.limits.DECODED_IMAGES", 8)
     report = checked(broken_log(tmp_path / "log.mcap", edited(COLOR, _cut, 27, 27)))
     assert only(list(report.findings), "sampled").what.startswith("32 of 60 images were decoded")
     assert only(above_note(report), "undecodable").value == 1  # by its missing end

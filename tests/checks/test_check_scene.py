@@ -55,9 +55,9 @@ def table(sample_data: Path) -> Table:
 
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatctrl_cli.checks.check_views.NUM_PAIRS", 24)
-    monkeypatch.setattr("splatctrl_cli.checks.check_views.NUM_POINTS", 700)
-    monkeypatch.setattr("splatctrl_cli.checks.check_views.MIN_LANDED", 300)
+    monkeypatch.setattr("splatctrl_cli.checks.limits.VIEWS_PAIRS", 24)
+    monkeypatch.setattr("splatctrl_cli.checks.limits.VIEWS_POINTS", 700)
+    monkeypatch.setattr("splatctrl_cli.checks.limits.VIEWS_LANDED", 300)
 
 
 def moved(frames: Sequence[RgbdFrame], camera: str, position: tuple[float, ...], degrees: float) -> list[RgbdFrame]:

@@ -8,13 +8,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from splatctrl_cli.config.fixed import TF_GAP_NS
 from splatctrl_cli.containers.mcap_records import BadRecordError, parse_record
 from splatctrl_cli.datasets.poses import read_tum
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import npy_of, read_arrays, savez
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.logs.messages import decode_rvl
-from splatctrl_cli.logs.tf_tree import MAX_GAP_NS, TfTree
+from splatctrl_cli.logs.tf_tree import TfTree
 from tests.logs.test_rvl import encoded_rvl
 from tests.properties import few
 
@@ -38,7 +39,7 @@ def test_rvl_gives_back_any_image(pixels: list[int]) -> None:
 NUMBER = st.floats(-10, 10)
 QUAT = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
 SAMPLES = st.lists(
-    st.tuples(st.integers(1, MAX_GAP_NS), st.tuples(NUMBER, NUMBER, NUMBER), QUAT), min_size=2, max_size=6
+    st.tuples(st.integers(1, TF_GAP_NS), st.tuples(NUMBER, NUMBER, NUMBER), QUAT), min_size=2, max_size=6
 )
 
 

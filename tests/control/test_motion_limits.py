@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splatctrl_cli.control.motion_limits import ENCODER, WINDOW, MotionLimits
+from splatctrl_cli.config.fixed import ENCODER, MOTION_WINDOW
+from splatctrl_cli.control.motion_limits import MotionLimits
 from splatctrl_cli.records import Float64
 from tests.reference.intervals import velocity_shares
 
@@ -52,7 +53,9 @@ def test_shares_are_those_of_the_reference() -> None:
     stamps = np.cumsum(generator.integers(1, 60, 120)).astype(np.int64) * 1_000_000
     positions = np.cumsum(generator.normal(0, 0.05, (120, 2)), axis=0)
     found = MotionLimits(LIMIT, None).add(stamps, positions)
-    np.testing.assert_allclose(found.velocity, velocity_shares(stamps, positions, LIMIT, WINDOW, ENCODER), rtol=1e-12)
+    np.testing.assert_allclose(
+        found.velocity, velocity_shares(stamps, positions, LIMIT, MOTION_WINDOW, ENCODER), rtol=1e-12
+    )
 
 
 def test_an_acceleration_is_found_by_its_size() -> None:
@@ -60,7 +63,7 @@ def test_an_acceleration_is_found_by_its_size() -> None:
     positions = np.zeros((len(stamps), 2))
     positions[:, 1] = 0.5 * 6.0 * (stamps * 1e-9) ** 2
     found = MotionLimits(np.array([9.0, 9.0]), np.array([5.0, 5.0])).add(stamps, positions)
-    assert found.acceleration.max() == pytest.approx(6.0 / 5.0 - 4 * ENCODER / WINDOW**2 / 5.0, rel=1e-6)
+    assert found.acceleration.max() == pytest.approx(6.0 / 5.0 - 4 * ENCODER / MOTION_WINDOW**2 / 5.0, rel=1e-6)
     assert (found.acceleration_joint[found.acceleration > 0] == 1).all()
     assert (MotionLimits(np.array([9.0, 9.0]), None).add(stamps, positions).acceleration == 0).all()
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from splatctrl_cli.control.near_space import EVERY_NS, NearSpace, Seen
+from splatctrl_cli.config.fixed import NEAR_EVERY_NS
+from splatctrl_cli.control.near_space import NearSpace, Seen
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
 from tests.reference.intervals import blind_share, near_figures
@@ -70,7 +71,7 @@ def test_points_that_are_not_outside_of_the_arm_are_not_asked_for() -> None:
 def test_states_are_thinned_by_time_across_blocks() -> None:
     space = NearSpace(PlanarArm(), 0.03)
     stamps = np.arange(0, 800, 40, dtype=np.int64) * 1_000_000  # 25 Hz
-    assert EVERY_NS == 200_000_000
+    assert NEAR_EVERY_NS == 200_000_000
     assert space.due(stamps[:12]) == [0, 5, 10]
     assert space.due(stamps[12:]) == [3]  # the state at 600 ms
     assert space.due(np.array([10 * SECOND, 11 * SECOND])) == [0, 1]  # slow states are all looked at

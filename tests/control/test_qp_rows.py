@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.control.barriers import BRAKING_SHARE, scene_margin
+from splatctrl_cli.config.fixed import BRAKING_SHARE
+from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.limits import JointLimits, box_rows
 from splatctrl_cli.control.printed_program import assemble_printed
 from splatctrl_cli.control.qp_rows import RowBuilder, Rows

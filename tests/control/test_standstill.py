@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from splatctrl_cli.config.fixed import ZONE_RESOLUTION
 from splatctrl_cli.control.events import runs_of
 from splatctrl_cli.control.goals import LoggedMotion
 from splatctrl_cli.control.standstill import (
-    RESOLUTION,
     BoxZone,
     Separation,
     Standstill,
@@ -148,7 +148,7 @@ def test_a_person_is_in_a_box_where_a_ball_reaches_into_it() -> None:
     answers = []
     for middle, radius in zip(rng.uniform(-0.6, 1.4, (300, 3)), rng.uniform(0.02, 0.5, 300), strict=True):
         gap = np.linalg.norm(middle - np.clip(middle, BOX.lower, BOX.upper)) - radius
-        if not 0 < gap < RESOLUTION:
+        if not 0 < gap < ZONE_RESOLUTION:
             found = is_anybody_in(BOX, lambda p, _, m=middle, r=radius: np.linalg.norm(p - m, axis=1) - r, 0)  # type: ignore[misc]
             assert found == (gap <= 0), (middle, radius)
             answers.append(found)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import MULTIPLIER
 from splatctrl_cli.control import barriers
 from splatctrl_cli.control.fallbacks import Rung, is_usable
 from splatctrl_cli.control.preconditions import static_violations
 from splatctrl_cli.control.qp import ClarabelSolver, QpSolution, QuadraticProgram, Residuals, unsolved
-from splatctrl_cli.control.step import MULTIPLIER, QpIkController
+from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.records import DistanceField, Float64

@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatctrl_cli.config.fixed import ROBOT_MARGIN
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.evaluate.held_out_depth import ROBOT_MARGIN, compare_with_held_out_depth, counted_pixels
+from splatctrl_cli.evaluate.held_out_depth import compare_with_held_out_depth, counted_pixels
 from splatctrl_cli.evaluate.views import surface_points
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Box, DistanceGrid, Intrinsics, RgbdFrame

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from splatctrl_cli.config.fixed import VOXELS_PER_LENGTH
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.field import full_gp, voxel_density
 from splatctrl_cli.field.clustered_splats import Spheres
@@ -19,7 +20,7 @@ LENGTH, NOISE = 0.02, 1e-6
 def test_voxel_density_is_spread_convolved_and_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
     centers, _ = cloud(60)
     centers = 0.1 * centers  # all within reach of each other
-    expected = reference.voxel_row_sums(centers, LENGTH, LENGTH / voxel_density.VOXELS_PER_LENGTH)
+    expected = reference.voxel_row_sums(centers, LENGTH, LENGTH / VOXELS_PER_LENGTH)
     sums = voxel_row_sums(centers, LENGTH, Matern12(LENGTH).value)
     np.testing.assert_allclose(sums, expected, rtol=1e-9)
     monkeypatch.setattr(voxel_density, "NODES", 48)  # blocks of 15 cells rather than 63
@@ -126,7 +127,7 @@ def test_what_cannot_be_solved_is_refused_in_words(monkeypatch: pytest.MonkeyPat
         UsageError, match=r"radii that differ by at most 16 length scales .*, got 60\.0; set a larger"
     ):
         GpdfField(centers, radii, 0.005, weights="cg")
-    monkeypatch.setattr(full_gp, "MAX_ITERATIONS", 20)
+    monkeypatch.setattr(full_gp, "CG_ITERATIONS", 20)
     with pytest.raises(NotEvaluableError, match=r"after 20 iterations, got .*; set a larger field.noise"):
         SeField(centers, radii, LENGTH, weights="cg")
     monkeypatch.setattr(full_gp, "available_memory", lambda: 1000)

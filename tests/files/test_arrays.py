@@ -13,9 +13,8 @@ from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.files.arrays import DAMAGE, read_arrays, savez
 from splatctrl_cli.files.npz_columns import NpzFile
 from splatctrl_cli.grid_files.npz_grid import MOST_PACKED, read_npz
-from splatctrl_cli.scene import occupancy
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, read_checkpoint
-from splatctrl_cli.scene_files.voxel_file import MOST_VOXELS, read_occupancy, read_states
+from splatctrl_cli.scene_files.voxel_file import read_occupancy, read_states
 from splatctrl_cli.sources.describe import describe
 from tests.files.make_npz import write_zeros
 
@@ -67,10 +66,6 @@ def test_a_zip_of_a_later_version_is_no_fault_of_the_program(tmp_path: Path, nam
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"x.npz: not a readable .npz: zip file version 25.5"):
         describe(path)
-
-
-def test_as_many_voxels_are_read_as_reconstruct_makes() -> None:
-    assert MOST_VOXELS == occupancy.MAX_VOXELS
 
 
 def test_arrays_are_read_as_numpy_reads_them(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from splatctrl_cli.cli.main import main
 from splatctrl_cli.config import load_config
+from splatctrl_cli.config.fixed import SPHERE_CELL
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.conformal import conformal_bound
 from splatctrl_cli.geometry import look_at
@@ -47,7 +48,7 @@ class FilmedSource(FakeSource):
 
 def test_what_is_within_reach_of_a_sphere_anywhere_in_its_cell_is_near() -> None:
     swept = evidence.Swept(np.zeros((1, 3)), np.array([0.05]), reach=0.1)
-    corners = evidence.CELL * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 1]])
+    corners = SPHERE_CELL * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 1]])
     reached = corners + 0.149 * np.array([[-1.0, 0, 0], [1, 0, 0], [3**-0.5] * 3])
     assert len(swept.near(reached)) == 3
     assert len(swept.near(np.array([[0.22, 0.0, 0.0]]))) == 0

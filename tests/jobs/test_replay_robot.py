@@ -190,7 +190,7 @@ FILES = ("steps.csv", "events.json", "summary.json", "states.json")
 
 def in_blocks_of(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
     for module in (files, state_pass, state_store, spilled_rows, state_columns):
-        monkeypatch.setattr(module, "CHUNK" if module is files else "BLOCK", num)
+        monkeypatch.setattr(module, "BLOCK", num)
 
 
 @pytest.mark.parametrize("mode", ["audit", "open-loop", "closed-loop"])

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.config.fixed import STILL_ROW
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.planner.configuration_clearance import Clearance
-from splatctrl_cli.planner.edges import ROUNDING, STILL, check_edges, check_sampled_edges
+from splatctrl_cli.planner.edges import ROUNDING, check_edges, check_sampled_edges
 from splatctrl_cli.planner.path import resampled
 from splatctrl_cli.planner.solid_scene import Ball, Cuboid, Rod, Solid, Solids
 from splatctrl_cli.records import Float64
@@ -91,7 +92,7 @@ def test_shares_do_not_depend_on_threads(arm: RobotModel) -> None:
             contact=CONTACT,
             give_up=0.05,
             rounding=ROUNDING,
-            still=STILL,
+            still=STILL_ROW,
             only_whole=False,
             threads=threads,
         )
@@ -110,7 +111,7 @@ def test_arrays_that_do_not_fit_are_refused(arm: RobotModel) -> None:
     def advance(edges: object = None, contact: float = CONTACT, **changes: object) -> None:
         other = replace(good, **changes)
         to = end[:, :6] if edges else end
-        other.advance(start, to, contact=contact, give_up=0.1, rounding=0.0, still=STILL, only_whole=True)
+        other.advance(start, to, contact=contact, give_up=0.1, rounding=0.0, still=STILL_ROW, only_whole=True)
 
     advance()
     with pytest.raises(ValueError, match="expected start and end"):

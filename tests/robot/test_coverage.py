@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from splatctrl_cli.config.fixed import DEFICIT_GAP
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import look_at, transform_points
 from splatctrl_cli.records import SphereSet
-from splatctrl_cli.robot.coverage import TOLERANCE, areas, coverage_deficit, largest_deficit, refined, uncovered_area
+from splatctrl_cli.robot.coverage import areas, coverage_deficit, largest_deficit, refined, uncovered_area
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import read_urdf
 from tests.robot.shapes import BALL, BOX, arm_of, written
@@ -95,7 +96,7 @@ def test_coverage_moves_rigidly_and_scales() -> None:
     assert there.proven == pytest.approx(here.proven, abs=2e-4)
     order = rng.permutation(6)
     assert largest_deficit(CUBE, centers[order], radii[order]).proven == here.proven
-    double = largest_deficit(2 * CUBE, 2 * centers, 2 * radii, tolerance=2 * TOLERANCE)
+    double = largest_deficit(2 * CUBE, 2 * centers, 2 * radii, tolerance=2 * DEFICIT_GAP)
     assert double.proven == pytest.approx(2 * here.proven, rel=1e-12)
 
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import CONTACT_REACH
 from splatctrl_cli.records import Box, Label
 from splatctrl_cli.robot.declared_contact import Carried, Declarations
-from splatctrl_cli.scene.contact import CONTACT, contact_pixels, count_carried, hidden_objects
+from splatctrl_cli.scene.contact import contact_pixels, count_carried, hidden_objects
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.self_mask import PixelKind, self_mask
@@ -29,7 +30,7 @@ def test_pixels_of_objects_beside_the_robot_are_those_within_the_distance() -> N
     near = contact_pixels(view, self_mask(view, low, OccupancyConfig()), low)
     points = world_points(view)[near]
     assert len(points) > 3
-    assert (np.linalg.norm(points - [0.0, 0.0, 0.249], axis=1) < 0.05 + CONTACT).all()
+    assert (np.linalg.norm(points - [0.0, 0.0, 0.249], axis=1) < 0.05 + CONTACT_REACH).all()
     assert (np.abs(points[:, 2] - VISITOR) < 1e-5).all()
 
 
@@ -42,7 +43,7 @@ def test_objects_in_contact_get_splats_of_one_radius_up_to_what_is_measured() ->
         target.step([view], robot)
     splats = target.splats()
     is_object = splats.labels == Label.OBJECT
-    is_near = is_object & (robot.distance_to_moving(splats.centers) < CONTACT)
+    is_near = is_object & (robot.distance_to_moving(splats.centers) < CONTACT_REACH)
     assert is_near.sum() > 5
     np.testing.assert_allclose(splats.radii[is_near], CONFIG.contact_radius, rtol=1e-5)
     clearance = (

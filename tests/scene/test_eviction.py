@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import EVICT_EVERY, EVICT_NEARER
 from splatctrl_cli.records import Box, Label, SplatSet
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
-from splatctrl_cli.scene.eviction import NEARER, distance_to_box, far_away, redundant, room_for
-from splatctrl_cli.scene.fitter import EVICT_EVERY, SceneFitter
+from splatctrl_cli.scene.eviction import distance_to_box, far_away, redundant, room_for
+from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.occupancy import OccupancyMap
 from splatctrl_cli.voxels import SWEPT
 from tests.reference.unrepresented import unrepresented
@@ -56,7 +57,7 @@ def test_the_only_splat_of_a_surface_is_not_redundant() -> None:
     assert redundant(np.array([2, 0, 1]), 3, pair, surface, 0.018).tolist() == [0]
 
 
-@pytest.mark.parametrize(("distance", "count"), [(NEARER - 0.01, 0), (NEARER + 0.01, 1)])
+@pytest.mark.parametrize(("distance", "count"), [(EVICT_NEARER - 0.01, 0), (EVICT_NEARER + 0.01, 1)])
 def test_a_surface_gives_way_to_one_that_is_much_nearer_to_the_path(distance: float, count: int) -> None:
     seeds = np.float32([[1.1, 0.5, 0.5]])
     centers = np.float32([[1.1 + distance, 0.5, 0.5], [0.5, 0.5, 0.5]])

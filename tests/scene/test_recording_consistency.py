@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatctrl_cli.config.fixed import PAIR_LIMIT
 from splatctrl_cli.records import Float64, RgbdFrame
-from splatctrl_cli.scene.recording_consistency import LIMIT, Agreement, agreements, differences, largest_jump
+from splatctrl_cli.scene.recording_consistency import Agreement, agreements, differences, largest_jump
 from tests.scene.wall import frame
 
 RANGE = (0.2, 3.0)
@@ -41,7 +42,7 @@ def test_what_only_some_pixels_disagree_on_is_no_wrong_pose() -> None:
     values = {"cameras": ("a", "b"), "num_pixels": 900}
     assert Agreement(median=0.1, quartile=0.01, depth=0.8, **values).holds
     assert not Agreement(median=0.1, quartile=0.02, depth=0.8, **values).holds
-    assert not Agreement(median=1.01 * LIMIT, quartile=LIMIT, depth=0.8, **values).holds
+    assert not Agreement(median=1.01 * PAIR_LIMIT, quartile=PAIR_LIMIT, depth=0.8, **values).holds
     assert Agreement(median=0.08, quartile=0.06, depth=3.0, **values).holds
 
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.jobs.replays.inputs import LoggedStates
 from splatctrl_cli.jobs.replays.metrics import Metrics
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
-from splatctrl_cli.jobs.replays.state_pass import SLIGHT
 from splatctrl_cli.records import Bool
 
 SAFE, MARGIN, CONTACT, LIMITS, CONTROL = "safe", "margin broken", "contact", "limits broken", "controller failed"
@@ -31,7 +31,7 @@ class Judged:
     @property
     def threshold(self) -> float:
         """The margin [m], less what solver and rounding may leave."""
-        return self.replay.margin - SLIGHT
+        return self.replay.margin - SLIGHTLY_UNDER
 
     @property
     def num_states(self) -> int:

@@ -14,15 +14,16 @@ from itertools import islice
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import ROBOT_MARGIN, SAME_MOMENT_NS, SPHERE_CELL
 from splatctrl_cli.config.motion import VerdictConfig
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.conformal import ConformalBound, conformal_bound
-from splatctrl_cli.evaluate.held_out_depth import ROBOT_MARGIN, depth_edges
+from splatctrl_cli.evaluate.held_out_depth import depth_edges
 from splatctrl_cli.field.distance import SphereField
 from splatctrl_cli.files.spilled_rows import ranges
 from splatctrl_cli.geometry import back_project, transform_points
-from splatctrl_cli.jobs.reconstruction import SAME_MOMENT_NS, training_cameras
+from splatctrl_cli.jobs.reconstruction import training_cameras
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.state_store import StoredAudit
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -33,7 +34,6 @@ from splatctrl_cli.scene_files.scene_folder import open_scene
 from splatctrl_cli.states.state_source import open_states
 
 EVERY = "held_out_every"  # the metric of a scene in lockstep that says which frame sets did not train it
-CELL = 0.02  # [m] to which the places of spheres are rounded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,12 +250,12 @@ def largest_miss(points: Float64, distance: DistanceFunction) -> Float64:
 
 
 class Swept:
-    """Places within `reach` [m] of where an arm's moving spheres were, or up to CELL beyond."""
+    """Places within `reach` [m] of where an arm's moving spheres were, or up to SPHERE_CELL beyond."""
 
     def __init__(self, cells: Float64, radii: Float64, reach: float) -> None:
-        """cells (K, 3): whole numbers of CELL; radii (K,) [m]: of the largest sphere that was there."""
-        centers, self._reach = (cells + 0.5) * CELL, reach
-        enlarged = radii + 0.5 * CELL * 3**0.5
+        """cells (K, 3): whole numbers of SPHERE_CELL; radii (K,) [m]: of the largest sphere that was there."""
+        centers, self._reach = (cells + 0.5) * SPHERE_CELL, reach
+        enlarged = radii + 0.5 * SPHERE_CELL * 3**0.5
         self._field = SphereField(centers, enlarged)
         far = (enlarged + reach)[:, None]
         self._box = Box(lower=(centers - far).min(axis=0), upper=(centers + far).max(axis=0))
@@ -267,7 +267,7 @@ class Swept:
         cells, radii = np.zeros((0, 3)), np.zeros(0)
         for first, last in ranges(len(audit.stamp_ns)):
             centers = model.sphere_centers_batch(audit.position[first:last])[:, moving]
-            cells = np.concatenate([cells, np.floor(centers.reshape(-1, 3) / CELL)])
+            cells = np.concatenate([cells, np.floor(centers.reshape(-1, 3) / SPHERE_CELL)])
             radii = np.concatenate([radii, np.tile(model.sphere_set.radii[moving], last - first)])
             cells, index = np.unique(cells, axis=0, return_inverse=True)
             largest = np.zeros(len(cells))

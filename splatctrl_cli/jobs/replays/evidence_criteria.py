@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import BLIND, CLOCKS_APART, MISPLACED, SAME_MOMENT_NS, SOME_UNSEEN, UNSEEN
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, held, lacking
@@ -19,13 +20,6 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     seconds_at,
 )
 from splatctrl_cli.jobs.replays.metrics import is_blank
-
-CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an arm is then 25 mm elsewhere
-AHEAD = 0.02  # [s] that the frames of one time step may lie apart
-BLIND = 0.09  # of the moving spheres: without a fault in a tenth of the runs more of them come to space never seen
-SOME_UNSEEN = 1 / 3  # of the points about the arm: below, a few spheres in the shadow of a seen thing do not count
-UNSEEN = 0.45  # of the points about the arm: three cameras leave 0.02 to 0.3; at 0.48 a lone one hid a thing
-MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a calibrated rig
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
@@ -107,11 +101,12 @@ def evidence_age(judged: Judged) -> Iterator[Reason]:
     """
     yield from _unwatched(judged)
     ahead = nearby(judged, "ahead")
-    if ahead is not None and ahead[0] > AHEAD:
+    allowed = SAME_MOMENT_NS / 1e9  # the frames of one time step lie apart
+    if ahead is not None and ahead[0] > allowed:
         yield lacking(
             sentence=f"the newest depth near the arm is {ahead[0]:.2f} s later than the state that it judges",
             value=-ahead[0],
-            threshold=-AHEAD,
+            threshold=-allowed,
             unit="s",
             time_s=ahead[1],
             remedy="a state is judged by what was known then: reconstruct with snapshots, or check the clocks",

@@ -15,6 +15,7 @@ from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, first_inte
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, write_json, write_run
+from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.jobs.replays.compare import document_of, draw_methods
 from splatctrl_cli.jobs.replays.inputs import coverage_words
 from splatctrl_cli.jobs.replays.metrics import Metrics
@@ -30,14 +31,13 @@ _SPECIAL = re.compile('[,"\r\n]')
 
 Columns = dict[str, list[object]]
 
-CHUNK = 4096  # states
 ALL = slice(None)
 
 
 def chunks_of(replay: Replay) -> Iterator[Columns]:
-    """`columns_of` all states, CHUNK at a time, so that a long log is never a table in memory."""
-    for first in range(0, len(replay.audit.stamp_ns), CHUNK):
-        yield columns_of(replay, slice(first, first + CHUNK))
+    """`columns_of` all states, BLOCK at a time, so that a long log is never a table in memory."""
+    for first in range(0, len(replay.audit.stamp_ns), BLOCK):
+        yield columns_of(replay, slice(first, first + BLOCK))
 
 
 def columns_of(replay: Replay, rows: slice = ALL) -> Columns:

@@ -11,8 +11,6 @@ from splatctrl_cli.evaluate.verdict import Outcome, Reason, failed
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 
-TOLERANCE = 1e-6  # [rad/s]: steps.csv keeps nine digits; another machine or solver needs more
-
 
 @dataclass(frozen=True, kw_only=True)
 class Golden:

@@ -5,16 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import UNWATCHED_AFTER_NS, UNWATCHED_APART_NS, UNWATCHED_NS
 from splatctrl_cli.control.audit import moving_clearance
 from splatctrl_cli.control.near_space import NearSpace
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.model import RobotModel
 
-LONG_NS = 500_000_000  # without depth from about the arm: two frame sets of a slow recording
-LONGEST_NS = 10_000_000_000  # after a motion, in which the next depth is waited for
 STEP_NS = 100_000_000  # between looks after a motion
-APART_NS = 20_000_000  # between postures that are kept
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +40,7 @@ class Hindsight:
     def add(self, stamps: Stamps, positions: Float64) -> None:
         """The next states (T,), (T, J) of the motion."""
         for at, stamp in enumerate(stamps.tolist()):
-            if not self._stamps or stamp >= self._stamps[-1] + APART_NS or at == len(stamps) - 1:
+            if not self._stamps or stamp >= self._stamps[-1] + UNWATCHED_APART_NS or at == len(stamps) - 1:
                 self._stamps.append(stamp)
                 self._postures.append(positions[at].copy())
 
@@ -53,7 +51,7 @@ class Hindsight:
         seen_ns = stamp_ns - round(age_s * 1e9)
         before, self._seen_ns = self._seen_ns, max(seen_ns, self._seen_ns or seen_ns)
         num = int(np.searchsorted(self._stamps, self._seen_ns, side="right"))
-        if before is not None and self._seen_ns - before > LONG_NS and num:
+        if before is not None and self._seen_ns - before > UNWATCHED_NS and num:
             self._hold_against(before, stamp_ns, num)
         del self._stamps[:num], self._postures[:num]
 
@@ -72,7 +70,7 @@ class Hindsight:
     def _later(self, stamp_ns: int) -> Iterator[int]:
         """Stamps at which a newer scene is known."""
         shown = self._scene.age_s(stamp_ns)
-        for later_ns in range(stamp_ns + STEP_NS, stamp_ns + LONGEST_NS, STEP_NS):
+        for later_ns in range(stamp_ns + STEP_NS, stamp_ns + UNWATCHED_AFTER_NS, STEP_NS):
             age = self._scene.age_s(later_ns)
             if age < shown + (later_ns - stamp_ns) * 1e-9 - 1e-6:
                 yield later_ns

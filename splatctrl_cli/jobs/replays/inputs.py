@@ -16,6 +16,7 @@ from splatctrl_cli.checks.clock_offset import (
     states_asked,
 )
 from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.config.fixed import COVERED_COARSE
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.replays.request import ReplayRequest
@@ -36,7 +37,6 @@ FR3_LIMITS = (
     "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to keep "
     "the published ones"
 )
-COARSE = 0.02  # [m] of areas, which a replay does not report; the deficit is as exact as ever
 
 
 def read_robot(request: ReplayRequest, config: ControlConfig) -> RobotModel:
@@ -101,7 +101,7 @@ def coverage_words(model: RobotModel, config: ControlConfig) -> str:
 def _measured(model: RobotModel, packages: list[Path]) -> RobotModel:
     try:
         return model.with_coverage(
-            coverage_deficit(model.urdf, model.sphere_set, folders=packages, resolution=COARSE)
+            coverage_deficit(model.urdf, model.sphere_set, folders=packages, resolution=COVERED_COARSE)
         )
     except InputError as error:
         return model.with_coverage(None, str(error))

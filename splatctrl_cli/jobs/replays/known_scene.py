@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import NEXT_SCENE_NS
 from splatctrl_cli.control.audit import DistanceFunction, Observed, observed_lookup
 from splatctrl_cli.control.events import UNREPRESENTED, Obstacle
 from splatctrl_cli.control.near_space import Seen
@@ -33,7 +34,6 @@ Index = NDArray[np.int64]
 Key = TypeVar("Key", bound=Hashable)
 BY_CAMERA = (VoxelState.FREE, VoxelState.UNCERTAIN, VoxelState.OCCUPIED)  # voxels that a camera saw
 HELD = 2  # scenes whose fields are kept: a rate of change needs two
-NEXT_NS = 500_000_000  # after a motion, in which the next scene is looked for
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,9 +113,9 @@ class KnownScene:
     def next_ns(self, stamp_ns: int) -> int | None:
         """The stamp [ns] from which the scene after the one in use at a stamp is known; None without one soon."""
         later = self._index_at(stamp_ns) + 1
-        self.advance(stamp_ns + NEXT_NS)
+        self.advance(stamp_ns + NEXT_SCENE_NS)
         known_ns = [stamp + self.latency_ns for stamp in self.stamps_ns[later : later + 1]]
-        return next((known for known in known_ns if known <= stamp_ns + NEXT_NS), None)
+        return next((known for known in known_ns if known <= stamp_ns + NEXT_SCENE_NS), None)
 
     def _index_at(self, stamp_ns: int) -> int:
         self.advance(stamp_ns)

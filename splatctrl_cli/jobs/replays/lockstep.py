@@ -9,11 +9,12 @@ import numpy as np
 
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.control.audit import Observed
 from splatctrl_cli.control.near_space import Seen
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import Stopwatch, write_run
-from splatctrl_cli.jobs.open_recording import DEFAULT_POSE_JUMP, check_pose_jumps
+from splatctrl_cli.jobs.open_recording import check_pose_jumps
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest
 from splatctrl_cli.jobs.replays.evidence import EVERY, every_of, trained, training_options
@@ -44,7 +45,7 @@ def check_lockstep(request: ReplayRequest) -> None:
     """Raise UsageError for options that mean nothing without it."""
     if request.latency and request.field is not None:
         raise UsageError("--latency: a baked field is one scene for all times", remedy="give --scene or --lockstep")
-    if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != DEFAULT_POSE_JUMP):
+    if not request.lockstep and (request.allow_disagreement or request.max_pose_jump != POSE_JUMP):
         raise UsageError("--allow-disagreement, --max-pose-jump: expected --lockstep", remedy="leave them out")
 
 

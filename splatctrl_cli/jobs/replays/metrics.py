@@ -9,9 +9,9 @@ from operator import attrgetter
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import MOTION_WINDOW
 from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.fallbacks import Rung
-from splatctrl_cli.control.motion_limits import WINDOW
 from splatctrl_cli.control.replay import Outcome, ReplayTrace
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
@@ -83,7 +83,7 @@ def _intervals(replay: Replay) -> int:
 def _num_sudden(replay: Replay) -> int:
     """States that have an acceleration, where that has a limit."""
     since = replay.audit.stamp_ns - replay.audit.stamp_ns[0]
-    return int(np.sum(since >= 2 * WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
+    return int(np.sum(since >= 2 * MOTION_WINDOW * 1e9)) if np.any(replay.config.control.max_acceleration) else 0
 
 
 def _deficit(replay: Replay) -> float | None:

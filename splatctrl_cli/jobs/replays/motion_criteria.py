@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, MOUNTED_CHANGE, STATIC_CHANGE
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.control.replay import Outcome as LoopOutcome
 from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, held, lacking
@@ -23,10 +24,6 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     mm,
     time_of_least,
 )
-
-STATIC_CHANGE = 0.01  # [m] by which a fixed sphere must come nearer to count: splats move by less about a surface
-MOUNTED = 0.03  # [m] the same of one that stands near its mount, whose map grows in the first frames
-TOO_MUCH = 1.01  # of a velocity or acceleration limit
 
 
 def clearance(judged: Judged) -> Iterator[Reason]:
@@ -157,7 +154,8 @@ def static_clearance(judged: Judged) -> Iterator[Reason]:
     broken = {
         name: (first, least)
         for name, (first, least) in judged.replay.statics.items()
-        if least < judged.threshold and least < first - (MOUNTED if first < 2 * judged.threshold else STATIC_CHANGE)
+        if least < judged.threshold
+        and least < first - (MOUNTED_CHANGE if first < 2 * judged.threshold else STATIC_CHANGE)
     }
     if broken:
         name, (first, least) = min(broken.items(), key=lambda item: item[1][1])
@@ -206,7 +204,7 @@ def acceleration_limits(judged: Judged) -> Iterator[Reason]:
 def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Reason]:
     values = judged.replay.strain[column]
     most = float(np.max(values)) if len(values) else 0.0
-    if most > TOO_MUCH:
+    if most > LIMIT_EXCEEDED:
         worst = max(events_of(judged.replay, kind), key=lambda event: event.worst)
         reason = failed(
             sentence=f"{worst.worst_name} reaches {most:.2f} times its limit",

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import RECORDINGS_APART_NS, SAME_CLEARANCE, SAME_MOTION_STATES
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource
@@ -16,9 +17,6 @@ from splatctrl_cli.scene_files.scene_folder import SceneFolder
 from splatctrl_cli.simulate.truth import Truth
 
 S = TypeVar("S", SceneConfig, OccupancyConfig)
-COMPARED = 20  # states
-SAME_CLEARANCE = 1e-3  # [m]: a truth file keeps six digits
-APART = 1_000_000_000  # [ns] between the times of two recordings that can still be one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +58,7 @@ def scene_mismatches(
     if scene.has_clock and len(states):
         stamps = [snapshot.stamp_ns for snapshot in scene.snapshots] or [scene.stamp_ns]
         first, last = int(states.stamp_ns[0]), int(states.stamp_ns[-1])
-        if last < stamps[0] - APART or first > max(stamps[-1], scene.stamp_ns) + APART:
+        if last < stamps[0] - RECORDINGS_APART_NS or first > max(stamps[-1], scene.stamp_ns) + RECORDINGS_APART_NS:
             yield Mismatch(
                 sentence=f"joint states from {first} to {last} ns and a scene from {stamps[0]} to "
                 f"{scene.stamp_ns} ns are of different times",
@@ -114,7 +112,7 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mis
     own = RobotModel.from_urdf(truth.robot_urdf, truth.robot_spheres, T_world_base=truth.T_world_base)
     moving = np.flatnonzero(own.moving_spheres)
     worst = 0.0
-    for stamp in shared[:: max(len(shared) // COMPARED, 1)]:
+    for stamp in shared[:: max(len(shared) // SAME_MOTION_STATES, 1)]:
         q = states.position[int(np.searchsorted(stamps, stamp))]
         gap = truth.distance(own.sphere_centers(q)[moving], int(stamp)) - own.sphere_set.radii[moving]
         recorded = truth.clearance[int(np.searchsorted(truth.stamps, stamp))]

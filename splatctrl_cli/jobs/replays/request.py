@@ -6,8 +6,8 @@ from dataclasses import field as made_by
 from pathlib import Path
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.control.goals import LoggedMotion
-from splatctrl_cli.jobs.open_recording import DEFAULT_POSE_JUMP
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.provenance import Mismatch
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -43,7 +43,7 @@ class ReplayRequest:
     lockstep: bool = False
     latency: float = 0.0
     allow_disagreement: bool = False
-    max_pose_jump: float = DEFAULT_POSE_JUMP
+    max_pose_jump: float = POSE_JUMP
     spheres: Path | None = None
     base: tuple[float, ...] | None = None
     locked: Mapping[str, float] = made_by(default_factory=dict)

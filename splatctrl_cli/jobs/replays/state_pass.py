@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import SLIGHTLY_UNDER
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
@@ -21,8 +22,6 @@ from splatctrl_cli.jobs.replays.state_store import BLOCK, Figures, StoredAudit, 
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
-
-SLIGHT = 1e-3  # [m] under a margin that solver, rounding and a map that is still being fitted may leave
 
 
 class ReplayRecord:
@@ -107,7 +106,7 @@ class ReplayRecord:
         """Find what happened in the block that was measured last, with what a controller did there."""
         signals = audit_signals(part, self._margin, self._spheres, self._model.joint_names, self._pairs)
         signals += limit_signals(self._strain, self._model.joint_names)
-        signals += interval_signals(self._lower, self._unbounded, self._margin - SLIGHT)
+        signals += interval_signals(self._lower, self._unbounded, self._margin - SLIGHTLY_UNDER)
         age_s = np.array([self._scene.age_s(stamp) for stamp in part.stamp_ns.tolist()])
         signals.append(stale_signal(age_s, self._max_map_age))
         if steps:
@@ -161,7 +160,7 @@ class ReplayRecord:
             velocities,
             at_states,
             known[name],
-            margin=self._margin - SLIGHT,
+            margin=self._margin - SLIGHTLY_UNDER,
             longest=self._longest,
         )
         self._keep_bounds(between, stamps, at_states, is_first=self._before is None)
@@ -210,7 +209,7 @@ class ReplayRecord:
         """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""
         exact = part.clearance["exact"].distance
         alone, splats_alone = exact.copy(), self._scene.at(int(part.stamp_ns[0])).splats_alone
-        low = np.flatnonzero(exact < self._margin - SLIGHT)
+        low = np.flatnonzero(exact < self._margin - SLIGHTLY_UNDER)
         if splats_alone is not None and len(low):
             centers = self._model.sphere_centers_batch(part.position[low])
             alone[low] = moving_clearance(self._model, centers, splats_alone)[0].distance
