@@ -286,11 +286,10 @@ def _timing_findings(timings: Sequence[ArmTiming]) -> list[Finding]:
 
 
 def _offset_finding(where: str, offset_s: float, rest: str) -> Finding:
-    text = (
-        f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * limits.TIME_ERROR:.0f} ms,"
-    )
-    text = f"{text} by where depth shows the arm){rest}"
-    is_off = abs(offset_s) > limits.TIME_OFFSET + limits.TIME_ERROR
+    error = limits.TIME_ERROR
+    text = f"frames are stamped {1e3 * offset_s:+.0f} ms against the joint states (+-{1e3 * error:.0f} ms, by where"
+    text = f"{text} depth shows the arm){rest}"
+    is_off = abs(offset_s) > limits.TIME_OFFSET + error
     make = warning if is_off else note
     remedy = LATE.format("late" if offset_s > 0 else "early") if is_off else ""
     return make("robot-clock", where, text, remedy, value=round(1e3 * offset_s, 1), unit="ms")

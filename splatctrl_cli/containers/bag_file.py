@@ -16,7 +16,6 @@ from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 _KINDS = frozenset({MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION})
 _U32 = struct.Struct("<I")
-_MOST_HEADER = 1 << 20  # bytes of a record's header; those of connections hold a name
 _MARK = b"compression="  # of a chunk's header, behind its length and perhaps the fields `op` and `size`
 _MARK_OFFSETS = (8, 16, 21, 29)
 
@@ -91,7 +90,7 @@ class BagFile:
     def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
         """Kind, fields and length of the body of the record that begins here; the stream is left at the body."""
         length = self._length(stream)
-        if length is None or length > min(_MOST_HEADER, self.size - stream.tell()):
+        if length is None or length > min(1 << 20, self.size - stream.tell()):  # those of connections hold a name
             return None
         fields = fields_of(stream.read(length))
         kind = fields["op"][0] if fields is not None and len(fields.get("op", b"")) == 1 else 0

@@ -29,10 +29,8 @@ from splatctrl_cli.containers.mcap_records import (
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE
 
-MAX_SUMMARY = 64 << 20  # bytes of a summary that are read
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, start, end, unpacked size, crc; then the compression's name
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
-_ATTACHMENT_HEAD = 1 << 16  # bytes in which name and media type of an attachment must end
 _FOOTER_SIZE = HEAD.size + 20
 
 
@@ -73,7 +71,7 @@ class McapFile:
             if footer is None or not len(MAGIC) <= footer.summary_start < self.size:
                 return []
             stream.seek(footer.summary_start)
-            content = stream.read(min(self.size - footer.summary_start, MAX_SUMMARY))
+            content = stream.read(min(self.size - footer.summary_start, 64 << 20))
         found, at = [], 0
         while at + HEAD.size <= len(content):
             opcode, length = HEAD.unpack_from(content, at)
@@ -218,7 +216,7 @@ class _Walk:
 
     def _check_attachment(self, offset: int, length: int) -> None:
         start = self._stream.tell()
-        head = self._take(min(length, _ATTACHMENT_HEAD))
+        head = self._take(min(length, 1 << 16))  # bytes in which its name and media type must end
         body = _attachment_length(head)
         if body is None or body + 4 > length:
             self._add(f"the attachment at byte {offset} does not hold what it announces")

@@ -23,8 +23,6 @@ from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics
 
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
-_MOST = 1 << 24  # bytes of cameras: 500 each
-MAX_SKEW = 1.0  # [px] our cameras have none
 PLAUSIBLE_RADIUS = (0.02, 20.0)  # [m] of the sphere around the object
 
 
@@ -160,7 +158,7 @@ def _numbered(folder: Path, num: int) -> dict[int, Path]:
 def _projections(path: Path) -> list[Float64]:
     """World points [mm] to pixels (3, 4), of each camera in the file."""
     try:
-        arrays = read_arrays(path, most=_MOST)
+        arrays = read_arrays(path, most=1 << 24)  # bytes of cameras: 500 each
         num = sum(1 for name in arrays if re.fullmatch(r"world_mat_\d+", name))
         world = [np.asarray(arrays[f"world_mat_{i}"], np.float64)[:3, :4] for i in range(max(num, 1))]
         radius = float(np.asarray(arrays["scale_mat_0"], np.float64)[0, 0]) / MILLIMETRES
@@ -179,7 +177,7 @@ def _projections(path: Path) -> list[Float64]:
 
 def _intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     width, height = size
-    if abs(K[0, 1]) > MAX_SKEW:
+    if abs(K[0, 1]) > 1.0:  # [px]; our cameras have none
         raise InputError(f"{path}: expected cameras without skew, got one of {K[0, 1]:.2f} px")
     if not (0.2 < K[0, 2] / width < 0.8 and 0.2 < K[1, 2] / height < 0.8):
         raise InputError(

@@ -17,7 +17,6 @@ MAX_POINTS = 2_000_000  # on a mesh
 MAX_SPACED = 6_000_000
 NO_PAIRS = np.empty((0, 2), np.int64)
 OTHER_UNITS = (1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
-ENOUGH = 20_000  # points to find a cloud's box from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +90,7 @@ def cloud_score(
 
 
 def _check_unit(points: Float64, reference: Float64, margin: float, unit: float) -> None:
-    some, others = (p[:: max(1, len(p) // ENOUGH)] for p in (points, reference))
+    some, others = (p[:: max(1, len(p) // 20_000)] for p in (points, reference))
     fits = {factor: _overlap(some, factor * others, margin) for factor in (1.0, *OTHER_UNITS)}
     best = max(fits, key=lambda factor: fits[factor])
     if fits[1.0] < CLOUD_NO_OVERLAP and fits[best] > CLOUD_GOOD_OVERLAP:

@@ -30,7 +30,6 @@ MVSNERF_SCORED = (32, 24, 23, 44)
 MVSNERF_SCANS = (1, 8, 21, 103, 114)
 SURFACE_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)  # those IDR has masks for
 RULES = "expected holdout:everyN, holdout:everyN+FIRST or holdout:2,5"
-MARGIN = 10  # [mm] of the masks that are used, the number in their names
 BEFORE, BEYOND = 0.060, 0.120  # [m] outside the box within which points are kept (eval.py: patch_size, twice that)
 
 
@@ -243,7 +242,7 @@ def cloud_of_scan(folder: Path, scan: str) -> Path:
 def read_observed(folder: Path, scan: str) -> ObservedSpace:
     """What of the space around a scan counts. Raises InputError naming the file."""
     number = scan_number(scan)
-    path, plane_path = folder / f"ObsMask{number}_{MARGIN}.mat", folder / f"Plane{number}.mat"
+    path, plane_path = folder / f"ObsMask{number}_10.mat", folder / f"Plane{number}.mat"
     box, resolution = _array(path, "BB", 6).reshape(2, 3), float(_array(path, "Res", 1)[0])
     mask = np.asarray(_variable(path, "ObsMask")) != 0
     if mask.ndim != 3 or not resolution > 0 or not (box[1] > box[0]).all():

@@ -30,7 +30,6 @@ CHANNELS: Mapping[str, tuple[str, int]] = {  # dtype, and components of a cell
 }
 DEFAULT_CHANNELS = ("sdf", "gradient", "bound", "observed")
 KERNEL_OF = {"safe": "se", "safe_gpdf": "gpdf", "se": "se", "gpdf": "gpdf", "hard": None}
-_TEMPORARY_BYTES = 64 << 20  # of the arrays beside the channels
 
 Planes = dict[str, NDArray[np.generic]]
 T = TypeVar("T", bound=np.generic)
@@ -101,7 +100,7 @@ class Baker:
         mask (blocks of the grid) uint8: where it is zero, a block of `out` keeps what it has.
         """
         per_plane = 40 * self.layout.shape[1] * self.layout.shape[2]
-        step = BLOCK * max(1, _TEMPORARY_BYTES // (BLOCK * per_plane))
+        step = BLOCK * max(1, (64 << 20) // (BLOCK * per_plane))  # bytes beside the channels
         for begin in range(first, last, step):
             end = min(begin + step, last)
             part = {name: values[begin - first : end - first] for name, values in out.items()}

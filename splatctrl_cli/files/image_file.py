@@ -18,7 +18,6 @@ _PNG_CHANNELS = {0: 1, 2: 3}  # by colour type: grey, RGB
 _CLOSING_MARKS = ((JPEG, b"\xff\xd9"), (PNG[:4], b"IEND"))
 _PNG_HEAD = struct.Struct(">16xIIB")
 _PNG_CHUNKS = {b"IHDR", b"PLTE", b"IDAT", b"IEND"}  # that must be understood
-_MOST_EXPANSION = 1100  # deflate's is 1032
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,4 +133,4 @@ def _says_more_than_it_holds(png: bytes) -> bool:
         if kind[:1].isupper() and kind not in _PNG_CHUNKS:
             return True
         at += 12 + int.from_bytes(png[at : at + 4], "big")
-    return bool(not has_pixels or at + 12 > end or width * height * bits // 8 > _MOST_EXPANSION * end)
+    return bool(not has_pixels or at + 12 > end or width * height * bits // 8 > 1100 * end)  # deflate's is 1032

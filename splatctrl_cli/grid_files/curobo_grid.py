@@ -31,7 +31,6 @@ CuroboVersion = Literal["0.7", "0.8"]
 VERSIONS: tuple[str, ...] = get_args(CuroboVersion)
 DISTANCES = ("sdf", "bound", "hard", "se", "gpdf")
 MARGIN = 1e-3  # [cells] by which 0.8 is given a longer side, so that float32 does not truncate it to a cell less
-_MOST_HEAD = 1 << 20  # bytes of the arrays but for the values
 
 
 def write_curobo(path: Path, grid: DistanceGrid, *, version: str = "0.7", channel: str = "sdf") -> None:
@@ -99,7 +98,7 @@ def describe_curobo(path: Path, head: bytes) -> Summary | None:
         return None
     try:
         content = read_arrays(
-            path, ("curobo", "channel", "shape", "voxel_size", "dims", "pose", "header"), most=_MOST_HEAD
+            path, ("curobo", "channel", "shape", "voxel_size", "dims", "pose", "header"), most=1 << 20
         )
         facts: dict[str, object] = {
             "curobo": str(content["curobo"]),

@@ -18,7 +18,6 @@ from splatctrl_cli.jobs.progress import Progress
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
-SPARE = 1 << 26  # [bytes] for what is small
 VDB_COPIES = 7  # of the channels, in memory: 454 MiB were measured for one of 64 MiB
 
 
@@ -80,7 +79,7 @@ def check_disk(folder: Path, layout: GridLayout, channels: Collection[str], form
     """Raise UsageError where the channels and the files made of them do not fit the disk."""
     per_cell = bytes_per_cell(channels)
     copies = sum(FORMATS[name].size_per_cell(per_cell) for name in formats)
-    needed = (per_cell + copies) * layout.num_cells + SPARE
+    needed = (per_cell + copies) * layout.num_cells + (1 << 26)  # bytes for what is small
     free = shutil.disk_usage(folder).free
     if needed > free:
         size = " x ".join(str(n) for n in layout.shape)

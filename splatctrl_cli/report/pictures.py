@@ -21,7 +21,6 @@ from splatctrl_cli.voxels import VoxelState
 WIDTH = 12.0  # inches; at DPI 100 the width is 1200 pixels
 DPI = 100
 MAX_DEPTH_ERROR = 0.05  # [m] top of the depth error's colour bar
-MAX_DISTANCE = 0.20  # [m] both ends of the distance's colour bar
 CONTOURS = (0.0, 0.02, 0.05, 0.10)  # [m]
 CURVE_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 INK = "#222222"
@@ -159,7 +158,7 @@ def draw_distance(
 ) -> Any:
     """Draw a distance as colour, [cm], and its contour lines; returns the image, for a colour bar."""
     finite = distance[np.isfinite(distance)]
-    limit = 100.0 * MAX_DISTANCE
+    limit = 20.0  # [cm]
     image = axes.imshow(
         100.0 * distance,
         origin="lower",

@@ -23,7 +23,6 @@ from splatctrl_cli.voxels import KnownVoxels
 CHECKPOINT = "checkpoint/state.npz"
 AUDIT = "audit.jsonl"
 START_OVER = "start over: the same command without --resume"
-_MOST_STATE = 1 << 32  # bytes: a grid of as many voxels as reconstruct makes takes 2.8e9, its splats the rest
 
 State = Mapping[str, NDArray[np.generic]]
 
@@ -46,7 +45,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     """The checkpoint in a partial scene folder. Raises InputError where it cannot be read."""
     path = folder / CHECKPOINT
     try:
-        state = read_arrays(path, most=_MOST_STATE)
+        state = read_arrays(path, most=1 << 32)  # the largest grid takes 2.8e9 bytes, its splats the rest
         header = json.loads(str(state.pop("progress")))
         return Checkpoint(
             progress=header["progress"],

@@ -28,7 +28,6 @@ DURATION_S = 24.0  # [s] in which every visit and every logged motion ends
 
 UPPER_ARM, FOREARM, HAND = (0.050, 0.33), (0.042, 0.28), (0.038, 0.09)  # radius, length [m]
 SHOULDER = (1.05, 0.42)  # [m] x, z: of a sitting person who leans in over the table's edge at x = 1.15
-KNOT_S = 0.05  # [s] between the poses of a track
 CUBE = 0.04  # [m]
 
 
@@ -113,7 +112,7 @@ def things(place: str, seed: int) -> list[Primitive]:
 
 def human_arm(visit: Visit, start_ns: int) -> list[Primitive]:
     """The person's upper arm, forearm and hand as capsules that move, there from the visit's start to its end."""
-    num_knots = int(np.ceil((visit.end_s - visit.start_s) / KNOT_S)) + 1
+    num_knots = int(np.ceil((visit.end_s - visit.start_s) / 0.05)) + 1  # [s] between two poses
     seconds = np.linspace(visit.start_s, visit.end_s, num_knots)
     chains = [_chain(visit, float(second)) for second in seconds]
     stamps = start_ns + np.rint(seconds * 1e9).astype(np.int64)

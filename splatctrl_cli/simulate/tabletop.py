@@ -35,7 +35,6 @@ WAYPOINTS = (
 
 NUM_VIEWS = 8
 VIEW_SIZE = (256, 208)  # width, height [px]
-LEAST_DEPTH = 1e-4  # [m] by which a thing stands before the furniture
 MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
 
 
@@ -212,4 +211,4 @@ def object_mask(frame: RgbdFrame) -> Bool:
         name=frame.camera, intrinsics=frame.intrinsics, T_world_camera=frame.T_world_camera, is_training=True
     )
     behind = Renderer(camera, furniture(), color_rays=0).depth([])
-    return np.asarray((frame.depth > 0) & ((behind == 0) | (frame.depth < behind - LEAST_DEPTH)))
+    return np.asarray((frame.depth > 0) & ((behind == 0) | (frame.depth < behind - 1e-4)))

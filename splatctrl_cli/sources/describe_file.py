@@ -22,7 +22,6 @@ from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
 from splatctrl_cli.splat_files.splat_formats import FORMATS as SPLAT_FORMATS
 from splatctrl_cli.splat_files.splat_formats import describe_splats
 
-_MOST_SHOWN = 1 << 24  # bytes of texts and short lists
 _LIST_LIMIT = 12  # longer lists are counted, not shown
 
 
@@ -69,7 +68,7 @@ def _npz(path: Path, _head: bytes) -> Summary:
         short = [name.removesuffix(".npy") for name, (shape, dtype) in arrays.items() if _is_short(shape, dtype)]
         facts: dict[str, object] = {
             name: _text_or_json(str(array)) if array.dtype.kind in "US" else array.tolist()
-            for name, array in read_arrays(path, short, most=_MOST_SHOWN).items()
+            for name, array in read_arrays(path, short, most=1 << 24).items()
         }
     except (*DAMAGE, OSError) as error:
         raise InputError(f"{path}: not a readable .npz: {error}", remedy="the file is damaged") from None
