@@ -25,7 +25,7 @@ from tests.cli import here
 from tests.logs.make_log import LogRecipe, make_log
 
 WRITERS = [command for command in COMMANDS if command not in {"info", "check", "batch"}]  # a batch goes on
-HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "mcap", "rosbags", "clarabel")
+HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "trimesh", "mcap", "rosbags", "pxr")
 QUICK = (
     *("--max-splats", "60", "--threads", "1", "--set", "scene.first_iterations=2"),
     *("--set", "scene.iterations_per_step=1", "--box=-3,-3,-1,3,3,3", "--set", "occupancy.voxel=0.1"),
@@ -285,6 +285,19 @@ def test_a_stream_that_is_closed_is_told_where_there_was_something_to_print(
     done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr.startswith(said) and done.stderr.count("\n") == bool(said)
+
+
+@pytest.mark.parametrize(("words", "first"), [(["info", "{log}"], "log.mcap"), (["replay", "--help-all"], "usage: ")])
+def test_a_reader_that_stops_after_the_first_line_ends_the_program_quietly(
+    log: Path, words: list[str], first: str
+) -> None:
+    program = [str(Path(sys.executable).with_name("splatctrl")), *(word.format(log=log) for word in words)]
+    for reader in ("head -1", "true"):  # `true` reads nothing: the pipe is closed before the program writes
+        shell = ["bash", "-c", f'"$@" | {reader}; echo "code ${{PIPESTATUS[0]}}"', "bash", *program]
+        done = subprocess.run(shell, capture_output=True, text=True, check=False, timeout=60)
+        *lines, code = done.stdout.splitlines()
+        assert (code, done.stderr) == ("code 0", "")
+        assert [first in line for line in lines] == [True] * (reader == "head -1")
 
 
 def test_an_output_is_written_though_stdout_is_closed(log: Path, tmp_path: Path) -> None:

@@ -240,16 +240,15 @@ def test_what_is_no_file_is_refused_by_every_command_at_once(tmp_path: Path) -> 
     }
 
 
-def test_a_pipe_of_the_shell_and_dev_null_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(num_frames=1))
-    read, write = os.pipe()
-    os.write(write, b"[occupancy]\nvoxel = 0.02\n")
-    os.close(write)
-    assert main(["info", str(log)]) == 0
-    assert Path(f"/dev/fd/{read}").read_text() == "[occupancy]\nvoxel = 0.02\n"
-    os.close(read)
-    assert Path(os.devnull).read_text() == ""
-    assert capsys.readouterr().err == ""
+def test_a_pipe_of_the_shell_and_dev_null_are_read(tmp_path: Path) -> None:
+    program = Path(sys.executable).with_name("splatctrl")
+    for config, said in (
+        ("<(echo '[occupancy]'; echo 'voxel = -2')", "occupancy.voxel: expected"),
+        (os.devnull, "absent"),
+    ):
+        command = f"{program} reconstruct absent -o out --config {config}"
+        done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False, cwd=tmp_path)
+        assert said in done.stderr, done.stderr
 
 
 def test_a_name_that_is_no_text_is_described_and_not_written_down(

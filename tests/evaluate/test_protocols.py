@@ -18,18 +18,32 @@ def test_regnerf_trains_on_its_first_views_and_scores_25(name: str, num: int) ->
     assert len(split.training) + len(split.scored) + len(split.left_out) == 49
 
 
+@pytest.mark.parametrize(
+    ("name", "mask", "fill", "size"),
+    [
+        *((f"regnerf-{num}", "object", 1.0, (400, 300)) for num in (3, 6, 9)),
+        ("mvsnerf", "depth", 0.0, (640, 512)),
+        ("dtu-train", "given", 0.0, None),
+    ],
+)
+def test_published_figures_are_of_these_pixels(
+    name: str, mask: str, fill: float, size: tuple[int, int] | None
+) -> None:
+    """Width and height; outside the mask SSIM sees white (regnerf/eval.py) or black."""
+    protocol = score_protocol(name)
+    assert (protocol.mask, protocol.fill, protocol.size) == (mask, fill, size)
+
+
 def test_regnerf_leaves_out_what_a_scan_of_64_views_has_more() -> None:
     split = score_protocol("regnerf-3").split(range(64), "scan")
     assert set(range(49, 64)) <= set(split.left_out)
 
 
 def test_mvsnerf_scores_four_views_where_there_is_depth() -> None:
-    protocol = score_protocol("mvsnerf")
-    split = protocol.split(DTU, "scan")
+    split = score_protocol("mvsnerf").split(DTU, "scan")
     assert split.scored == (32, 24, 23, 44)
     assert len(split.training) == 16
     assert not set(split.training) & set(split.scored)
-    assert protocol.mask == "depth"
 
 
 def test_every_eighth_view_is_scored_and_all_of_dtu_train() -> None:
