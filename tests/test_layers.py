@@ -25,6 +25,7 @@ HOMES = {
     "daqp": {"control"},
     "rosbags": {"containers", "logs"},
     "mcap": {"containers", "logs"},
+    "google": {"containers"},
     "pxr": {"splat_files"},
     "matplotlib": {"libraries"},
 }

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.reader import make_reader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -30,103 +32,53 @@ from tests.logs.make_log import LogRecipe, make_log
 from tests.logs.write_log import encoded as ros_message
 from tests.logs.write_log import messages_of, rewritten, write_bag
 
-DOUBLE, INT64, INT32, FIXED32, STRING, MESSAGE, BYTES = 1, 3, 5, 7, 9, 11, 12
-TIME = ".google.protobuf.Timestamp"
-Fields = dict[str, tuple[int, int, str]]
-TYPES: dict[str, Fields] = {  # name, number, type (and message) of each field, numbered as Foxglove numbers them
-    "google.protobuf.Timestamp": {"seconds": (1, INT64, ""), "nanos": (2, INT32, "")},
-    "foxglove.Vector3": {"x": (1, DOUBLE, ""), "y": (2, DOUBLE, ""), "z": (3, DOUBLE, "")},
-    "foxglove.Quaternion": {"x": (1, DOUBLE, ""), "y": (2, DOUBLE, ""), "z": (3, DOUBLE, ""), "w": (4, DOUBLE, "")},
-    "foxglove.CompressedImage": {
-        "timestamp": (1, MESSAGE, TIME),
-        "frame_id": (4, STRING, ""),
-        "data": (2, BYTES, ""),
-        "format": (3, STRING, ""),
-    },
+TIME = "timestamp .google.protobuf.Timestamp"
+TYPES = {  # fields of each type, numbered as Foxglove numbers them: name and type, [] where it repeats
+    "foxglove.Vector3": {1: "x double", 2: "y double", 3: "z double"},
+    "foxglove.Quaternion": {1: "x double", 2: "y double", 3: "z double", 4: "w double"},
+    "foxglove.CompressedImage": {1: TIME, 4: "frame_id string", 2: "data bytes", 3: "format string"},
     "foxglove.RawImage": {
-        "timestamp": (1, MESSAGE, TIME),
-        "frame_id": (7, STRING, ""),
-        "width": (2, FIXED32, ""),
-        "height": (3, FIXED32, ""),
-        "encoding": (4, STRING, ""),
-        "step": (5, FIXED32, ""),
-        "data": (6, BYTES, ""),
+        **{1: TIME, 7: "frame_id string", 2: "width fixed32", 3: "height fixed32"},
+        **{4: "encoding string", 5: "step fixed32", 6: "data bytes"},
     },
     "foxglove.CameraCalibration": {
-        "timestamp": (1, MESSAGE, TIME),
-        "frame_id": (9, STRING, ""),
-        "width": (2, FIXED32, ""),
-        "height": (3, FIXED32, ""),
-        "distortion_model": (4, STRING, ""),
-        **{name: (number, DOUBLE, "repeated") for name, number in (("D", 5), ("K", 6), ("R", 7), ("P", 8))},
+        **{1: TIME, 9: "frame_id string", 2: "width fixed32", 3: "height fixed32"},
+        **{4: "distortion_model string", 5: "D double[]", 6: "K double[]", 7: "R double[]", 8: "P double[]"},
     },
     "foxglove.FrameTransform": {
-        "timestamp": (1, MESSAGE, TIME),
-        "parent_frame_id": (2, STRING, ""),
-        "child_frame_id": (3, STRING, ""),
-        "translation": (4, MESSAGE, ".foxglove.Vector3"),
-        "rotation": (5, MESSAGE, ".foxglove.Quaternion"),
+        **{1: TIME, 2: "parent_frame_id string", 3: "child_frame_id string"},
+        **{4: "translation .foxglove.Vector3", 5: "rotation .foxglove.Quaternion"},
     },
-    "foxglove.FrameTransforms": {"transforms": (1, MESSAGE, ".foxglove.FrameTransform repeated")},
-    "foxglove.JointState": {"name": (1, STRING, ""), "position": (2, DOUBLE, "")},
-    "foxglove.JointStates": {
-        "timestamp": (1, MESSAGE, TIME),
-        "joints": (2, MESSAGE, ".foxglove.JointState repeated"),
-    },
+    "foxglove.FrameTransforms": {1: "transforms .foxglove.FrameTransform[]"},
+    "foxglove.JointState": {1: "name string", 2: "position double"},
+    "foxglove.JointStates": {1: TIME, 2: "joints .foxglove.JointState[]"},
 }
 
 
-def varint(value: int) -> bytes:
-    data = b""
-    while True:
-        value, low = value >> 7, value & 127
-        data += bytes([low | (128 if value else 0)])
-        if not value:
-            return data
-
-
-def delimited(number: int, content: bytes) -> bytes:
-    return varint(number << 3 | 2) + varint(len(content)) + content
-
-
 def descriptor_set() -> bytes:
-    """One file a package."""
-    files = b""
-    for package in ("google.protobuf", "foxglove"):
-        file = delimited(1, f"{package}.proto".encode()) + delimited(2, package.encode())
-        for name, fields in TYPES.items():
-            if name.rpartition(".")[0] == package:
-                message = delimited(1, name.rpartition(".")[2].encode())
-                for field, (number, kind, of) in fields.items():
-                    label = 3 if of.endswith("repeated") else 1
-                    entry = delimited(1, field.encode()) + b"\x18" + varint(number) + b"\x20" + varint(label)
-                    entry += b"\x28" + varint(kind)
-                    entry += delimited(6, of.split()[0].encode()) if kind == MESSAGE else b""
-                    message += delimited(2, entry)
-                file += delimited(4, message)
-        files += delimited(1, file)
-    return files
+    """The types, before the file that they import."""
+    file = FileDescriptorProto(name="foxglove.proto", package="foxglove", syntax="proto3")
+    file.dependency.append(Timestamp.DESCRIPTOR.file.name)
+    for name, fields in TYPES.items():
+        message = file.message_type.add(name=name.removeprefix("foxglove."))
+        for number, text in fields.items():
+            field, kind = text.removesuffix("[]").split()
+            kind_name = "MESSAGE" if kind.startswith(".") else kind.upper()
+            message.field.add(
+                name=field,
+                number=number,
+                label=3 if text.endswith("[]") else 1,
+                type=FieldDescriptorProto.Type.Value(f"TYPE_{kind_name}"),
+                type_name=kind if kind.startswith(".") else None,
+            )
+    files = FileDescriptorSet(file=[file, FileDescriptorProto.FromString(Timestamp.DESCRIPTOR.file.serialized_pb)])
+    return files.SerializeToString()
 
 
 def encoded(type_name: str, message: dict[str, Any]) -> bytes:
-    """A message in the wire format, packed where it repeats numbers."""
-    data = b""
-    for name, value in message.items():
-        number, kind, of = TYPES[type_name][name]
-        if kind == MESSAGE:
-            items = value if of.endswith("repeated") else [value]
-            data += b"".join(delimited(number, encoded(of.split()[0][1:], item)) for item in items)
-        elif of == "repeated":
-            data += delimited(number, struct.pack(f"<{len(value)}d", *value))
-        elif kind == DOUBLE:
-            data += varint(number << 3 | 1) + struct.pack("<d", value)
-        elif kind == FIXED32:
-            data += varint(number << 3 | 5) + struct.pack("<I", value)
-        elif kind in {INT64, INT32}:
-            data += varint(number << 3) + varint(value)
-        else:
-            data += delimited(number, value if kind == BYTES else value.encode())
-    return data
+    """A message in the wire format."""
+    kind = type(MessageTypes(descriptor_set()).read(type_name, b""))
+    return bytes(kind(**message).SerializeToString())
 
 
 def foxglove_of(kind: str, message: Any) -> tuple[str, dict[str, Any]]:
@@ -307,39 +259,40 @@ def test_a_message_that_does_not_decode_is_counted(tmp_path: Path) -> None:
     source = open_source(convert(log, tmp_path / "broken.mcap", "protobuf", spoil))
     assert len(list(source.records())) == 4
     assert source.loss.damaged == 1
-    assert "foxglove.CompressedImage that does not decode: protobuf: field 3 of 4 bytes" in source.loss.notes[0]
+    assert "foxglove.CompressedImage that does not decode: protobuf: Error parsing message" in source.loss.notes[0]
 
 
 @pytest.mark.parametrize("data", [b"\x0a\xff", b"\xff" * 11, b"\x0b", b"\x0a\x05abc", struct.pack("<B", 9) + b"1234"])
 def test_bytes_that_are_no_message_are_refused(data: bytes) -> None:
-    with pytest.raises(ValueError, match="protobuf"):
+    with pytest.raises(ValueError, match="protobuf: Error parsing message"):
         MessageTypes(descriptor_set()).read("foxglove.Vector3", data)
+
+
+def without_its_import(files: FileDescriptorSet) -> None:
+    del files.file[1]
+
+
+def defined_twice(files: FileDescriptorSet) -> None:
+    files.file.add(name="foxglove.proto", package="other")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(without_its_import, "Couldn't build proto file"), (defined_twice, "foxglove.proto already added")],
+)
+def test_a_schema_that_is_not_usable_is_refused(change: Callable[[FileDescriptorSet], None], words: str) -> None:
+    files = FileDescriptorSet.FromString(descriptor_set())
+    change(files)
+    with pytest.raises(ValueError, match=f"protobuf: .*{words}"):
+        MessageTypes(files.SerializeToString()).read("foxglove.RawImage", b"")
 
 
 def test_fields_that_were_not_written_have_their_defaults_and_unknown_ones_are_passed_over() -> None:
     types = MessageTypes(descriptor_set())
-    message = types.read("foxglove.FrameTransform", delimited(3, b"cam") + delimited(99, b"new"))
+    message = types.read("foxglove.FrameTransform", b"\x1a\x03cam" + b"\x9a\x06\x03new")
     assert (message.child_frame_id, message.parent_frame_id, message.timestamp.seconds) == ("cam", "", 0)
-    negative = types.read("google.protobuf.Timestamp", varint(8) + varint((1 << 64) - 5))
-    assert negative.seconds == -5
     with pytest.raises(ValueError, match=r"does not define foxglove\.Nothing"):
         types.read("foxglove.Nothing", b"")
-
-
-def test_nested_types_and_numbers_of_every_wire_form_are_read() -> None:
-    """type a.Outer { message Inner { sint64 z = 1; } Inner i = 1; repeated uint32 packed = 2; bool b = 3; }"""
-
-    def field(name: str, number: int, label: int, kind: int, of: str = "") -> bytes:
-        numbers = b"\x18" + varint(number) + b"\x20" + varint(label) + b"\x28" + varint(kind)
-        return delimited(2, delimited(1, name.encode()) + numbers + (delimited(6, of.encode()) if of else b""))
-
-    inner = delimited(3, delimited(1, b"Inner") + field("z", 1, 1, 18))
-    outer = delimited(1, b"Outer") + inner + field("i", 1, 1, MESSAGE, "Inner")
-    outer += field("packed", 2, 3, 13) + field("b", 3, 1, 8)
-    types = MessageTypes(delimited(1, delimited(2, b"a") + delimited(4, outer)))
-    data = delimited(1, b"\x08" + varint(5)) + delimited(2, varint(300) + varint(7)) + b"\x18\x01" + b"\x10\x09"
-    message = types.read("a.Outer", data)
-    assert (message.i.z, message.packed, message.b) == (-3, [300, 7, 9], True)
 
 
 def test_the_descriptors_of_a_real_log_are_read(real_data: Path) -> None:
