@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.check_states import robot_findings
 from splatctrl_cli.checks.check_times import file_findings
 from splatctrl_cli.checks.finding import CHECKS, CheckReport, Finding, Severity
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_logs
 from tests.files.break_log import Change, Message, broken_log, set_stamp, stamp_of
@@ -108,6 +106,10 @@ def half_the_depth(log_time: int, topic: str, kind: str, message: Any) -> Iterat
         yield log_time, topic, kind, message
 
 
+def _with(**values: Any) -> Edit:
+    return lambda message: [setattr(message, name, value) for name, value in values.items()]
+
+
 def _cut(message: Any) -> None:
     message.data = message.data[:60]
 
@@ -132,21 +134,9 @@ def _narrow(info: Any) -> None:
     info.k[0] = info.k[4] = 300.0
 
 
-def _strange(info: Any) -> None:
-    info.distortion_model, info.d = "fish", np.full(5, 0.1)
-
-
-def _few(info: Any) -> None:
-    info.distortion_model, info.d = "plumb_bob", np.full(3, 0.01)
-
-
 def _other_size(info: Any) -> None:
     info.width, info.height = 64, 48
     info.k[[2, 5]] *= 2
-
-
-def _encoding(message: Any) -> None:
-    message.encoding = "bayer_of_mars"
 
 
 def _jump(message: Any) -> None:
@@ -159,10 +149,6 @@ def _parent(number: int, name: str) -> Edit:
 
 def _gripper(message: Any) -> None:
     message.transforms[0].child_frame_id = "gripper"
-
-
-def _joint(**columns: Any) -> Edit:
-    return lambda state: [setattr(state, name, value) for name, value in columns.items()]
 
 
 def _nan(state: Any) -> None:
@@ -213,8 +199,8 @@ FAULTS = [
     Fault(code="clock-drift", value=0.058, where=JOINTS,
           change=logged_later(lambda time, topic: (time - START_NS) // 50 if topic == JOINTS else 0)),
     Fault(code="undecodable", change=edited(COLOR, _cut, 7, 7), where=COLOR, value=1, at=0.7),
-    Fault(code="encoding", severity=NOTE, change=doubled(DEPTH, _encoding, name="/odd/image"), where="/odd/image",
-          what="'bayer_of_mars' is not read"),
+    Fault(code="encoding", severity=NOTE, where="/odd/image", what="'bayer_of_mars' is not read",
+          change=doubled(DEPTH, _with(encoding="bayer_of_mars"), name="/odd/image")),
     Fault(code="image-size", change=edited(DEPTH, _shrink, first=26), where=DEPTH),
     Fault(code="pairing", change=late_half, where="camera cam0", value=0.5),
     Fault(code="pair-offset", severity=NOTE, recipe=replace(GOOD, depth_delay_ns=15_000_000), value=15, beside=True),
@@ -233,8 +219,10 @@ FAULTS = [
     Fault(code="focal-ratio", change=edited(INFO, _of_info(1.3, 4)), beside=True),
     Fault(code="field-of-view", change=edited(INFO, _narrow), beside=True),
     Fault(code="uncalibrated", change=edited(INFO, _of_info(0, *range(9))), beside=True),
-    Fault(code="distortion", severity=ERROR, change=edited(INFO, _strange), beside=True),
-    Fault(code="distortion", severity=ERROR, change=edited(INFO, _few), what="plumb_bob with 3", beside=True),
+    Fault(code="distortion", severity=ERROR, beside=True,
+          change=edited(INFO, _with(distortion_model="fish", d=np.full(5, 0.1)))),
+    Fault(code="distortion", severity=ERROR, what="plumb_bob with 3", beside=True,
+          change=edited(INFO, _with(distortion_model="plumb_bob", d=np.full(3, 0.01)))),
     Fault(code="camera-info-size", severity=ERROR, change=edited(INFO, _other_size), beside=True),
     Fault(code="camera-info-changes", change=edited(INFO, _of_info(1.1, 0, 4), first=15), at=1.5),
     Fault(code="camera-info-two", change=doubled(INFO, _of_info(1.1, 0, 4), name="/calibrated/camera_info")),
@@ -249,7 +237,7 @@ FAULTS = [
     Fault(code="joints-nan", change=edited(JOINTS, _nan, 3, 3)),
     Fault(code="joints-velocity", change=edited(JOINTS, _no_velocity)),
     Fault(code="joints-still", severity=NOTE, change=edited(JOINTS, _still), where=JOINTS, beside=True),
-    Fault(code="damaged", change=edited(JOINTS, _joint(position=np.zeros(0))), value=30,
+    Fault(code="damaged", change=edited(JOINTS, _with(position=np.zeros(0))), value=30,
           what="a JointState with 2 names, 0 positions and 2 velocities (30 times)"),
     Fault(code="missing", severity=ERROR, recipe=LogRecipe(has_depth=False),
           what="no depth topic; colour topics there: " + COLOR, remedy="record 16UC1, mono16 or 32FC1 depth images"),
@@ -335,7 +323,7 @@ def test_what_a_log_lacks_is_said_for_each_command(tmp_path: Path) -> None:
     assert missing.remedy == "record /tf and /tf_static, or give --camera-pose cam0=x,y,z,qx,qy,qz,qw"
     for name, recipe, change in (
         ("none", replace(GOOD, has_joints=False), without()),
-        ("empty", GOOD, edited(JOINTS, _joint(name=[], position=np.zeros(0), velocity=np.zeros(0)))),
+        ("empty", GOOD, edited(JOINTS, _with(name=[], position=np.zeros(0), velocity=np.zeros(0)))),
     ):
         alone = checked(broken_log(tmp_path / f"{name}.mcap", change, recipe))
         assert [need.command for need in alone.needs if alone.lacks(need)] == ["replay"]
@@ -356,45 +344,6 @@ def test_a_file_that_was_cut_is_a_warning_and_the_rest_is_judged(tmp_path: Path)
     assert damaged
     assert all(f.severity is WARNING and f.remedy.startswith("copy the file again") for f in damaged)
     assert next(rate for rate in report.rates if rate.topic == COLOR).messages > 10
-
-
-@pytest.fixture(scope="module")
-def arm(sample_data: Path) -> RobotModel:
-    tabletop = sample_data / "tabletop"
-    return RobotModel.from_urdf(tabletop / "robot.urdf", tabletop / "robot_spheres.yaml")
-
-
-def swing(model: RobotModel, link: str | None = None) -> list[JointState]:
-    """States between the limits, with poses of a link."""
-    middle, half = 0.5 * (model.lower + model.upper), 0.5 * (model.upper - model.lower)
-    states = []
-    for index in range(20):
-        q = middle + 0.4 * half * np.sin(0.3 * index + np.arange(model.num_joints))
-        pose = None if link is None else model.frame_pose(q, link)
-        states.append(JointState(stamp_ns=index, position=q, velocity=np.zeros_like(q), T_base_ee=pose))
-    return states
-
-
-def test_states_beyond_the_limits_are_a_warning_with_the_joint(arm: RobotModel) -> None:
-    states = swing(arm)
-    assert robot_findings(arm, states, "joint states") == []
-    beyond = states[7].position.copy()
-    beyond[3] = arm.upper[3] + 0.2
-    states[7] = replace(states[7], position=beyond)
-    finding = only(robot_findings(arm, states, "joint states"), "joints-limits")
-    assert (finding.severity, finding.value, finding.stamp_ns) == (WARNING, pytest.approx(0.2), 7)
-    assert f"1 of 20 states are beyond the URDF's limits, {arm.joint_names[3]}" in finding.what
-
-
-def test_end_effector_poses_of_another_robot_are_an_error(arm: RobotModel) -> None:
-    good = only(robot_findings(arm, swing(arm, "hand"), "joint states"), "end-effector")
-    assert (good.severity, good.value) == (NOTE, pytest.approx(0, abs=0.01))
-    poses = [state.T_base_ee for state in swing(arm, "hand")]
-    other = [replace(s, T_base_ee=T) for s, T in zip(swing(arm), reversed(poses), strict=True)]
-    finding = only(robot_findings(arm, other, "joint states"), "end-effector")
-    assert finding.severity is ERROR
-    assert finding.value is not None and finding.value > 100
-    assert finding.remedy == "give the URDF of this very robot, and its --base"
 
 
 def test_one_camera_of_three_with_another_clock_is_found(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.checks.check_states import PoseVerdict, check_angles, pose_agreement
+from splatctrl_cli.checks.check_states import PoseVerdict, check_angles, pose_agreement, robot_findings
+from splatctrl_cli.checks.finding import Severity
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.records import Float64, JointState
@@ -28,7 +29,7 @@ def motion(model: RobotModel, num: int = 60, amplitude: float = 0.5) -> Float64:
     return np.asarray(model.middle + amplitude * np.sin(phase))
 
 
-def states_with(q: Float64, T_base_ee: Callable[[Float64], Float64]) -> list[JointState]:
+def states_with(q: Float64, T_base_ee: Callable[[Float64], Float64 | None]) -> list[JointState]:
     return [
         JointState(stamp_ns=i, position=row, velocity=np.zeros(len(row)), T_base_ee=T_base_ee(row))
         for i, row in enumerate(q)
@@ -124,3 +125,24 @@ def test_degrees_are_refused_and_radians_are_not(model: RobotModel) -> None:
     with pytest.raises(InputError, match=r"log: joint .* which would fit as degrees") as caught:
         check_angles(model, states(np.degrees(q)), "log")
     assert 'unit = "deg"' in caught.value.remedy
+
+
+def test_states_beyond_the_limits_are_a_warning_with_the_joint(model: RobotModel) -> None:
+    q = motion(model)
+    assert robot_findings(model, states_with(q, lambda _: None), "joint states") == []
+    q[7, 3] = model.upper[3] + 0.2
+    (finding,) = robot_findings(model, states_with(q, lambda _: None), "joint states")
+    assert (finding.code, finding.severity, finding.stamp_ns) == ("joints-limits", Severity.WARNING, 7)
+    assert finding.value == pytest.approx(0.2)
+    assert f"1 of 60 states are beyond the URDF's limits, {model.joint_names[3]}" in finding.what
+
+
+def test_end_effector_poses_of_another_robot_are_an_error(model: RobotModel) -> None:
+    q = motion(model)
+    (good,) = robot_findings(model, states_with(q, lambda q: in_base(model, q, "hand")), "joint states")
+    assert (good.code, good.severity, good.value) == ("end-effector", Severity.NOTE, pytest.approx(0, abs=0.01))
+    poses = iter([in_base(model, row, "hand") for row in q[::-1]])
+    (other,) = robot_findings(model, states_with(q, lambda _: next(poses)), "joint states")
+    assert (other.code, other.severity) == ("end-effector", Severity.ERROR)
+    assert other.value is not None and other.value > 100
+    assert other.remedy == "give the URDF of this very robot, and its --base"

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from splatctrl_cli.config import FieldConfig
+from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.files.output import part_digests, write_json
-from splatctrl_cli.records import Float64, JointState, Label, SplatSet
+from splatctrl_cli.grid_files.npz_grid import write_npz
+from splatctrl_cli.records import Box, Float64, JointState, Label, SplatSet
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.simulate.primitives import Primitive, Texture
@@ -105,6 +108,19 @@ class Stage:
         code = self.desk.replay(*arguments, "-q", "--force", is_judged=True)
         self.desk.robot = robot
         return code, self.desk.verdict() if (self.desk.folder / "out").exists() else {}
+
+    def judged_by_field(
+        self, *balls: Ball, voxel: float = 0.04, moment_ns: int | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        """Exit code and verdict of an audit of the states by a field of these balls that is of that time."""
+        self.desk.source.states = self.states
+        box = Box(lower=np.array([-1.2, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.4]))
+        grid = bake(splats_of(*balls), box, FieldConfig(voxel=voxel), occupancy=grid_seen(), threads=1)
+        header = dict(grid.header) | ({} if moment_ns is None else {"stamp_ns": moment_ns})
+        folder = self.desk.folder / "field"
+        folder.mkdir()
+        write_npz(folder / "field.npz", replace(grid, header=header))
+        return self.replayed("--field", str(folder))
 
     def truth(self, *balls: Ball, name: str = "ball") -> Path:
         """A truth.json of these balls, called `name` and a number, beside the states."""

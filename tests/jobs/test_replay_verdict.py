@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.checks.clock_offset import ClockOffset
-from splatctrl_cli.config import FieldConfig
-from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.grid_files.npz_grid import read_npz, write_npz
 from splatctrl_cli.jobs import replay as job
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
-from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import VoxelState
-from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
+from tests.cli.replay_desk import SECOND, START, Desk, grid_seen
 from tests.jobs.broken import (
     ALONE,
     ELSEWHERE,
@@ -213,45 +210,30 @@ def test_states_of_another_hour_are_not_judged_by_a_scene_or_a_field(stage: Stag
     stage.states = states_on(np.tile(START, (11, 1)), start_ns=3600 * SECOND)
     code, verdict = stage.judged()
     assert code == 5 and {"map age", "evidence age", "evidence"} <= set(decisive(verdict))
-    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR), moment=SECOND)))
+    code, verdict = stage.judged_by_field(FAR, moment_ns=SECOND)
     assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
-
-
-def baked(stage: Stage, *, splats: object, voxel: float = 0.04, moment: int | None = None) -> Path:
-    """A field of the arm's surroundings."""
-    box = Box(lower=np.array([-1.2, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.4]))
-    grid = bake(splats, box, replace(FieldConfig(), voxel=voxel), occupancy=grid_seen(), threads=1)  # type: ignore[arg-type]
-    header = dict(grid.header) | ({} if moment is None else {"stamp_ns": moment})
-    folder = stage.desk.folder / "field"
-    folder.mkdir()
-    write_npz(folder / "field.npz", replace(grid, header=header))
-    return folder
 
 
 def test_a_margin_that_only_the_grids_bound_breaks_is_a_matter_of_the_grid(stage: Stage) -> None:
     ball, moment = stage.ball_at_the_end(0.03), int(stage.states[-1].stamp_ns)
-    stage.desk.source.states = stage.states
-    code, verdict = stage.replayed(
-        "--field", str(baked(stage, splats=splats_of(FAR, ball), voxel=0.08, moment=moment))
-    )
+    code, verdict = stage.judged_by_field(FAR, ball, voxel=0.08, moment_ns=moment)
     assert (code, decisive(verdict)) == (5, {"certified clearance": "not evaluable"})
     found = re.search(r"bake again with --voxel at most ([\d.]+)", verdict["sentence"])
     assert found is not None and 0.005 < float(found[1]) < 0.08
 
 
 def test_a_field_that_does_not_say_of_what_time_it_is_is_no_evidence(stage: Stage) -> None:
-    stage.desk.source.states = stage.states
-    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR))))
+    code, verdict = stage.judged_by_field(FAR)
     assert (code, decisive(verdict)) == (5, {"map age": "not evaluable"})
     assert "does not say what time it shows" in verdict["sentence"]
 
 
 def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_said_not_to_be(stage: Stage) -> None:
-    stage.states = stage.desk.source.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
-    field = baked(stage, splats=splats_of(FAR), moment=SECOND)
-    code, verdict = stage.replayed("--field", str(field))
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]))
+    code, verdict = stage.judged_by_field(FAR, moment_ns=SECOND)
     assert (code, decisive(verdict)) == (0, {})
     assert "age of the evidence about the arm not judged" in verdict["sentence"]
+    field = stage.desk.folder / "field"
     grid = read_npz(field / "field.npz")
     for state, channels in (
         (VoxelState.SWEPT_BY_ROBOT, {"observed": np.full_like(grid.channels["observed"], VoxelState.SWEPT_BY_ROBOT)}),
@@ -266,9 +248,7 @@ def test_what_a_field_never_saw_about_the_arm_is_judged_and_its_evidence_age_is_
 
 
 def test_a_value_of_the_grid_below_the_margin_is_red(stage: Stage) -> None:
-    ball = stage.ball_at_the_end(-0.01)
-    stage.desk.source.states = stage.states
-    code, verdict = stage.replayed("--field", str(baked(stage, splats=splats_of(FAR, ball), voxel=0.04)))
+    code, verdict = stage.judged_by_field(FAR, stage.ball_at_the_end(-0.01))
     assert (code, verdict["label"], decisive(verdict)["clearance"]) == (1, "contact", "failed")
     assert decisive(verdict)["certified clearance"] == "failed"
 

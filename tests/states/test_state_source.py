@@ -1,6 +1,8 @@
 """Robot logs of every kind as joint states, and what each kind of bad log says."""
 
-import os
+import sqlite3
+from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +35,20 @@ from tests.logs.make_states import (
 
 ARM = tuple(f"fr3_joint{i}" for i in range(1, 8))
 AB = ("a", "b")
-REAL = os.environ.get("SPLATCTRL_REAL_DATA")
 
 
 def ramp(num: int, joints: int = 2) -> Float64:
     """Positions (T, J): joint k moves at (k + 1) rad/s from k."""
     t = np.arange(num) * 1e-9 * STEP_NS
     return np.stack([k + (k + 1) * t for k in range(joints)], axis=1)
+
+
+def sent(topic: str, kind: str, contents: Iterable[Any]) -> list[Message]:
+    """One message a step."""
+    return [
+        Message(log_ns=START_NS + i * STEP_NS, topic=topic, type_name=kind, content=content)
+        for i, content in enumerate(contents)
+    ]
 
 
 def opened(path: Path, joints: tuple[str, ...] = AB, **options: Any) -> RecordSource:
@@ -113,12 +122,8 @@ def test_joints_of_two_topics_are_brought_together_at_the_stamps_of_one(tmp_path
 
 def test_joints_of_alternating_messages_of_one_topic_are_brought_together(tmp_path: Path) -> None:
     q = ramp(40)
-    messages = []
-    for i, message in enumerate(states_of(q, AB)):
-        name, value = (AB[i % 2],), q[i, i % 2 : i % 2 + 1]
-        content = joint_state(message.log_ns, name, value)
-        messages.append(Message(log_ns=message.log_ns, topic="/js", type_name=message.type_name, content=content))
-    source = opened(write_mcap(tmp_path / "x.mcap", messages))
+    halves = (joint_state(START_NS + i * STEP_NS, (AB[i % 2],), q[i, i % 2 : i % 2 + 1]) for i in range(40))
+    source = opened(write_mcap(tmp_path / "x.mcap", sent("/js", "sensor_msgs/msg/JointState", halves)))
     position = columns(source, AB)[0]
     assert len(position) == 19  # the first or last of either half has nothing to be interpolated between
     assert position[:, 1] == pytest.approx(1 + 2 * position[:, 0], abs=1e-9)
@@ -171,18 +176,14 @@ def test_controller_states_give_positions_velocities_and_commands(tmp_path: Path
         )
 
     names = ("feedback", "reference") if is_new else ("actual", "desired")
-    messages = []
+    fields = set(store.types[kind].__dataclass_fields__) - {"header", "joint_names", "__msgtype__"}
+    contents = []
     for i, row in enumerate(q):
-        stamp = START_NS + i * STEP_NS
-        empty = {
-            f: point([], [])
-            for f in store.types[kind].__dataclass_fields__
-            if f not in {"header", "joint_names", "__msgtype__"}
-        }
         filled = {names[0]: point(row, [1.0, 2.0]), names[1]: point(row + 0.1, [1.5, 2.5])}
-        content = store.types[kind](header=header(store, stamp), joint_names=list(AB), **{**empty, **filled})
-        messages.append(Message(log_ns=stamp, topic="/controller/state", type_name=kind, content=content))
-    found = states(opened(write_bag2(tmp_path / "bag", messages, store)))
+        points = {field: filled.get(field, point([], [])) for field in fields}
+        stamped = header(store, START_NS + i * STEP_NS)
+        contents.append(store.types[kind](header=stamped, joint_names=list(AB), **points))
+    found = states(opened(write_bag2(tmp_path / "bag", sent("/controller/state", kind, contents), store)))
     assert len(found) == 20
     assert found[3].position == pytest.approx(q[3])
     assert found[3].velocity == pytest.approx([1.0, 2.0])
@@ -201,25 +202,20 @@ def some_pose() -> Float64:
     return T
 
 
-def test_a_ros_1_franka_state_without_names_is_taken_by_the_numbers_of_its_joints(tmp_path: Path) -> None:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg(FRANKA_STATE, "franka_msgs/msg/FrankaState"))
-    kind, q = "franka_msgs/msg/FrankaState", ramp(20, 7)
-    messages = []
+def franka_1(store: Any, q: Float64) -> list[Message]:
+    """Robot states without names of joints, the first without a pose."""
+    kind, contents = "franka_msgs/msg/FrankaState", []
     for i, row in enumerate(q):
-        stamp = START_NS + i * STEP_NS
-        content = store.types[kind](
-            header=header(store, stamp),
-            q=row,
-            q_d=row,
-            dq=np.arange(1.0, 8.0),
-            dq_d=np.arange(2.0, 9.0),
-            O_T_EE=pose_columns(some_pose()) if i else np.zeros(16),
-            O_T_EE_d=np.zeros(16),
-            time=0.0,
-        )
-        messages.append(Message(log_ns=stamp, topic="/franka_states", type_name=kind, content=content))
-    source = opened(write_bag1(tmp_path / "x.bag", messages, store), ARM)
+        numbers = {"q": row, "q_d": row, "dq": np.arange(1.0, 8.0), "dq_d": np.arange(2.0, 9.0)}
+        poses = {"O_T_EE": pose_columns(some_pose()) if i else np.zeros(16), "O_T_EE_d": np.zeros(16)}
+        contents.append(store.types[kind](header=header(store, START_NS + i * STEP_NS), time=0.0, **numbers, **poses))
+    return sent("/franka_states", kind, contents)
+
+
+def test_a_ros_1_franka_state_without_names_is_taken_by_the_numbers_of_its_joints(tmp_path: Path) -> None:
+    store, q = get_typestore(Stores.ROS1_NOETIC), ramp(20, 7)
+    store.register(get_types_from_msg(FRANKA_STATE, "franka_msgs/msg/FrankaState"))
+    source = opened(write_bag1(tmp_path / "x.bag", franka_1(store, q), store), ARM)
     found = states(source)
     assert source.joint_names == ARM
     assert found[4].position == pytest.approx(q[4])
@@ -232,17 +228,11 @@ def test_a_ros_1_franka_state_without_names_is_taken_by_the_numbers_of_its_joint
 
 
 def test_fingers_of_another_topic_join_a_franka_state_without_names(tmp_path: Path) -> None:
-    store = store_with(franka_msgs__FrankaState=FRANKA_STATE)
-    kind, q = "franka_msgs/msg/FrankaState", ramp(20, 7)
-    messages = []
-    for i, row in enumerate(q):
-        stamp, zero = START_NS + i * STEP_NS, np.zeros(16)
-        numbers = {"q": row, "q_d": row, "dq": row, "dq_d": row, "O_T_EE": zero, "O_T_EE_d": zero}
-        content = store.types[kind](header=header(store, stamp), time=0.0, **numbers)
-        messages.append(Message(log_ns=stamp, topic="/franka_states", type_name=kind, content=content))
+    store, q = store_with(franka_msgs__FrankaState=FRANKA_STATE), ramp(20, 7)
     fingers = ("fr3_finger_joint1", "fr3_finger_joint2")
     gripper = states_of(np.full((20, 2), 0.04), fingers, topic="/gripper")
-    source = opened(write_mcap(tmp_path / "x.mcap", messages + gripper, store), (*ARM, *fingers))
+    log = write_mcap(tmp_path / "x.mcap", franka_1(store, q) + gripper, store)
+    source = opened(log, (*ARM, *fingers))
     assert source.joint_names == (*ARM, *fingers)
     assert states(source)[5].position == pytest.approx([*q[5], 0.04, 0.04])
 
@@ -250,7 +240,7 @@ def test_fingers_of_another_topic_join_a_franka_state_without_names(tmp_path: Pa
 def franka_2(num: int) -> tuple[Any, list[Message]]:
     store = store_with(franka_msgs__FrankaRobotState=FRANKA_ROBOT_STATE)
     kind, q = "franka_msgs/msg/FrankaRobotState", ramp(num, 7)
-    types, messages = store.types, []
+    types, contents = store.types, []
     half = float(np.sqrt(0.5))
     for i, row in enumerate(q):
         stamp = START_NS + i * STEP_NS
@@ -268,8 +258,8 @@ def franka_2(num: int) -> tuple[Any, list[Message]]:
             o_t_ee=pose,
             time=0.0,
         )
-        messages.append(Message(log_ns=stamp, topic="/robot_state", type_name=kind, content=content))
-    return store, messages
+        contents.append(content)
+    return store, sent("/robot_state", kind, contents)
 
 
 def test_a_franka_robot_state_of_ros_2_is_preferred_because_it_has_poses(tmp_path: Path) -> None:
@@ -288,11 +278,8 @@ def test_a_type_that_the_log_does_not_define_is_said_and_is_no_damage(tmp_path: 
     store, messages = franka_2(5)
     both = messages + states_of(ramp(20, 7), ARM)
     bag = write_bag2(tmp_path / "bag", both, store)
-    import sqlite3
-
-    with sqlite3.connect(next(bag.glob("*.db3"))) as base:
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as base, base:
         base.execute("DELETE FROM message_definitions")
-    base.close()
     source = opened(next(bag.glob("*.db3")), ARM)
     assert len(states(source)) == 20
     assert source.loss.damaged == 0
@@ -325,14 +312,19 @@ def test_a_log_without_states_names_what_it_holds(tmp_path: Path) -> None:
     assert "/cam0/color/image_raw/compressed (sensor_msgs/msg/CompressedImage)" in message
 
 
-def test_states_that_name_no_joints_are_none(tmp_path: Path) -> None:
-    assert "expected joint states, got none" in refusal(
-        write_mcap(tmp_path / "x.mcap", states_of(np.zeros((4, 0)), ()))
-    )
-
-
-def test_a_log_without_a_message_is_refused(tmp_path: Path) -> None:
-    assert "the log holds no messages" in refusal(write_mcap(tmp_path / "x.mcap", []))
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([], "the log holds no messages"),
+        (states_of(np.zeros((4, 0)), ()), "expected joint states, got none"),
+        (states_of(np.full((3, 2), np.nan), AB), "expected joint states, got none"),
+    ],
+    ids=["nothing", "states without joints", "positions that are all NaN"],
+)
+def test_a_log_without_a_state_that_can_be_used_is_refused(
+    tmp_path: Path, messages: list[Message], words: str
+) -> None:
+    assert words in refusal(write_mcap(tmp_path / "x.mcap", messages))
 
 
 def test_a_joint_topic_that_is_none_lists_those_there(tmp_path: Path) -> None:
@@ -358,10 +350,6 @@ def test_nan_positions_are_damage_and_nan_velocities_are_differences(tmp_path: P
     assert any("velocities of a are missing or NaN in 1 states" in note for note in source.loss.notes)
 
 
-def test_positions_that_are_all_nan_are_no_states(tmp_path: Path) -> None:
-    assert "got none" in refusal(write_mcap(tmp_path / "x.mcap", states_of(np.full((3, 2), np.nan), AB)))
-
-
 def test_stamps_that_go_back_or_repeat_are_sorted_and_counted(tmp_path: Path) -> None:
     stamps = [START_NS + i * STEP_NS for i in range(20)]
     stamps[5], stamps[6] = stamps[6], stamps[5]
@@ -383,20 +371,15 @@ def test_a_pause_of_the_recording_is_counted_with_its_length(tmp_path: Path) -> 
     assert any("the longest 2.010 s" in note for note in source.loss.notes)
 
 
-@pytest.mark.skipif(REAL is None, reason="SPLATCTRL_REAL_DATA is not set")
-def test_real_bags_without_joint_states_say_so() -> None:
-    assert REAL is not None
-    bags = sorted(Path(REAL, "rosbag2_testbags").rglob("talker.*"))
+def test_real_bags_without_joint_states_say_so(real_data: Path) -> None:
+    bags = [path for path in (real_data / "rosbag2_testbags").rglob("talker.*") if path.suffix in {".mcap", ".db3"}]
     assert bags
     for bag in bags:
-        if bag.suffix in {".mcap", ".db3"}:
-            assert "expected joint states, got none" in refusal(bag)
+        assert "expected joint states, got none" in refusal(bag)
 
 
-@pytest.mark.skipif(REAL is None, reason="SPLATCTRL_REAL_DATA is not set")
-def test_a_real_log_gives_its_states_and_tells_a_velocity_that_nobody_filled() -> None:
-    assert REAL is not None
-    log = Path(REAL, "rosbag2_mcap_sensor_msgs", "rosbag2_2025_09_10-13_03_56_0.mcap")
+def test_a_real_log_gives_its_states_and_tells_a_velocity_that_nobody_filled(real_data: Path) -> None:
+    log = real_data / "rosbag2_mcap_sensor_msgs" / "rosbag2_2025_09_10-13_03_56_0.mcap"
     source = opened(log, ("wrist_joint", "gripper_joint"))
     assert source.joint_names == ("wrist_joint", "gripper_joint")
     assert len(states(source)) == 15

@@ -14,18 +14,6 @@ constexpr float kSmallTurn = 0.06f;      // four terms of the exponential of thi
 Float8 exp8(Float8 x) { return exp2_8(min8(max8(x * kLog2e, splat8(-126.0f)), splat8(126.0f))); }
 Float8 distances(Float8 dx, Float8 dy, Float8 dz) { return sqrt8(dx * dx + dy * dy + dz * dz); }
 
-// What counts in a block or sub-block, relative to its middle; offsets less that of the block's nearest sphere.
-struct Terms {
-  TermList single;
-  GroupList grouped;
-
-  void clear(const Clusters& s) {
-    single.reserve(kLanes * s.num_clusters), grouped.reserve(4 * s.num_clusters);
-    single.size = grouped.size = 0;
-  }
-  void pad() { single.pad(), grouped.pad(); }
-};
-
 struct Work {
   Candidates found;
   std::vector<float> scores[2], weights;
@@ -129,10 +117,7 @@ struct Baker {
   }
 
   void add_cluster(int cluster, Point c, float least, double common, Terms& terms) const {
-    if (is_alike(groups.of_16[cluster], c, least)) {
-      add_group(groups.of_16[cluster], c, common, terms);
-      return;
-    }
+    if (is_alike(groups.of_16[cluster], c, least)) return add_group(groups.of_16[cluster], c, common, terms);
     for (int k = 4 * cluster; k < 4 * (cluster + 1); ++k)
       if (is_alike(groups.of_4[k], c, least))
         add_group(groups.of_4[k], c, common, terms);
@@ -312,7 +297,7 @@ struct Baker {
   // Adds the terms at eight cells of height z.
   template <bool kGroups>
   void add_each(int size, const Terms& terms, Float8 shift, const Columns& columns, float z, Sums& sums) const {
-    const auto& list = pick<kGroups>(terms);
+    const auto& list = terms.list<kGroups>();
     const float scale = 1.0f / length;
     for (int i = 0; i < size; ++i) {
       const Float8 dx = columns.x - list.x[i], dy = columns.y - list.y[i], dz = splat8(z - list.z[i]);
@@ -324,14 +309,6 @@ struct Baker {
       add_weight<kGroups>(list, i, weight, sums);
       if (gradient != nullptr) add_slope<kGroups>(list, i, weight, dx, dy, dz, 1.0f / max8(d, splat8(1e-20f)), sums);
     }
-  }
-
-  template <bool kGroups>
-  static const auto& pick(const Terms& terms) {
-    if constexpr (kGroups)
-      return terms.grouped;
-    else
-      return terms.single;
   }
 
   template <bool kGroups, typename List>
@@ -352,7 +329,7 @@ struct Baker {
   // is that of the one below times a ratio, which itself changes by one ratio.
   template <int kCells, bool kGroups, bool kGradient>
   void add_parabolas(int size, const Terms& terms, Point m, const Columns& columns, Float8 shift, Sums* sums) const {
-    const auto& list = pick<kGroups>(terms);
+    const auto& list = terms.list<kGroups>();
     const auto voxel = static_cast<float>(grid.voxel);
     const float scale = 1.0f / length, half = -columns.z;
     const Float8 x = columns.x - m.x, y = columns.y - m.y;

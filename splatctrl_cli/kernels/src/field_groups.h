@@ -56,4 +56,23 @@ struct GroupList {
   void view(Point m, float around, float length);
 };
 
+// What counts in a block or sub-block, relative to its middle; offsets less that of the block's nearest sphere.
+struct Terms {
+  TermList single;
+  GroupList grouped;
+
+  void clear(const Clusters& s) {
+    single.reserve(kLanes * s.num_clusters), grouped.reserve(4 * s.num_clusters);
+    single.size = grouped.size = 0;
+  }
+  void pad() { single.pad(), grouped.pad(); }
+  template <bool kGroups>
+  const auto& list() const {
+    if constexpr (kGroups)
+      return grouped;
+    else
+      return single;
+  }
+};
+
 }  // namespace splatctrl
