@@ -5,7 +5,6 @@ from dataclasses import replace
 
 from splatctrl_cli.checks.check_cameras import calibration_findings, camera_findings, tf_findings
 from splatctrl_cli.checks.check_images import depth_findings, image_findings, sample_findings
-from splatctrl_cli.checks.check_recording import Evidence, judged
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_times import (
     TimesWatch,
@@ -18,6 +17,7 @@ from splatctrl_cli.checks.check_times import (
     time_findings,
 )
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, damage_findings, error, warning
+from splatctrl_cli.checks.judge_evidence import Evidence, judged
 from splatctrl_cli.checks.log_pass import LogWatch, checked_camera, image_motion, ready
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError

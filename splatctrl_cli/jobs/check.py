@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from splatctrl_cli.checks.check_folder import check_folder
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.check_source import check_source
 from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, error, note
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.errors import UsageError
@@ -56,7 +56,7 @@ def check(request: CheckRequest) -> CheckResult:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
     model, log = _robot(request), open_logs(request.paths)
     if log is None:
-        report = check_source(request.paths[0], request.options, model=model, num_images=request.num_images)
+        report = check_folder(request.paths[0], request.options, model=model, num_images=request.num_images)
     else:
         report = check_log(log, request.options, model=model, num_images=request.num_images)
     report = replace(report, findings=[*report.findings, *_agreement(report)])

@@ -17,7 +17,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_logs
-from tests.files.break_log import Change, Message, broken_log, set_stamp, stamp_of
+from tests.logs.break_log import Change, Message, broken_log, set_stamp, stamp_of
 from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log
 
 ROOT = Path(__file__).parents[2]
@@ -265,7 +265,7 @@ def test_a_fault_is_found_by_its_name_place_and_figure(tmp_path: Path, fault: Fa
 
 
 def test_every_code_that_is_made_is_in_the_table_and_every_entry_is_made() -> None:
-    sources = [*(ROOT / "splatctrl_cli/checks").glob("check_*.py"), ROOT / "splatctrl_cli/jobs/check.py"]
+    sources = [*(ROOT / "splatctrl_cli/checks").glob("*.py"), ROOT / "splatctrl_cli/jobs/check.py"]
     text = "\n".join(path.read_text() for path in sources)
     made = set(re.findall(r'(?:error|warning|note|severity|make)\(\s*"([a-z-]+)"', text))
     assert made | {"quick", "tf-gap", "pairing", "pose-missing", "damaged"} == set(CHECKS)

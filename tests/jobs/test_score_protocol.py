@@ -25,7 +25,7 @@ from splatctrl_cli.jobs.score_reference import missing_views
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 from tests.datasets.make_idr import half_size
-from tests.files.make_observed import write_observed
+from tests.evaluate.make_observed_space import write_observed
 
 QUICK = ("-q", "--max-splats", "600", "--set", "scene.first_iterations=8", "--set", "scene.refine_iterations=4")
 HOLDOUT = "holdout:every4"

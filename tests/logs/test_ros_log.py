@@ -11,7 +11,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.source import CameraTopics, SourceOptions, open_source
 from tests.containers.test_log_formats import as_ros1_bag, assert_same
-from tests.files.break_log import broken_log
+from tests.logs.break_log import broken_log
 from tests.logs.make_log import (
     FRAME_NS,
     HEIGHT,

@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.protocols import cloud_of_scan, read_observed
-from tests.files.make_observed import RESOLUTION, write_observed
+from tests.evaluate.make_observed_space import RESOLUTION, write_observed
 
 LOW, HIGH = np.array([-30.0, -20.0, 500.0]), np.array([30.0, 20.0, 560.0])
 

@@ -12,11 +12,11 @@ from splatctrl_cli.checks.check_images import (
     sample_findings,
     strided_lens,
 )
-from splatctrl_cli.checks.check_recording import Evidence, judged
 from splatctrl_cli.checks.check_states import robot_states
 from splatctrl_cli.checks.check_times import TimesWatch, time_findings
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, error, needs, note, warning
+from splatctrl_cli.checks.judge_evidence import Evidence, judged
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateCollector
@@ -96,7 +96,7 @@ class _SourceWatch:
                 return
 
 
-def check_source(
+def check_folder(
     path: Path, options: SourceOptions, *, model: RobotModel | None = None, num_images: int | None = None
 ) -> CheckReport:
     """Read the frames of `path` once; with `num_images` up to as many of a camera."""
