@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.control.arm import ArmModel, sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
-from splatctrl_cli.kernels.edges import EdgeRoom
+from splatctrl_cli.kernels.joint_edges import EdgeRoom
 from splatctrl_cli.planner.solid_scene import Solids
 from splatctrl_cli.records import Bool, DistanceField, Float64
 

@@ -73,7 +73,7 @@ class Solids:
         object.__setattr__(self, "_rods", (*_into([s.T_world_shape for s in rods]), shape.reshape(-1, 3).T))
 
     def rows(self) -> tuple[Float64, Float64, Float64]:
-        """Balls (., 4), boxes (., 15) and rods (., 15), as `kernels.edges.EdgeRoom` takes them."""
+        """Balls (., 4), boxes (., 15) and rods (., 15), as `kernels.joint_edges.EdgeRoom` takes them."""
         centers, radii = self._balls
         return np.column_stack([centers, radii]), _placed_rows(*self._boxes), _placed_rows(*self._rods)
 

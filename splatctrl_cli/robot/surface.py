@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, transform_points
-from splatctrl_cli.kernels.surface import BALL, BOX, CAPSULE, CYLINDER, SurfaceImage, SurfaceScene, render_surface
+from splatctrl_cli.kernels.surface_image import (
+    BALL,
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    SurfaceImage,
+    SurfaceScene,
+    render_surface,
+)
 from splatctrl_cli.mesh_distance import TriangleMesh, load_mesh
 from splatctrl_cli.records import Box, Float32, Float64, Intrinsics, SphereSet
 from splatctrl_cli.robot.link_meshes import mesh_path, mesh_pieces
@@ -23,7 +31,7 @@ KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": BALL, "capsule": CAPSULE}
 class RobotSurface:
     """Solids (P) and triangles (F), each fixed to one of `links` (L) [m].
 
-    kinds (P,) as `kernels.surface` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
+    kinds (P,) as `kernels.surface_image` numbers them, sizes (P, 3) (half edges; radius and half length; radius),
     T_link_solid (P, 4, 4), solid_links (P,); triangles (F, 3, 3) in the frame of triangle_links (F,).
     by_spheres: links that collision spheres stand for, because their geometry is missing or cannot be read. fixed:
     links that no joint moves. num_carried: the last of `links` again, one for each box around what they carry.
@@ -147,7 +155,7 @@ class RobotSurface:
         quadratic: float = 0.0,
     ) -> SurfaceImage:
         """What a camera sees of the robot alone with its links at T_world_link (L, 4, 4), and which points of
-        `measured` (H, W) float32 [m] lie inside it; see `kernels.surface.render_surface`.
+        `measured` (H, W) float32 [m] lie inside it; see `kernels.surface_image.render_surface`.
         """
         k = intrinsics
         T_camera_link = invert_transform(T_world_camera) @ T_world_link

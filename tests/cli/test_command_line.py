@@ -25,7 +25,7 @@ from tests.cli import here
 from tests.logs.make_log import LogRecipe, make_log
 
 WRITERS = [command for command in COMMANDS if command not in {"info", "check", "batch"}]  # a batch goes on
-HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "trimesh", "mcap", "rosbags", "clarabel")
+HEAVY = ("torch", "pinocchio", "cv2", "open3d", "numpy", "scipy", "matplotlib", "trimesh", "mcap", "clarabel")
 QUICK = (
     *("--max-splats", "60", "--threads", "1", "--set", "scene.first_iterations=2"),
     *("--set", "scene.iterations_per_step=1", "--box=-3,-3,-1,3,3,3", "--set", "occupancy.voxel=0.1"),

@@ -1,4 +1,4 @@
-#include "surface.h"
+#include "surface_image.h"
 
 #include <algorithm>
 #include <cmath>

@@ -1,4 +1,4 @@
-#include "edges.h"
+#include "joint_edges.h"
 
 #include <algorithm>
 #include <vector>

@@ -3,7 +3,7 @@
 #include <vector>
 
 #include "bind.h"
-#include "surface.h"
+#include "surface_image.h"
 
 namespace splatctrl {
 namespace {

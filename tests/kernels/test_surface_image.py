@@ -5,7 +5,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.geometry import invert_transform
-from splatctrl_cli.kernels.surface import BALL, BOX, CAPSULE, CYLINDER, SurfaceImage, SurfaceScene, render_surface
+from splatctrl_cli.kernels.surface_image import (
+    BALL,
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    SurfaceImage,
+    SurfaceScene,
+    render_surface,
+)
 from splatctrl_cli.records import Float64
 from tests.reference.surface import is_inside_spans, span
 

@@ -2,7 +2,7 @@
 #include <vector>
 
 #include "bind_chain.h"
-#include "edges.h"
+#include "joint_edges.h"
 
 namespace splatctrl {
 namespace {
