@@ -30,7 +30,8 @@ from splatctrl_cli.logs.decoder import MessageDecoder, UndecodableMessageError
 from splatctrl_cli.logs.joint_topics import AGAIN
 from splatctrl_cli.logs.mcap_writer import McapLog, mcap_log
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import MILLIMETRES, JointState, RgbdFrame
+from splatctrl_cli.logs.stored_frame import StoredFrame
+from splatctrl_cli.records import MILLIMETRES, JointState, RgbdFrame, by_stamp
 
 MOST_FILES = 1 << 20  # an empty file takes a disk's block, its name in an archive thirty bytes
 _LONGEST = 255  # bytes of a name
@@ -88,21 +89,18 @@ def pack_capture(capture: Path, out: Path, progress: Callable[[int], None] | Non
     source = CaptureSource(capture, SourceOptions())
     with mcap_log(out) as log:
         log.describe(MARK, {"version": str(VERSION), "name": capture.name})
-        states = iter(source.states)
-        state = next(states, None)
-        for number in range(len(source)):
-            row, stored = source.row(number), source.stored_at(number)
-            if stored is None:
-                raise InputError(f"{capture}: {source.loss.notes[-1]}", remedy=AGAIN)
-            while state is not None and state.stamp_ns <= stored.frame.stamp_ns:
-                state = _add_state(log, state, source, states)
-            _add_frame(
-                log, stored.frame, stored.depth_unit, {n: capture / row[n] for n in _IMAGES if row.get(n)}, source
-            )
+        records: Iterator[JointState | StoredFrame] = by_stamp(source.states, _stored_frames(source, capture))
+        num_frames = 0
+        for record in records:
+            if isinstance(record, JointState):
+                log.add_joint_state(record, source.joint_names)
+                continue
+            row = source.row(num_frames)
+            files = {name: capture / row[name] for name in _IMAGES if row.get(name)}
+            _add_frame(log, record.frame, record.depth_unit, files, source)
+            num_frames += 1
             if progress is not None:
-                progress(number + 1)
-        while state is not None:
-            state = _add_state(log, state, source, states)
+                progress(num_frames)
         images = {row[name] for row in map(source.row, range(len(source))) for name in _IMAGES if row.get(name)}
         for name in sorted(p.relative_to(capture).as_posix() for p in capture.rglob("*") if p.is_file()):
             if name not in images:
@@ -142,12 +140,13 @@ def unpack_capture(packed: Path, folder: Path) -> int:
     return num_frames
 
 
-def _add_state(
-    log: McapLog, state: JointState, source: CaptureSource, states: Iterator[JointState]
-) -> JointState | None:
-    """Write a state; returns the next."""
-    log.add_joint_state(state, source.joint_names)
-    return next(states, None)
+def _stored_frames(source: CaptureSource, capture: Path) -> Iterator[StoredFrame]:
+    """All of them, by their rows."""
+    for number in range(len(source)):
+        stored = source.stored_at(number)
+        if stored is None:
+            raise InputError(f"{capture}: {source.loss.notes[-1]}", remedy=AGAIN)
+        yield stored
 
 
 def _add_frame(
