@@ -23,7 +23,7 @@ from splatctrl_cli.jobs.replays.metrics import is_blank
 
 
 def known_space(judged: Judged) -> Iterator[Reason]:
-    """Cameras saw at least 55 % of the space around the moving arm; where they saw less than two thirds, at most 9 %
+    """Cameras saw at least 53 % of the space around the moving arm; where they saw less than two thirds, at most 9 %
     of the moving spheres come to space of which less than a tenth was seen; at most `--max-unknown` of the sphere
     centres are in space never seen; within the margin there is no place where cameras looked and got no depth. A
     baked field needs its channel `observed`.
