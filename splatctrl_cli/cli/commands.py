@@ -14,6 +14,7 @@ from splatctrl_cli.cli.options import (
     SEVERAL_LOGS,
     add_common,
     add_gates,
+    add_junit,
     add_lock,
     add_output,
     add_packages,
@@ -36,7 +37,7 @@ LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yam
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """A subcommand, or an action of one: `run` names MODULE:FUNCTION of this room, `options` adds its options; with
-    `actions` it has no more than these.
+    `actions` it has no more than these. judges: it ends in a verdict, of which it can tell CI.
     """
 
     summary: str
@@ -44,6 +45,7 @@ class Command:
     run: str = ""
     options: Callable[[Options, Parser], None] | None = None
     actions: "dict[str, Command] | None" = None
+    judges: bool = False
 
 
 def build_parser(command: str | None = None) -> Parser:
@@ -70,7 +72,17 @@ def _add_commands(parser: Parser, commands: dict[str, Command], *, dest: str, on
         if command.options is not None:
             command.options(Options(one), one)
             add_common(one)
+            if command.judges:
+                add_junit(one)
             one.set_defaults(run=command.run)
+
+
+def judges(words: Sequence[str]) -> bool:
+    """Whether the command that `words` begin with is there, and ends in a verdict."""
+    command = COMMANDS.get(words[0]) if words else None
+    if command is not None and command.actions is not None:
+        command = command.actions.get(words[1]) if len(words) > 1 else None
+    return command is not None and command.judges
 
 
 def function_of(run: str) -> Callable[..., int]:
@@ -246,6 +258,7 @@ COMMANDS = {
         summary="say what is wrong with a log, capture or image folder",
         examples=(f"check {LOG} {ROBOT}", "check run.bag --quick --fail-on warning"),
         run="check:run",
+        judges=True,
         options=_check,
     ),
     "reconstruct": Command(
@@ -255,6 +268,7 @@ COMMANDS = {
             "reconstruct --dtu sample_data/dtu --protocol holdout:2,5 -o out/scan",
         ),
         run="reconstruct:run",
+        judges=True,
         options=reconstruct_options,
     ),
     "export": Command(
@@ -270,6 +284,7 @@ COMMANDS = {
             "sdf-bake out/scene --box=-1,-1,0,1,1,1 --voxel 0.02 --formats npz,nrrd -o out/grid",
         ),
         run="sdf_bake:run",
+        judges=True,
         options=sdf_bake_options,
     ),
     "score": Command(
@@ -279,6 +294,7 @@ COMMANDS = {
             "score out/scan --dtu sample_data/dtu --protocol holdout:2,5 --require 'psnr_all>=20'",
         ),
         run="score:run",
+        judges=True,
         options=score_options,
     ),
     "replay": Command(
@@ -288,6 +304,7 @@ COMMANDS = {
             f"replay out/x.capture --scene out/scene {ROBOT} --mode closed-loop --start-time 1.6",
         ),
         run="replay:run",
+        judges=True,
         options=replay_options,
     ),
     "batch": Command(
@@ -303,11 +320,13 @@ COMMANDS = {
             "spheres": Command(
                 summary="fit spheres that cover all of each link's collision geometry",
                 run="robot:run_spheres",
+                judges=True,
                 options=_robot_spheres,
             ),
             "check": Command(
                 summary="measure how much of the collision surface a set of spheres covers",
                 run="robot:run_check",
+                judges=True,
                 options=_robot_check,
             ),
             "pairs": Command(
@@ -326,6 +345,7 @@ COMMANDS = {
         summary="run the main job on a sample recording, with pictures",
         examples=("demo", "demo --data out/log -o out/demo"),
         run="demo:run",
+        judges=True,
         options=_demo,
     ),
     "capture": Command(

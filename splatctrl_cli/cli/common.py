@@ -7,17 +7,21 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from splatctrl_cli.cli.reports import reports_of
 from splatctrl_cli.evaluate.verdict import Verdict
 
 _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
 
 class Console:
-    """Results to stdout, as a table or one JSON object; log lines to stderr unless --quiet."""
+    """Results to stdout, as a table or one JSON object; log lines to stderr unless --quiet; verdicts to CI, too, but
+    not those of a step of the command (is_step).
+    """
 
-    def __init__(self, args: argparse.Namespace) -> None:
+    def __init__(self, args: argparse.Namespace, *, is_step: bool = False) -> None:
         self.is_json = bool(args.json)
         self.is_quiet = bool(args.quiet)
+        self.reports = reports_of(args) if hasattr(args, "junit") and not is_step else None
 
     def log(self, line: str) -> None:
         """One progress line on stderr."""
@@ -58,6 +62,8 @@ class Console:
         if code:
             gates = [str(reason) for reason in verdict.decisive[1:] if reason.criterion.startswith("--require")]
             print("\n".join(f"splatctrl: {line}" for line in (verdict.sentence, *gates)), file=sys.stderr, flush=True)
+        if self.reports is not None:
+            self.reports.conclude(verdict.as_dict(), code)
         return code
 
 

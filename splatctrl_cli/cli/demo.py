@@ -25,12 +25,13 @@ from splatctrl_cli.jobs.score import ScoreResult
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     console, request = Console(args), request_of(DemoRequest, args)
+    step_console = Console(args, is_step=True)
 
     def told(result: StepResult, folder: Path) -> None:
         """Print what the command of this step would, with the folder's name of later."""
         text = io.StringIO()
         with contextlib.redirect_stdout(text):
-            _show(console, result)
+            _show(step_console, result)
         print(text.getvalue().replace(str(folder), str(request.out)), end="", flush=True)
 
     is_silent = console.is_quiet or console.is_json

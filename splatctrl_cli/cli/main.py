@@ -6,14 +6,17 @@ import io
 import os
 import stat
 import sys
+import time
 import traceback
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from splatctrl_cli.cli.commands import build_parser, function_of
+from splatctrl_cli.cli.commands import build_parser, function_of, judges
+from splatctrl_cli.cli.reports import tell_of_failure
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
+from splatctrl_cli.report.junit import check_replaceable
 
 MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 
@@ -35,38 +38,54 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    verbose = 0
     refuse_endless_files()
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when cv2 is first imported
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of numpy; more wait for each other, and round otherwise
+    words, args, start = sys.argv[1:] if argv is None else list(argv), None, time.perf_counter()
     try:
-        words = sys.argv[1:] if argv is None else list(argv)
         args = build_parser(words[0] if words else "").parse_args(words)
-        verbose = args.verbose
-        _check_output(args)
+        args.began = start
+        _check_outputs(args)
         code = function_of(args.run)(args)
         sys.stdout.flush()
         return code
-    except SplatCtrlError as error:
-        return _fail(error, str(error), error.exit_code, verbose)
-    except KeyboardInterrupt as error:
-        return _fail(error, str(error) or "interrupted", 130, verbose)
     except BrokenPipeError:
         sys.stderr.close()
         return 0
-    except OSError as error:
-        return _fail_to_read_or_write(error, verbose)
-    except MemoryError as error:
-        line = "input: asks for more memory than there is; is it damaged, or too large for this machine"
-        return _fail(error, line, 4, verbose)
-    except UnicodeEncodeError as error:  # names of files are bytes to Linux
-        name = error.object[max(error.start - 40, 0) : error.end + 40]
-        line = f"input: the name in {name!a} is not UTF-8 text; give the file another name"
-        return _fail(error, line, 4, verbose)
-    except RecursionError as error:
-        return _fail(error, "input: nested too deeply to be read; is it damaged", 4, verbose)
-    except Exception as error:
-        return _fail(error, f"internal error: {type(error).__name__}: {error}; please report it", 70, verbose)
+    except (Exception, KeyboardInterrupt) as error:
+        if args is not None and args.verbose:
+            traceback.print_exception(error)
+        line, code = _line_and_code(error)
+        print(f"splatctrl: {line}", file=sys.stderr)
+        if judges(words):
+            tell_of_failure(words, args, line, code, start)
+        return code
+
+
+def _line_and_code(error: BaseException) -> tuple[str, int]:
+    """What a person is told of an error, in one line, and the exit code."""
+    match error:
+        case SplatCtrlError():
+            line, code = str(error), error.exit_code
+        case KeyboardInterrupt():
+            line, code = str(error) or "interrupted", 130
+        case OSError():
+            is_write = is_write_failure(error)
+            does = "writing failed" if is_write else "cannot be read"
+            remedy = "make room" if is_write else "check the path and its permissions"
+            name = error.filename or ("output" if is_write else "input")
+            line, code = f"{name}: {does}: {error.strerror or error}; {remedy}", 6 if is_write else 4
+        case MemoryError():
+            line = "input: asks for more memory than there is; is it damaged, or too large for this machine"
+            code = 4
+        case UnicodeEncodeError():  # names of files are bytes to Linux
+            name = error.object[max(error.start - 40, 0) : error.end + 40]
+            line, code = f"input: the name in {name!a} is not UTF-8 text; give the file another name", 4
+        case RecursionError():
+            line, code = "input: nested too deeply to be read; is it damaged", 4
+        case _:
+            line, code = f"internal error: {type(error).__name__}: {error}; please report it", 70
+    return " ".join(line.split()), code
 
 
 class _Lost(io.TextIOBase):
@@ -96,35 +115,39 @@ def _stand_in_for_closed_streams() -> _Lost:
     return lost
 
 
-def _fail_to_read_or_write(error: OSError, verbose: int) -> int:
-    reason = error.strerror or error
-    if is_write_failure(error):
-        return _fail(error, f"{error.filename or 'output'}: writing failed: {reason}; make room", 6, verbose)
-    line = f"{error.filename or 'input'}: cannot be read: {reason}; check the path and its permissions"
-    return _fail(error, line, 4, verbose)
+def _check_outputs(args: argparse.Namespace) -> None:
+    """Refuse an output or a report that cannot be written; a report that is refused is not written at all."""
+    out, report = getattr(args, "out", None), getattr(args, "junit", None)
+    values = [value for name, value in vars(args).items() if name not in ("out", "junit")]
+    given = [each for value in values for each in (value if isinstance(value, list) else [value])]
+    inputs = [each for each in given if isinstance(each, Path)]
+    try:
+        if report is not None:
+            _check_output(report, inputs, "--junit")
+            check_replaceable(report)
+            if out is not None and _places(out) & {*_places(report), *report.absolute().parents}:
+                raise UsageError(f"--junit {report}: is in --out, which appears whole", remedy="put it beside that")
+    except UsageError:
+        args.junit = None
+        raise
+    if out is not None:
+        _check_output(out, inputs, "--out")
 
 
-def _check_output(args: argparse.Namespace) -> None:
+def _check_output(out: Path, inputs: Sequence[Path], option: str) -> None:
     """Refuse an output that cannot be written, or that is or holds an input, itself or its partial."""
-    out = getattr(args, "out", None)
-    if out is None:
-        return
     check_can_be_written(out)
-    target = Path(os.path.realpath(out))  # resolve() raises RuntimeError for a link to itself
-    targets = {target, target.with_name(target.name + PARTIAL)} if target.name else {target}
-    values = [value for name, value in vars(args).items() if name != "out"]
-    for given in [each for value in values for each in (value if isinstance(value, list) else [value])]:
-        if isinstance(given, Path):
-            source = Path(os.path.realpath(given))
-            if targets & {source, *source.parents}:
-                raise UsageError(f"{out}: would replace the input {given}", remedy="give another --out")
+    targets = _places(out)
+    for given in inputs:
+        source = Path(os.path.realpath(given))
+        if targets & {source, *source.parents}:
+            raise UsageError(f"{out}: would replace the input {given}", remedy=f"give another {option}")
 
 
-def _fail(error: BaseException, line: str, code: int, verbose: int) -> int:
-    if verbose:
-        traceback.print_exception(error)
-    print(f"splatctrl: {' '.join(line.split())}", file=sys.stderr)
-    return code
+def _places(output: Path) -> set[Path]:
+    """Where an output is written: itself, and its partial."""
+    target = Path(os.path.realpath(output))  # resolve() raises RuntimeError for a link to itself
+    return {target, target.with_name(target.name + PARTIAL)} if target.name else {target}
 
 
 @cache

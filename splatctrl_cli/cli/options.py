@@ -36,6 +36,12 @@ def add_common(parser: Parser) -> None:
     add("-q/--quiet", "no progress, no log lines")
 
 
+def add_junit(parser: Parser) -> None:
+    """``--junit``, which every command that judges has."""
+    meaning = "write the verdict as JUnit XML, a case for each criterion and gate (docs/ci.md)"
+    Options(parser.run_group)("--junit FILE", meaning, Path)
+
+
 def add_config(add: Options, parser: Parser) -> None:
     """``--config``, ``--set``, and among the options of a run ``--seed``, ``--threads``."""
     add("--config FILE.toml", "configuration, see docs/config.md", Path)

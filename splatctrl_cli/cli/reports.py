@@ -1,0 +1,99 @@
+"""Where a command that judges tells CI what it found: ``--junit FILE``, and on GitHub annotations and a summary."""
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli import __version__
+from splatctrl_cli.errors import SplatCtrlError
+from splatctrl_cli.report.github import tell_github
+from splatctrl_cli.report.junit import write_junit
+from splatctrl_cli.report.suites import Case, Suite, cases_of, error_case, notes_of
+
+RECORDINGS = ("log", "source", "reference", "dtu", "scene", "data", "run", "urdf")  # what is judged: logs before maps
+JUNIT = "--junit"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reports:
+    """One command's report: `path` of the recording, the file of --junit, and by time.perf_counter when it began."""
+
+    command: str
+    path: str
+    junit: Path | None
+    start: float
+
+    def conclude(self, verdict: Mapping[str, Any], code: int) -> None:
+        """Tell of a verdict. Raises UsageError and WriteError where the file cannot be written."""
+        self._write(cases_of(verdict, self._group), notes_of(verdict), code, {"label": verdict["label"]})
+
+    def fail(self, line: str, code: int) -> None:
+        """Tell of a command that came to no verdict; `line` is what it said."""
+        self._write([error_case(self._group, line, exit_code=code)], (), code, {})
+
+    @property
+    def _group(self) -> str:
+        return f"{self.path}/{self.command}" if self.path else self.command
+
+    def _write(self, cases: Sequence[Case], notes: Sequence[str], code: int, more: Mapping[str, str]) -> None:
+        seconds = time.perf_counter() - self.start
+        suite = Suite(
+            name=self.path or self.command,
+            path=self.path,
+            cases=cases,
+            notes=notes,
+            properties={"splatctrl": __version__, "command": self.command, "exit code": str(code), **more},
+            started=(datetime.now(UTC) - timedelta(seconds=seconds)).isoformat(timespec="seconds"),
+            seconds=seconds,
+        )
+        publish([suite], junit=self.junit, is_fatal=code != 0)
+
+
+def publish(suites: Sequence[Suite], *, junit: Path | None, is_fatal: bool) -> None:
+    """Write --junit, and on GitHub the annotations and the summary. A summary that cannot be written is said."""
+    if junit is not None:
+        write_junit(junit, suites)
+    try:
+        tell_github(suites, sys.stderr, is_fatal=is_fatal)
+    except OSError as error:
+        print(f"splatctrl: GITHUB_STEP_SUMMARY: cannot be written: {error.strerror}", file=sys.stderr)
+
+
+def reports_of(args: argparse.Namespace) -> Reports:
+    """The report of a command that was parsed."""
+    action = getattr(args, "action", None)
+    command = f"{args.command} {action}" if action else args.command
+    given = next((value for name in RECORDINGS if (value := getattr(args, name, None))), "")
+    path = " ".join(map(str, given if isinstance(given, list) else [given]))
+    return Reports(command=command, path=path, junit=args.junit, start=args.began)
+
+
+def tell_of_failure(
+    words: Sequence[str], args: argparse.Namespace | None, line: str, code: int, start: float
+) -> None:
+    """Write the report of a command that came to no verdict; where that cannot be done, too, say why on stderr.
+
+    args: None where the words could not be parsed; start: when the command began, by time.perf_counter.
+    """
+    unparsed = Reports(command=words[0], path="", junit=_junit_in(words), start=start)
+    try:
+        (unparsed if args is None else reports_of(args)).fail(line, code)
+    except (SplatCtrlError, OSError) as error:
+        if str(error) != line:
+            print(f"splatctrl: {' '.join(str(error).split())}", file=sys.stderr)
+
+
+def _junit_in(words: Sequence[str]) -> Path | None:
+    """The file of --junit, among words that argparse refused."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word == "--":
+            break
+        name, equals, value = word.partition("=")
+        if name == JUNIT and (value if equals else following):
+            return Path(value if equals else following)
+    return None

@@ -1,0 +1,151 @@
+"""What commands that judge tell CI: --junit, and on GitHub annotations and a summary."""
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+from junitparser import Error, Failure, JUnitXml, TestSuite
+
+from splatctrl_cli.cli import check
+from splatctrl_cli.cli.commands import COMMANDS
+from tests.cli.here import splatctrl
+from tests.logs.make_log import LogRecipe, make_log
+
+CLI = Path(check.__file__).parent
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_log(tmp_path_factory.mktemp("log") / "log.mcap", LogRecipe(num_frames=12, tf_frames=6))
+
+
+@pytest.fixture(autouse=True)
+def outside_of_github(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY", "GITHUB_WORKSPACE"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def suite_in(path: Path) -> TestSuite:
+    (suite,) = JUnitXml.fromfile(str(path))
+    return suite
+
+
+def test_every_command_that_concludes_takes_junit() -> None:
+    """By the functions that call Console.concluded, themselves or through one of the same file."""
+    concluding = set()
+    for path in CLI.glob("*.py"):
+        functions = {
+            node.name: node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)
+        }
+        found = {name for name, node in functions.items() if ".concluded(" in ast.unparse(node)}
+        found |= {
+            name for name, node in functions.items() if any(f"{other}(" in ast.unparse(node) for other in found)
+        }
+        concluding |= {f"{path.stem}:{name}" for name in found}
+    leaves = [leaf for command in COMMANDS.values() for leaf in (command.actions or {"": command}).values()]
+    assert {leaf.run for leaf in leaves if leaf.judges} == {leaf.run for leaf in leaves} & concluding
+    assert sum(leaf.judges for leaf in leaves) >= 8
+
+
+def test_a_verdict_is_a_suite_of_its_recording(log: Path, tmp_path: Path) -> None:
+    told = splatctrl("check", log, "--fail-on", "warning", "--junit", tmp_path / "j.xml", "--json")
+    suite = suite_in(tmp_path / "j.xml")
+    criteria = {reason["criterion"]: reason["outcome"] for reason in json.loads(told.stdout)["verdict"]["reasons"]}
+    assert (told.returncode, suite.name) == (1, str(log))
+    assert {case.name for case in suite} == set(criteria)
+    failures = {case.name for case in suite if any(isinstance(result, Failure) for result in case.result)}
+    assert failures == {name for name, outcome in criteria.items() if outcome == "failed"} != set()
+    assert {case.classname for case in suite} == {f"{log}/check"}
+    assert {p.name: p.value for p in suite.properties()} == {
+        "splatctrl": "0.1.0",
+        "command": "check",
+        "exit code": "1",
+        "label": "failed",
+    }
+    assert suite.time > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "name", "said"),
+    [
+        (["check", "{log}", "--quik"], 2, "wrong usage", "did you mean --quick?"),
+        (["check", "{log}.missing"], 4, "input unusable", "no such file or folder"),
+        (["robot", "check", "--urdf", "{log}"], 4, "input unusable", "log.mcap"),
+    ],
+)
+def test_a_command_that_cannot_run_is_one_error(
+    log: Path, tmp_path: Path, words: list[str], code: int, name: str, said: str
+) -> None:
+    told = splatctrl(*[word.format(log=log) for word in words], f"--junit={tmp_path / 'j.xml'}")
+    (case,) = suite_in(tmp_path / "j.xml")
+    (error,) = case.result
+    assert (told.returncode, case.name, type(error)) == (code, name, Error)
+    assert said in error.message
+    assert f"splatctrl: {error.message}\n" == told.stderr
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "name"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("x"), 70, "internal error"),
+        (OSError(28, "No space left on device", "out/a"), 6, "writing failed"),
+    ],
+)
+def test_a_command_that_is_stopped_is_one_error(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raised: BaseException, code: int, name: str
+) -> None:
+    def stopped(request: object) -> None:
+        raise raised
+
+    monkeypatch.setattr(check, "check", stopped)
+    told = splatctrl("check", log, "--junit", tmp_path / "j.xml")
+    (case,) = suite_in(tmp_path / "j.xml")
+    assert (told.returncode, case.name, case.classname) == (code, name, f"{log}/check")
+    assert isinstance(case.result[0], Error)
+
+
+def test_a_report_replaces_a_report_and_nothing_else(log: Path, tmp_path: Path) -> None:
+    for _ in range(2):
+        assert splatctrl("check", log, "--junit", tmp_path / "j.xml").returncode == 0
+    before = log.read_bytes()
+    told = splatctrl("check", log, "--junit", log)
+    assert (told.returncode, log.read_bytes()) == (2, before)
+    assert told.stderr == f"splatctrl: {log}: would replace the input {log}; give another --junit\n"
+    (tmp_path / "notes.txt").write_text("mine")
+    told = splatctrl("check", log, "--junit", tmp_path / "notes.txt")
+    assert (told.returncode, (tmp_path / "notes.txt").read_text()) == (2, "mine")
+    assert told.stderr.count("no JUnit report of splatctrl") == 1
+
+
+def test_a_report_inside_the_output_is_refused(log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    told = splatctrl("reconstruct", log, "-o", out, "--junit", out / "j.xml")
+    assert (told.returncode, out.exists()) == (2, False)
+    assert "j.xml: is in --out, which appears whole; put it beside that" in told.stderr
+
+
+def test_on_github_a_command_annotates_and_sums_up_and_its_json_is_whole(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
+    monkeypatch.setenv("GITHUB_WORKSPACE", str(log.parent))
+    told = splatctrl("check", log, "--fail-on", "warning", "--json")
+    assert json.loads(told.stdout)["exit_code"] == told.returncode == 1
+    assert "\n::error file=log.mcap,title=" in told.stderr
+    assert "criteria passed, " in (tmp_path / "summary.md").read_text()
+    told = splatctrl("check", log, "--quik")
+    assert told.stderr.splitlines()[1].startswith("::error title=check%3A wrong usage (error)::check: unrecognized")
+    assert "did you mean --quick?" in (tmp_path / "summary.md").read_text()
+    assert splatctrl("info", log, "--quik").stderr.count("\n") == 1, "it judges nothing"
+
+
+def test_a_summary_that_cannot_be_written_is_said_and_changes_nothing(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path))
+    told = splatctrl("check", log)
+    assert (told.returncode, "GITHUB_STEP_SUMMARY: cannot be written" in told.stderr) == (0, True)
