@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_GOOD_OVERLAP, CLOUD_NO_OVERLAP
 from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.mesh_distance import TriangleMesh
 from splatctrl_cli.records import Bool, Float64
 
@@ -17,6 +18,9 @@ MAX_POINTS = 2_000_000  # on a mesh
 MAX_SPACED = 6_000_000
 NO_PAIRS = np.empty((0, 2), np.int64)
 OTHER_UNITS = (1e3, 1e-3, 1e2, 1e-2, 10.0, 0.1)  # m, cm, dm and mm, taken for each other
+
+
+SURFACE_ERROR = Scale(unit="m", better=Better.LOWER, absolute=2e-4, relative=0.02)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,9 +115,11 @@ def _overlap(points: Float64, others: Float64, margin: float) -> float:
     return shared / (sum(each) - shared)
 
 
-def cloud_names() -> tuple[str, ...]:
-    """The names of `CloudScore.figures`, known before anything is scored."""
-    return tuple(CloudScore.__dataclass_fields__)
+CLOUD_SCALES = {  # by the names of `CloudScore.figures`
+    **dict.fromkeys(("accuracy", "completeness", "completeness_seen", "chamfer"), SURFACE_ERROR),
+    **dict.fromkeys(("accuracy_beyond", "completeness_beyond", "completeness_seen_beyond"), BAD_SHARE),
+    **dict.fromkeys(("num_points", "num_reference"), DESCRIBES),
+}
 
 
 def spaced(points: Float64, spacing: float, *, seed: int = 0) -> Float64:

@@ -1,13 +1,14 @@
 """How far a distance field is from the true distance, by band of true distance."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config.fixed import BANDS, MAP_ALLOWANCE
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS, LENGTH, Scale
 from splatctrl_cli.records import Bool, DistanceGrid, Float64
 
 
@@ -45,6 +46,25 @@ class OverEstimate:
         return self.count > 0 and self.count_beyond == 0
 
 
+MEDIAN = LENGTH  # errors have a sign: a mean or a median may move either way
+BAND_SCALES = {
+    "count": DESCRIBES,
+    "mean": MEDIAN,
+    "rmse": ERROR,
+    "median": MEDIAN,
+    "over_95": ERROR,
+    "over_max": ERROR,
+}
+OVER_SCALES = {
+    "allowance": LENGTH,
+    "count": DESCRIBES,
+    "count_beyond": FAULTS,
+    "share_beyond": BAD_SHARE,
+    "median_beyond": ERROR,
+    "max_error": ERROR,
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class FieldAccuracy:
     """Accuracy of several fields at the same points: bands by field name, over all points and over the seen ones.
@@ -75,11 +95,14 @@ class FieldAccuracy:
 
 def metric_names(field_names: Sequence[str]) -> tuple[str, ...]:
     """Flat names of the numbers in a FieldAccuracy: ``seen.hard.0_2cm.rmse``, ``over_estimate.count``."""
-    figures = [f.name for f in fields(BandAccuracy) if f.name not in {"lower", "upper"}]
-    bands = [band_name(lower, upper) for lower, upper in BANDS]
+    return tuple(metric_scales(field_names, [band_name(lower, upper) for lower, upper in BANDS]))
+
+
+def metric_scales(field_names: Sequence[str], bands: Sequence[str]) -> dict[str, Scale]:
+    """How two runs are compared by each of `metric_names`, for bands by name."""
     places = [f"{where}.{name}.{band}" for where in ("everywhere", "seen") for name in field_names for band in bands]
-    over = [f"over_estimate.{f.name}" for f in fields(OverEstimate)]
-    return (*(f"{place}.{figure}" for place in places for figure in figures), *over)
+    over = {f"over_estimate.{name}": scale for name, scale in OVER_SCALES.items()}
+    return {f"{place}.{figure}": scale for place in places for figure, scale in BAND_SCALES.items()} | over
 
 
 def band_name(lower: float, upper: float) -> str:

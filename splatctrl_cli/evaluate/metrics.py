@@ -1,7 +1,10 @@
-"""Metrics as they are declared: the value, what it rests on, and of a figure of states how it folds over them."""
+"""Metrics as they are declared: the value, what it rests on, of a figure of states how it folds over them, and how
+two runs are compared by it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -13,18 +16,84 @@ R = TypeVar("R")  # the result that has the metric
 Column = Callable[[R], Float64]
 
 
+class Better(StrEnum):
+    """Which way a figure gets better."""
+
+    HIGHER = "higher"
+    LOWER = "lower"
+    NEITHER = "neither"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """How two values of a figure are compared: a change for the worse counts where it is larger than `absolute`, in
+    `unit`, and `relative` times the value before, together.
+    """
+
+    unit: str = ""
+    better: Better = Better.NEITHER
+    absolute: float = 0.0
+    relative: float = 0.0
+
+    def tolerance(self, before: float) -> float:
+        """In `unit`, beside a value from before."""
+        return self.absolute + self.relative * abs(before)
+
+    def harm(self, before: float, after: float) -> float:
+        """By how much `after` is worse, negative where it is better; 0 where no direction is declared."""
+        sign = {Better.HIGHER: -1.0, Better.LOWER: 1.0, Better.NEITHER: 0.0}[self.better]
+        return sign * (after - before)
+
+
+DESCRIBES = Scale()
+"""A figure that is neither good nor bad."""
+GAP = Scale(unit="m", better=Better.HIGHER, absolute=1e-3)  # as far as a map that is being fitted moves in a frame
+ERROR = Scale(unit="m", better=Better.LOWER, absolute=1e-3, relative=0.02)
+FAULTS = Scale(better=Better.LOWER, relative=0.05)  # of 0 none may come, of 100 some may cross the line
+BAD_SHARE = Scale(better=Better.LOWER, absolute=0.005, relative=0.02)
+GOOD_SHARE = Scale(better=Better.HIGHER, absolute=0.005)
+DECIBELS = Scale(unit="dB", better=Better.HIGHER, absolute=0.1)
+SIMILARITY = Scale(better=Better.HIGHER, absolute=0.005)
+DISSIMILARITY = Scale(better=Better.LOWER, absolute=0.005)
+AGE = Scale(unit="s", better=Better.LOWER, absolute=0.01, relative=0.02)
+LENGTH, TIME = Scale(unit="m"), Scale(unit="s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """In which row of a run's table of states a figure shows: where `column` is `pick`: "least", "largest", or else
+    that word.
+    """
+
+    column: str
+    pick: str
+
+
+def least_of(column: str) -> Shown:
+    """Where a column is least."""
+    return Shown(column=column, pick="least")
+
+
+def largest_of(column: str) -> Shown:
+    """Where a column is largest."""
+    return Shown(column=column, pick="largest")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Metric(Generic[R]):
     """One figure: its value, None where it has none, and how many states, views or points it rests on.
 
     running: what it is before the first state, and over the states up to each (T,); None where it is not made of
-    single states.
+    single states. scale: how two runs are compared by it; shown: where a table of states shows it, None where none
+    does.
     """
 
     name: str
     value: Callable[[R], float | None]
     count: Callable[[R], int]
     running: Callable[[R], tuple[float, Float64]] | None = None
+    scale: Scale = DESCRIBES
+    shown: Shown | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +147,15 @@ def known(values: Float64) -> int:
     return int(np.sum(~np.isnan(values)))
 
 
-def folded(name: str, fold: Fold, column: Column[R], count: Callable[[R], int] | None = None) -> Metric[R]:
+def folded(
+    name: str,
+    fold: Fold,
+    column: Column[R],
+    count: Callable[[R], int] | None = None,
+    *,
+    scale: Scale = DESCRIBES,
+    shown: Shown | None = None,
+) -> Metric[R]:
     """A column's fold, which rests on the values that are not NaN unless `count` says otherwise."""
     accumulate = fold.accumulate
     return Metric(
@@ -86,14 +163,25 @@ def folded(name: str, fold: Fold, column: Column[R], count: Callable[[R], int] |
         value=lambda result: fold.of(column(result)),
         count=count or (lambda result: known(column(result))),
         running=None if accumulate is None else lambda result: (fold.start, accumulate(column(result))),
+        scale=scale,
+        shown=shown,
     )
 
 
-def counted(name: str, column: Column[R], is_on: Callable[[R, Float64], Bool]) -> Metric[R]:
+def counted(
+    name: str,
+    column: Column[R],
+    is_on: Callable[[R, Float64], Bool],
+    *,
+    scale: Scale = FAULTS,
+    shown: Shown | None = None,
+) -> Metric[R]:
     """How many values of a column are so."""
     return Metric(
         name=name,
         value=lambda result: int(np.sum(is_on(result, column(result)))),
         count=lambda result: known(column(result)),
         running=lambda result: (0.0, np.cumsum(is_on(result, column(result))).astype(np.float64)),
+        scale=scale,
+        shown=shown,
     )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,16 @@ from numpy.typing import NDArray
 from splatctrl_cli.config.fixed import IN_FRONT
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.evaluate.images import DepthErrors, depth_errors, filled, psnr, published_ssim, ssim_map
+from splatctrl_cli.evaluate.metrics import (
+    BAD_SHARE,
+    DECIBELS,
+    DESCRIBES,
+    DISSIMILARITY,
+    GOOD_SHARE,
+    SIMILARITY,
+    Better,
+    Scale,
+)
 from splatctrl_cli.records import Bool, Float32, Float64, Label, RgbdFrame, SplatSet
 from splatctrl_cli.voxels import OccupancyGrid
 
@@ -54,6 +64,17 @@ class RegionScore:
     depth: DepthErrors
     depth_coverage: float
     in_front: float
+
+
+DEPTH_ERROR = Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.02)
+REGION = {
+    "psnr": DECIBELS,
+    "ssim": SIMILARITY,
+    "depth_pixels": DESCRIBES,
+    **dict.fromkeys(("depth_median", "depth_mean", "depth_p90"), DEPTH_ERROR),
+    **dict.fromkeys(("depth_within_1cm", "depth_within_2cm", "depth_coverage"), GOOD_SHARE),
+    "in_front": BAD_SHARE,
+}  # of the pixels of a region
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,12 +207,18 @@ def metric_names() -> tuple[str, ...]:
     """The names that `total_score` can have, known before anything is scored; those of a mask and of LPIPS only where
     they were given.
     """
-    depth = ("pixels", *(f.name for f in fields(DepthErrors) if f.name != "num_pixels"), "coverage")
-    names = ["num_views", "valid_share", "seen_share", "mask_share", "ssim_published", "lpips", "lpips_published"]
-    for region in ("seen", "all", "masked"):
-        names += [f"psnr_{region}", f"ssim_{region}", *(f"depth_{name}_{region}" for name in depth)]
-        names.append(f"in_front_{region}")
-    return tuple(names)
+    return tuple(metric_scales())
+
+
+def metric_scales() -> dict[str, Scale]:
+    """How two runs are compared by each of `metric_names`."""
+    of_regions = {f"{name}_{region}": scale for region in ("seen", "all", "masked") for name, scale in REGION.items()}
+    return {
+        **dict.fromkeys(("num_views", "valid_share", "seen_share", "mask_share"), DESCRIBES),
+        "ssim_published": SIMILARITY,
+        **dict.fromkeys(("lpips", "lpips_published"), DISSIMILARITY),
+        **of_regions,
+    }
 
 
 def total_score(views: Sequence[ViewScore]) -> dict[str, float]:

@@ -10,16 +10,25 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.evaluate.cloud import cloud_names
+from splatctrl_cli.evaluate.cloud import CLOUD_SCALES
 from splatctrl_cli.evaluate.gates import gate_reasons
-from splatctrl_cli.evaluate.score import metric_names
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS
+from splatctrl_cli.evaluate.score import metric_scales
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 
 PREFIX = "change_"
 COMPARED = ("name", "split", "mask_rule", "resolution", "averaging", "lpips", "scans")
 SUMS = ("num_views", "num_skipped", "num_warnings", "num_points", "num_reference")
 AVERAGING = "mean over the views"
-NAMES = (*metric_names(), *cloud_names(), "free_mass", "num_skipped", "num_warnings", "num_scans")
+SCALES = {
+    **metric_scales(),
+    **CLOUD_SCALES,
+    "free_mass": BAD_SHARE,
+    "num_skipped": DESCRIBES,
+    "num_warnings": FAULTS,
+    "num_scans": DESCRIBES,
+}
+NAMES = tuple(SCALES)
 NAMES_WITH_CHANGES = (*NAMES, *(PREFIX + name for name in NAMES))  # since a baseline
 
 

@@ -13,6 +13,7 @@ from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate import field_accuracy
 from splatctrl_cli.evaluate.field_truth import FIELDS
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, FAULTS, LENGTH
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.field.baker import CHANNELS, DEFAULT_CHANNELS, KERNEL_OF, Baker
 from splatctrl_cli.field.grid_cells import LOSS, GridLayout, bounding_box, check_loss
@@ -40,10 +41,12 @@ from splatctrl_cli.report.field_pictures import gradient_picture, probability_pi
 from splatctrl_cli.report.reliability import reliability_picture
 from splatctrl_cli.robot.model import RobotModel
 
-SUMMARY_METRICS = (
-    *("num_splats", "num_splats_left_out", "num_cells", "voxel", "length_scale", "median_radius", "median_spacing"),
-    *("never_seen_share", "over_estimating_share", "num_warnings"),
-)
+SUMMARY_METRICS = {
+    **dict.fromkeys(("num_splats", "num_splats_left_out", "num_cells"), DESCRIBES),
+    **dict.fromkeys(("voxel", "length_scale", "median_radius", "median_spacing"), LENGTH),
+    **dict.fromkeys(("never_seen_share", "over_estimating_share"), BAD_SHARE),
+    "num_warnings": FAULTS,
+}  # and how two runs are compared by them
 EXACT = frozenset({"bound", "hard"})
 
 

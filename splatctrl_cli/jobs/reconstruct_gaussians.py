@@ -8,11 +8,13 @@ from typing import Any
 
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.metrics import DESCRIBES
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, written_run
+from splatctrl_cli.jobs.reconstruct_verdict import GATED as SPLATS_GATED
 from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest, no_frame, training_cameras
 from splatctrl_cli.records import RecordSource, RgbdFrame
@@ -21,7 +23,10 @@ from splatctrl_cli.scene.time_steps import depth_box
 from splatctrl_cli.scene_files.scene_folder import FORMAT
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
 
-GATED = ("iterations", "splats", "cloned", "split", "pruned", "unmet", "loss", "psnr")  # what --require can name
+GATED = {  # what --require can name, and how two runs are compared by it
+    **dict.fromkeys(("iterations", "splats", "cloned", "split", "pruned"), DESCRIBES),
+    **{name: SPLATS_GATED[name] for name in ("unmet", "loss", "psnr")},
+}
 ROUTES = "leave out --method, or give a folder of views (a TOML file or --dtu)"
 
 

@@ -7,17 +7,26 @@ from typing import Any
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import MASK_PIXELS
 from splatctrl_cli.evaluate.gates import gate_reasons
+from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, FAULTS, Better, Scale
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, note, noted, verdict_of
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.records import LossReport
 from splatctrl_cli.robot.declared_contact import carried_words
 from splatctrl_cli.scene.audit_row import AuditRow
 
-GATED = (
-    *("time_steps", "iterations", "splats", "robot_splats", "added", "relocated", "unmet", "evicted"),
-    *("unrepresented_voxels", "unrepresented_volume", "max_unrepresented_voxels"),
-    *("self_mask_residual_mm", "inside_robot_points", "loss", "psnr"),
-)  # what --require can name
+UNREPRESENTED = Scale(better=Better.LOWER, absolute=2, relative=0.05)  # voxels
+GATED = {
+    **dict.fromkeys(("time_steps", "iterations", "splats", "robot_splats", "added", "relocated"), DESCRIBES),
+    "unmet": FAULTS,
+    "evicted": DESCRIBES,
+    "unrepresented_voxels": UNREPRESENTED,
+    "unrepresented_volume": Scale(unit="m3", better=Better.LOWER, absolute=1e-5, relative=0.05),
+    "max_unrepresented_voxels": UNREPRESENTED,
+    "self_mask_residual_mm": Scale(unit="mm", better=Better.LOWER, absolute=0.5, relative=0.02),
+    "inside_robot_points": FAULTS,
+    "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
+    "psnr": DECIBELS,
+}  # what --require can name, and how two runs are compared by it
 LONGEST_BLIND = ReplayRequest.max_map_age  # [s] as long as a replay takes what it knows for evidence
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import DEFAULT_SPHERES
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names, gate_reasons
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, ERROR, FAULTS
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, noted, verdict_of
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.geometry import transform_points
@@ -27,6 +28,13 @@ from splatctrl_cli.robot.spheres import are_links_renamed, matched_links
 from splatctrl_cli.robot.srdf import read_srdf
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
+SCALES = {
+    "max_deficit": ERROR,
+    "uncovered_share": BAD_SHARE,
+    "max_protrusion": ERROR,
+    "num_spheres": DESCRIBES,
+    **dict.fromkeys(("num_bare_links", "num_open_links", "num_stray_spheres"), FAULTS),
+}
 METRICS: dict[str, Callable[[CoverageReport], float | None]] = {  # lengths in metres, None where no figure bounds it
     "max_deficit": lambda report: report.max_deficit,
     "uncovered_share": lambda report: report.uncovered_share,

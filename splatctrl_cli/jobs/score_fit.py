@@ -16,8 +16,9 @@ from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.images import psnr
+from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, TIME, Scale
 from splatctrl_cli.evaluate.perceptual import Lpips
-from splatctrl_cli.evaluate.score_report import AVERAGING, judged, mean_of
+from splatctrl_cli.evaluate.score_report import AVERAGING, SCALES, judged, mean_of
 from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views, open_to_train
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
@@ -44,15 +45,19 @@ METHODS = {
     "3dgs": Method(name="3D-GS", key="3dgs", psnr=23.27, splats="50,000-100,000"),
     "budget": Method(name="ours", key="ours", psnr=23.33, splats="10,000"),
 }
-EACH = (
-    *("psnr_seen", "psnr_all", "psnr_masked", "ssim_seen", "ssim_all", "ssim_published", "lpips", "lpips_published"),
-    *("depth_median_seen", "depth_median_all", "chamfer"),
-)
-OWN = ("psnr", "splats", "memory", "seconds")
-GATED = (
-    *("psnr_gain", *(f"{what}_{method.key}" for method in METHODS.values() for what in (*OWN, *EACH))),
-    *("num_scans", "num_warnings"),
-)
+EACH = {
+    name: SCALES[name]
+    for name in (
+        *("psnr_seen", "psnr_all", "psnr_masked", "ssim_seen", "ssim_all", "ssim_published", "lpips"),
+        *("lpips_published", "depth_median_seen", "depth_median_all", "chamfer"),
+    )
+}
+OWN = {"psnr": DECIBELS, "splats": DESCRIBES, "memory": Scale(unit="MiB"), "seconds": TIME}
+GATED = {
+    "psnr_gain": DECIBELS,
+    **{f"{what}_{method.key}": scale for method in METHODS.values() for what, scale in (OWN | EACH).items()},
+    **{name: SCALES[name] for name in ("num_scans", "num_warnings")},
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import pytest
 from splatctrl_cli.config import Config, FieldConfig
 from splatctrl_cli.field.slabs import bake
 from splatctrl_cli.grid_files.npz_grid import write_npz
-from splatctrl_cli.jobs.replays.compare import certified_distance, figure_names
+from splatctrl_cli.jobs.replays.compare import certified_distance, figure_scales
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.records import Box
 from splatctrl_cli.robot.model import RobotModel
@@ -104,7 +104,7 @@ def test_all_baselines_stand_in_one_table(desk: Desk, arm: RobotModel) -> None:
     zone = ("--zone", "0.9,1.0")
     assert desk.replay("--scene", str(scene), *CLOSED, "--baseline", "standstill,birrt", *zone) == 0
     metrics = desk.metrics()
-    assert set(figure_names(["standstill", "birrt"], has_truth=False)) <= set(metrics)
+    assert set(figure_scales(["standstill", "birrt"], has_truth=False)) <= set(metrics)
     assert metrics["standstill_num_interventions"] == metrics["standstill_num_stops"] == 1
     assert metrics["standstill_joint_path_rad"] == pytest.approx(metrics["log_joint_path_rad"])
     assert metrics["standstill_duration_s"] > metrics["log_duration_s"] + 1

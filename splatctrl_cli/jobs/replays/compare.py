@@ -14,6 +14,7 @@ from splatctrl_cli.control.goals import PlanDetour
 from splatctrl_cli.control.open_loop import is_shaped
 from splatctrl_cli.control.replay import ReplayTask
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.evaluate.metrics import DESCRIBES, GAP, TIME, Better, Scale
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replays.goal import goal_waypoints
 from splatctrl_cli.jobs.replays.known_scene import KnownFields
@@ -28,11 +29,23 @@ from splatctrl_cli.report.replay_pictures import methods_picture
 BIRRT, BIRRT_IK = "birrt", "birrt-ik"
 ALWAYS = ("closed_loop", "log")  # what stands in every comparison
 ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
-MOTION = (
-    *("success", "goal_reached", "duration_s", "joint_path_rad", "effector_path_m", "effector_path_deg"),
-    *("min_clearance_barrier", "min_clearance", "min_clearance_proved", "min_clearance_true", "num_interventions"),
-)
-PLAN = ("planning_time_s", "planned_margin", "planned_self_margin", "num_edges", "num_edges_proved")
+MOTION = {
+    "success": Scale(better=Better.HIGHER),
+    "goal_reached": Scale(better=Better.HIGHER),
+    "duration_s": Scale(unit="s", better=Better.LOWER, absolute=0.05, relative=0.02),
+    "joint_path_rad": Scale(unit="rad", better=Better.LOWER, absolute=0.01, relative=0.02),
+    "effector_path_m": Scale(unit="m", better=Better.LOWER, absolute=0.005, relative=0.02),
+    "effector_path_deg": Scale(unit="degrees", better=Better.LOWER, absolute=0.5, relative=0.02),
+    **dict.fromkeys(("min_clearance_barrier", "min_clearance", "min_clearance_proved", "min_clearance_true"), GAP),
+    "num_interventions": DESCRIBES,
+}
+PLAN = {
+    "planning_time_s": TIME,  # wall clock
+    "planned_margin": GAP,
+    "planned_self_margin": GAP,
+    "num_edges": DESCRIBES,
+    "num_edges_proved": DESCRIBES,
+}
 
 
 def method_named(baseline: str) -> str:
@@ -40,18 +53,23 @@ def method_named(baseline: str) -> str:
     return baseline.replace("-", "_")
 
 
-def figure_names(baselines: Sequence[str], *, has_truth: bool) -> tuple[str, ...]:
-    """The names that `figures_of` gives; none without a baseline."""
+def figure_scales(baselines: Sequence[str], *, has_truth: bool) -> dict[str, Scale]:
+    """How two runs are compared by the figures that `figures_of` gives; none without a baseline."""
     if not baselines:
-        return ()
+        return {}
     methods = (*ALWAYS, *map(method_named, baselines))
     plans = {method_named(name) for name in (BIRRT, BIRRT_IK)}
-    names = [(method, name) for method in methods for name in (*MOTION, *(PLAN if method in plans else ()))]
-    return tuple(f"{method}_{name}" for method, name in names if has_truth or name != "min_clearance_true")
+    of_method = {method: MOTION | (PLAN if method in plans else {}) for method in methods}
+    return {
+        f"{method}_{name}": scale
+        for method, scales in of_method.items()
+        for name, scale in scales.items()
+        if has_truth or name != "min_clearance_true"
+    }
 
 
 def figures_of(comparison: Comparison) -> dict[str, float | None]:
-    """Every figure of every method, by `figure_names`."""
+    """Every figure of every method, by the names of `figure_scales`."""
     has_truth = any(figures.true_clearance is not None for figures in comparison.figures.values())
     found: dict[str, float | None] = {}
     for method in comparison.methods:
@@ -246,7 +264,7 @@ def _stamps(start_ns: int, num: int, period: float) -> Any:
 
 def _motion_values(figures: MotionFigures | None) -> dict[str, float | None]:
     if figures is None:
-        return {"success": 0, "goal_reached": 0, **dict.fromkeys(MOTION[2:])}
+        return {"success": 0, "goal_reached": 0, **dict.fromkeys([*MOTION][2:])}
     return {
         "success": int(figures.is_success),
         "goal_reached": int(figures.has_arrived),

@@ -16,6 +16,7 @@ from splatctrl_cli.control.preconditions import checked_posture
 from splatctrl_cli.control.replay import Waypoint
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.evaluate.metrics import BAD_SHARE, DESCRIBES, Better, Scale
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.replays.request import ReplayRequest
@@ -24,10 +25,18 @@ from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.states.twists import read_twists
 
 WORLD = "world"
-TWIST_FIGURES = (
-    *("twist_share", "twist_share_capped", "mean_twist_error_linear", "max_twist_error_linear"),
-    *("mean_twist_error_angular", "max_twist_error_angular"),
-)
+TWIST_FIGURES = {
+    "twist_share": DESCRIBES,
+    "twist_share_capped": BAD_SHARE,
+    **dict.fromkeys(
+        ("mean_twist_error_linear", "max_twist_error_linear"),
+        Scale(unit="m/s", better=Better.LOWER, absolute=1e-3, relative=0.02),
+    ),
+    **dict.fromkeys(
+        ("mean_twist_error_angular", "max_twist_error_angular"),
+        Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02),
+    ),
+}
 POSE = "x,y,z,qx,qy,qz,qw"
 POSE_COLUMNS = tuple(POSE.split(","))
 

@@ -18,6 +18,7 @@ from splatctrl_cli.checks.clock_offset import (
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import COVERED_COARSE
 from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.state_columns import StateColumns
@@ -29,10 +30,15 @@ from splatctrl_cli.robot.srdf import read_srdf
 from splatctrl_cli.states.state_source import open_states
 
 MAX_NOTES = 10  # printed
-LOG_FIGURES = (
-    *("num_poses", "max_pose_position", "max_pose_rotation", "max_pose_rest_position", "max_pose_rest_rotation"),
-    *("clock_offset_s", "clock_uncertainty_s"),
-)
+ANGLE = Scale(unit="rad")
+LOG_FIGURES = {  # they describe the log
+    "num_poses": DESCRIBES,
+    "max_pose_position": LENGTH,
+    "max_pose_rotation": ANGLE,
+    "max_pose_rest_position": LENGTH,
+    "max_pose_rest_rotation": ANGLE,
+    **dict.fromkeys(("clock_offset_s", "clock_uncertainty_s"), TIME),
+}
 FR3_LIMITS = (
     "an FR3 refuses speeds near its position limits that its URDF allows; set control.velocity_limits = fr3 to keep "
     "the published ones"
@@ -170,7 +176,7 @@ class LoggedStates:
         """How many poses or intervals each of `metrics` rests on; the number of poses rests on the states."""
         num_poses = 0 if self.poses is None else self.poses.num_poses
         num_intervals = 0 if self.clock is None else self.clock.num_intervals
-        return {name: num_intervals if name.startswith("clock_") else num_poses for name in LOG_FIGURES[1:]}
+        return {name: num_intervals if name.startswith("clock_") else num_poses for name in [*LOG_FIGURES][1:]}
 
     def lines(self) -> list[str]:
         """A line for each thing that a person should know."""

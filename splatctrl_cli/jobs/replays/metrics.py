@@ -16,19 +16,33 @@ from splatctrl_cli.control.replay import Outcome, ReplayTrace
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.evaluate.clearance_agreement import ClearanceAgreement
 from splatctrl_cli.evaluate.metrics import (
+    AGE,
+    BAD_SHARE,
+    DESCRIBES,
+    ERROR,
+    FAULTS,
+    GAP,
+    GOOD_SHARE,
     LARGEST,
     LAST,
     LEAST,
+    LENGTH,
     LOWEST,
     MEAN,
     P95,
+    TIME,
     TOTAL,
+    Better,
     Metric,
+    Scale,
+    Shown,
     counted,
     folded,
     known,
+    largest_of,
+    least_of,
 )
-from splatctrl_cli.jobs.replays.compare import figure_names, figures_of
+from splatctrl_cli.jobs.replays.compare import figure_scales, figures_of
 from splatctrl_cli.jobs.replays.goal import TWIST_FIGURES
 from splatctrl_cli.jobs.replays.inputs import LOG_FIGURES, LoggedStates
 from splatctrl_cli.jobs.replays.result import Replay
@@ -55,15 +69,19 @@ def is_blank(replay: Replay) -> Bool:
 
 
 def _single(
-    name: str, value: Callable[[Replay], float | None], count: Callable[[Replay], int] = num_states
+    name: str,
+    value: Callable[[Replay], float | None],
+    count: Callable[[Replay], int] = num_states,
+    scale: Scale = DESCRIBES,
 ) -> Metric[Replay]:
     """A figure that is not made of a column."""
-    return Metric(name=name, value=value, count=count)
+    return Metric(name=name, value=value, count=count, scale=scale)
 
 
 def _clearance(field: str) -> Metric[Replay]:
     name = "min_clearance" if field == "exact" else f"min_clearance_{field}"
-    return folded(name, LEAST, lambda replay: replay.audit.clearance[field].distance)
+    shown = least_of(f"clearance_{field}")
+    return folded(name, LEAST, lambda replay: replay.audit.clearance[field].distance, scale=GAP, shown=shown)
 
 
 def _exact(replay: Replay) -> Float64:
@@ -90,7 +108,7 @@ def _deficit(replay: Replay) -> float | None:
     return None if replay.model.coverage is None else replay.model.coverage.max_deficit
 
 
-def _map_error(name: str, figure: str) -> Metric[Replay]:
+def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
     """By held-out depth; None without, or where that is too little."""
 
     def value(replay: Replay) -> float | None:
@@ -98,55 +116,99 @@ def _map_error(name: str, figure: str) -> Metric[Replay]:
         found: float | None = None if bound is None else getattr(bound, figure)
         return found
 
-    return _single(name, value, lambda replay: 0 if replay.map_error is None else replay.map_error.num_seen)
+    return _single(name, value, lambda replay: 0 if replay.map_error is None else replay.map_error.num_seen, scale)
 
 
+LIMIT = Scale(unit="rad", better=Better.HIGHER, absolute=1e-3)  # or m, of a prismatic joint
+SPEED = Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02)
+SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  # or rad/s, by the row
+ANGLE = Scale(unit="rad", better=Better.LOWER, absolute=1e-3, relative=0.02)
+RESIDUAL = Scale(better=Better.LOWER, absolute=1e-6)
+FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
+NEAREST = least_of("clearance_exact")
 OF_AUDIT: Declared = (
     _single("num_spheres", lambda replay: len(replay.model.sphere_set.radii)),
-    _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links)),
-    _single("coverage_deficit", _deficit, lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links)),
+    _single("num_bare_links", lambda r: len(r.model.bare_links), lambda r: len(r.model.urdf.links), FAULTS),
+    _single(
+        "coverage_deficit",
+        _deficit,
+        lambda r: 0 if r.model.coverage is None else len(r.model.coverage.links),
+        ERROR,
+    ),
     _single("num_self_pairs", lambda replay: len(replay.model.self_pairs())),
     _single("num_states", num_states),
-    _single("num_before_scene", lambda replay: replay.num_before_scene),
-    _single("duration_s", lambda replay: float(replay.audit.stamp_ns[-1] - replay.audit.stamp_ns[0]) * 1e-9),
+    _single("num_before_scene", lambda replay: replay.num_before_scene, scale=FAULTS),
+    _single(
+        "duration_s", lambda replay: float(replay.audit.stamp_ns[-1] - replay.audit.stamp_ns[0]) * 1e-9, scale=TIME
+    ),
 )
 OF_STATES: Declared = (
-    folded("min_clearance_true", LEAST, lambda r: np.asarray(() if r.true_clearance is None else r.true_clearance)),
-    counted("num_below_margin", _exact, lambda replay, values: values < replay.margin),
-    counted("num_in_collision", _exact, lambda _, values: values < 0),
+    folded(
+        "min_clearance_true",
+        LEAST,
+        lambda r: np.asarray(() if r.true_clearance is None else r.true_clearance),
+        scale=GAP,
+        shown=least_of("clearance_true"),
+    ),
+    counted("num_below_margin", _exact, lambda replay, values: values < replay.margin, shown=NEAREST),
+    counted("num_in_collision", _exact, lambda _, values: values < 0, shown=NEAREST),
     folded(
         "min_self_clearance",
         LEAST,
         lambda replay: replay.audit.self_clearance,
         lambda replay: num_states(replay) if len(replay.model.self_pairs()) else 0,
+        scale=GAP,
+        shown=least_of("self_clearance"),
     ),
-    folded("min_limit_margin", LEAST, lambda replay: replay.audit.limit_margin, num_states),
-    folded("max_velocity_share", LARGEST, _of("strain", "velocity"), _intervals),
-    folded("max_acceleration_share", LARGEST, _of("strain", "acceleration"), _num_sudden),
-    folded("min_clearance_surface", LEAST, _of("between", "surface")),
-    folded("min_clearance_between", LEAST, _of("between", "lower")),
-    folded("min_clearance_splats", LEAST, _of("between", "represented")),
-    folded("max_unseen_share", LARGEST, _of("near", "unseen")),
-    folded("max_blind_share", LARGEST, _of("near", "blind")),
-    folded("min_unanswered", LEAST, _of("near", "unanswered"), num_states),
-    folded("max_evidence_age_s", LARGEST, _of("near", "age")),
-    _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals),
-    folded("unknown_share", MEAN, lambda replay: replay.audit.unknown_share),
+    folded(
+        "min_limit_margin",
+        LEAST,
+        lambda replay: replay.audit.limit_margin,
+        num_states,
+        scale=LIMIT,
+        shown=least_of("limit_margin"),
+    ),
+    folded("max_velocity_share", LARGEST, _of("strain", "velocity"), _intervals, scale=BAD_SHARE),
+    folded("max_acceleration_share", LARGEST, _of("strain", "acceleration"), _num_sudden, scale=BAD_SHARE),
+    folded("min_clearance_surface", LEAST, _of("between", "surface"), scale=GAP, shown=NEAREST),
+    folded("min_clearance_between", LEAST, _of("between", "lower"), scale=GAP, shown=NEAREST),
+    folded("min_clearance_splats", LEAST, _of("between", "represented"), scale=GAP, shown=NEAREST),
+    folded("max_unseen_share", LARGEST, _of("near", "unseen"), scale=BAD_SHARE),
+    folded("max_blind_share", LARGEST, _of("near", "blind"), scale=BAD_SHARE),
+    folded("min_unanswered", LEAST, _of("near", "unanswered"), num_states, scale=GAP),
+    folded("max_evidence_age_s", LARGEST, _of("near", "age"), scale=AGE),
+    _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals, AGE),
+    folded(
+        "unknown_share",
+        MEAN,
+        lambda replay: replay.audit.unknown_share,
+        scale=BAD_SHARE,
+        shown=largest_of("unknown_share"),
+    ),
     counted("num_without_distance", lambda r: is_blank(r).astype(np.float64), lambda _, values: values > 0),
-    _single("num_static_violations", lambda r: len(r.static_violations), lambda r: len(r.statics)),
-    folded("max_map_age_s", LARGEST, lambda replay: np.asarray(replay.map_age_s)),
-    _map_error("map_error_bound", "bound"),
-    _map_error("map_error_blocks", "num_stretches"),
-    _map_error("map_error_confidence", "confidence"),
+    _single("num_static_violations", lambda r: len(r.static_violations), lambda r: len(r.statics), FAULTS),
+    folded(
+        "max_map_age_s",
+        LARGEST,
+        lambda replay: np.asarray(replay.map_age_s),
+        scale=AGE,
+        shown=largest_of("map_age_s"),
+    ),
+    _map_error("map_error_bound", "bound", ERROR),
+    _map_error("map_error_blocks", "num_stretches", DESCRIBES),
+    _map_error("map_error_confidence", "confidence", GOOD_SHARE),
 )
 
 
+LARGEST_DIFFERENCE, LEAST_SLACK = largest_of("velocity_difference"), least_of("barrier_margin_logged")
+FULFILLED_STEPS = Scale(better=Better.HIGHER, relative=0.05)
 STEPS, ASKED = partial(_of, "kept_steps.figures"), partial(_of, "open_loop.figures")
 
 
 def _rung(rung: Rung) -> Metric[Replay]:
-    name = "num_" + rung.value.replace("-", "_")
-    return counted(name, STEPS("rung"), lambda _, values: values == RUNGS.index(rung))
+    name, shown = "num_" + rung.value.replace("-", "_"), Shown(column="rung", pick=rung.value)
+    scale = FULFILLED_STEPS if rung is Rung.SOLVED else FAULTS
+    return counted(name, STEPS("rung"), lambda _, values: values == RUNGS.index(rung), scale=scale, shown=shown)
 
 
 def _first_intervention(replay: Replay) -> float | None:
@@ -157,31 +219,33 @@ def _first_intervention(replay: Replay) -> float | None:
 OF_STEPS: Declared = (
     folded("intervention_share", MEAN, STEPS("shaped")),
     *(folded(f"intervention_share_{kind}", MEAN, STEPS(f"shaped {kind}")) for kind in RowKind),
-    _single("first_intervention_s", _first_intervention),
-    folded("min_barrier_clearance", LOWEST, STEPS("clearance")),
+    _single("first_intervention_s", _first_intervention, scale=TIME),
+    folded("min_barrier_clearance", LOWEST, STEPS("clearance"), scale=GAP, shown=least_of("barrier_clearance")),
     *(_rung(rung) for rung in (Rung.SOLVED, Rung.RELAXED, Rung.MINIMUM_VIOLATION, Rung.HOLD)),
-    folded("num_refused", TOTAL, STEPS("refused")),
-    counted("num_scaled_back", STEPS("scale"), lambda _, values: values < 1),
-    folded("max_residual", LARGEST, STEPS("residual")),
+    folded("num_refused", TOTAL, STEPS("refused"), scale=FAULTS),
+    counted("num_scaled_back", STEPS("scale"), lambda _, values: values < 1, shown=least_of("scale")),
+    folded("max_residual", LARGEST, STEPS("residual"), scale=RESIDUAL, shown=largest_of("residual")),
 )
 OF_OPEN_LOOP: Declared = (
-    folded("mean_velocity_difference", MEAN, ASKED("size")),
-    folded("p95_velocity_difference", P95, ASKED("size")),
-    folded("max_velocity_difference", LARGEST, ASKED("largest")),
-    folded("min_barrier_margin_logged", LOWEST, ASKED("barrier")),
-    counted("num_barrier_broken_logged", ASKED("barrier"), lambda _, values: values < 0),
-    folded("min_velocity_margin_logged", LOWEST, ASKED("limit")),
+    folded("mean_velocity_difference", MEAN, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),
+    folded("p95_velocity_difference", P95, ASKED("size"), scale=SPEED, shown=LARGEST_DIFFERENCE),
+    folded("max_velocity_difference", LARGEST, ASKED("largest"), scale=SPEED, shown=LARGEST_DIFFERENCE),
+    folded("min_barrier_margin_logged", LOWEST, ASKED("barrier"), scale=SLACK, shown=LEAST_SLACK),
+    counted("num_barrier_broken_logged", ASKED("barrier"), lambda _, values: values < 0, shown=LEAST_SLACK),
+    folded(
+        "min_velocity_margin_logged", LOWEST, ASKED("limit"), scale=SLACK, shown=least_of("velocity_margin_logged")
+    ),
 )
 
 
-def _trace(name: str, value: Callable[[ReplayTrace], float]) -> Metric[Replay]:
+def _trace(name: str, value: Callable[[ReplayTrace], float], scale: Scale = DESCRIBES) -> Metric[Replay]:
     """A figure of the closed loop."""
 
     def of_trace(replay: Replay) -> float:
         assert replay.closed_loop is not None
         return value(replay.closed_loop)
 
-    return _single(name, of_trace)
+    return _single(name, of_trace, scale=scale)
 
 
 def _rotation_deg(replay: Replay) -> Float64:
@@ -189,23 +253,30 @@ def _rotation_deg(replay: Replay) -> Float64:
 
 
 OF_CLOSED_LOOP: Declared = (
-    _trace("goal_reached", lambda trace: int(trace.outcome is Outcome.GOAL_REACHED)),
-    _trace("stalled", lambda trace: int(trace.outcome is Outcome.STALLED)),
-    _trace("num_goals_reached", lambda trace: trace.num_reached),
-    _single("start_time_s", lambda replay: replay.start_time_s),
+    _trace("goal_reached", lambda trace: int(trace.outcome is Outcome.GOAL_REACHED), FULFILLED),
+    _trace("stalled", lambda trace: int(trace.outcome is Outcome.STALLED), FAULTS),
+    _trace("num_goals_reached", lambda trace: trace.num_reached, FULFILLED),
+    _single("start_time_s", lambda replay: replay.start_time_s, scale=TIME),
     _trace("num_steps", lambda trace: len(trace.steps)),
-    _trace("position_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[:3]))),
-    _trace("rotation_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[3:]))),
-    _trace("num_scene_hits", lambda trace: sum(change.is_hit for change in trace.scene_changes)),
+    _trace("position_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[:3])), ERROR),
+    _trace("rotation_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[3:])), ANGLE),
+    _trace("num_scene_hits", lambda trace: sum(change.is_hit for change in trace.scene_changes), FAULTS),
     _trace("num_anchors", lambda trace: len(trace.anchored)),
     _trace("num_detours", lambda trace: len(trace.detours)),
     *(
-        folded(f"{prefix}_divergence_{name}", fold, column, num_states)
+        folded(
+            f"{prefix}_divergence_{name}",
+            fold,
+            column,
+            num_states,
+            scale=Scale(unit=unit),
+            shown=largest_of(f"divergence_{name}"),
+        )
         for prefix, fold in (("max", LARGEST), ("end", LAST))
-        for name, column in (
-            ("joints", _of("divergence", "joints")),
-            ("position", _of("divergence", "position")),
-            ("rotation_deg", _rotation_deg),
+        for name, unit, column in (
+            ("joints", "rad", _of("divergence", "joints")),
+            ("position", "m", _of("divergence", "position")),
+            ("rotation_deg", "degrees", _rotation_deg),
         )
     ),
 )
@@ -215,6 +286,11 @@ OF_MODE: dict[str, Declared] = {
     "closed-loop": (*OF_STEPS, *OF_CLOSED_LOOP),
 }
 TRUTH = tuple(("num_compared" if f.name == "num_states" else f.name) for f in fields(ClearanceAgreement))
+AGREEMENT = {
+    **dict.fromkeys(("median", "p95", "largest", "largest_over"), ERROR),
+    "share_within": GOOD_SHARE,
+    "num_compared": DESCRIBES,
+}  # scales of TRUTH, without its tolerance
 
 
 def _declared(mode: str, of_fields: Sequence[str]) -> Declared:
@@ -230,16 +306,29 @@ def metric_names(
     mode: str, of_fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = (), has_twists: bool = False
 ) -> tuple[str, ...]:
     """The names that `metrics_of` and the log's own figures have for a --mode and --baseline."""
-    names = [metric.name for metric in _declared(mode, of_fields)]
-    names += LOG_FIGURES
-    names += TWIST_FIGURES if has_twists else ()
+    given = {"has_truth": has_truth, "has_twists": has_twists}
+    return tuple(metric_scales(mode, of_fields, baselines=baselines, **given))
+
+
+def metric_scales(
+    mode: str, of_fields: Sequence[str], *, has_truth: bool, baselines: Sequence[str] = (), has_twists: bool = False
+) -> dict[str, Scale]:
+    """How two runs are compared by each of `metric_names`."""
+    scales = {metric.name: metric.scale for metric in _declared(mode, of_fields)}
+    scales |= LOG_FIGURES
+    scales |= TWIST_FIGURES if has_twists else {}
     if STANDSTILL in baselines:
-        names += [f"{motion}_{figure}" for motion in BESIDE for figure in FIGURES]
-    names += figure_names(baselines, has_truth=has_truth)
+        scales |= {f"{motion}_{figure}": scale for motion in BESIDE for figure, scale in FIGURES.items()}
+    scales |= figure_scales(baselines, has_truth=has_truth)
     if has_truth:
-        names += [*(f"truth_{of}_{name}" for name in of_fields for of in TRUTH if of != "tolerance")]
-        names += ["truth_tolerance"]
-    return tuple(names)
+        scales |= {f"truth_{figure}_{name}": scale for name in of_fields for figure, scale in AGREEMENT.items()}
+        scales["truth_tolerance"] = LENGTH
+    return scales
+
+
+def shown_metrics(mode: str, of_fields: Sequence[str]) -> dict[str, Shown]:
+    """Where ``steps.csv`` shows the metrics that it shows, by name."""
+    return {metric.name: metric.shown for metric in _declared(mode, of_fields) if metric.shown is not None}
 
 
 def metrics_of(replay: Replay) -> Metrics:

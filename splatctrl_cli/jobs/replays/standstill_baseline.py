@@ -19,6 +19,7 @@ from splatctrl_cli.control.standstill import (
     separation_of,
 )
 from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.evaluate.metrics import DESCRIBES, GAP, Better, Scale
 from splatctrl_cli.jobs.replays.compare import BIRRT, BIRRT_IK, check_comparable
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
@@ -26,10 +27,16 @@ from splatctrl_cli.records import Box, Float64
 from splatctrl_cli.simulate.truth import distance_to
 
 PEOPLE = ("human*", "person*")  # names of a truth's primitives
-FIGURES = (
-    *("completed", "duration_s", "mean_human_distance", "min_human_distance", "num_stops"),
-    *("longest_stop_s", "stopped_s"),
-)
+STOPPED = Scale(unit="s", better=Better.LOWER, absolute=0.05, relative=0.02)
+FIGURES = {
+    "completed": Scale(better=Better.HIGHER),
+    "duration_s": STOPPED,
+    "mean_human_distance": GAP,
+    "min_human_distance": GAP,
+    "num_stops": DESCRIBES,
+    "longest_stop_s": STOPPED,
+    "stopped_s": STOPPED,
+}
 STANDSTILL = "standstill"
 BESIDE = ("closed_loop", STANDSTILL)
 BASELINES = (STANDSTILL, BIRRT, BIRRT_IK)
