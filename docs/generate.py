@@ -25,6 +25,7 @@ from splatctrl_cli.datasets.layouts import LAYOUTS
 from splatctrl_cli.evaluate.verdict import Criterion
 from splatctrl_cli.grid_files.grid_format import GridFormat
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
+from splatctrl_cli.jobs.declared_metrics import Compared, documented
 from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.splat_files.splat_format import SplatFormat
@@ -38,12 +39,13 @@ HELP = ("help", "help_all")
 SIMPLE = ("int", "float", "str")  # types that a default shows
 TABLE = re.compile(r"(<!-- Rows of (\w+); `make docs` writes them again. -->\n\n)((?:[|-].*\n)*)")
 REGISTRIES: dict[
-    str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout | Check | Criterion[Judged]]]
+    str, tuple[tuple[str, ...], Iterable[SplatFormat | GridFormat | Layout | Check | Criterion[Judged] | Compared]]
 ] = {
     "splat_files": (("suffix", "what it is", "rounds to", "does not hold"), SPLAT_FORMATS.values()),
     "grid_files": (("`--formats`", "file", "who opens it", "checked", "cost"), GRID_FORMATS.values()),
     "datasets": (("layout", "known by", "poses", "depth", "intrinsics"), LAYOUTS),
     "criteria": (("criterion", "holds where", "broken:"), CRITERIA),
+    "metrics": (("command", "figures", "unit", "better", "tolerance"), [*documented()]),
     "checks": ((), CHECKS.values()),  # without a header: a list
 }
 
@@ -60,7 +62,7 @@ def pages() -> dict[str, str]:
     """The text of each generated page, by file name."""
     tabled = {
         name: (DOCS / name).read_text(encoding="utf-8")
-        for name in ("artefacts.md", "check.md", "input.md", "verdict.md")
+        for name in ("artefacts.md", "check.md", "compare.md", "input.md", "verdict.md")
     }
     filled = {name: TABLE.sub(_filled, text) for name, text in tabled.items()}
     return {"cli.md": cli_page(), "config.md": config_page(), **filled}

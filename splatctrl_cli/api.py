@@ -8,6 +8,7 @@ from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, 
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
 from splatctrl_cli.jobs.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake_request import BakeRequest
+from splatctrl_cli.jobs.compare import CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import Progress
@@ -23,6 +24,8 @@ __all__ = [
     "BakeRequest",
     "BakeResult",
     "Box",
+    "CompareRequest",
+    "CompareResult",
     "Config",
     "ExportRequest",
     "ExportResult",
@@ -45,6 +48,7 @@ __all__ = [
     "Verdict",
     "WriteError",
     "bake",
+    "compare",
     "export",
     "load_config",
     "open_to_train",

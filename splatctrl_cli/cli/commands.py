@@ -180,6 +180,12 @@ def _demo(add: Options, parser: Parser) -> None:
     add_threads(parser)
 
 
+def _compare(add: Options, parser: Parser) -> None:
+    add("OUTPUT", "folder that a command or a batch wrote; of two the earlier first", Path, nargs="+")
+    add("--against FILE", "compare the only OUTPUT with this stored baseline", Path)
+    add("--update-baseline FILE", "write the last OUTPUT as a baseline, alone or after the comparison", Path)
+
+
 def _robot(add: Options, parser: Parser, spheres: str = "those of the URDF itself") -> None:
     """``--urdf``, ``--packages``, and ``--spheres`` unless they are fitted."""
     add("--urdf FILE", "the robot's URDF (expanded, no xacro)", Path, required=True)
@@ -312,6 +318,14 @@ COMMANDS = {
         examples=("batch nightly.toml --shard 2/4", "batch nightly.toml --failed"),
         run="batch:run",
         options=_batch,
+        judges=True,
+    ),
+    "compare": Command(
+        summary="say what got worse between two runs, two batches, or since a stored baseline",
+        examples=("compare out/old out/new", "compare out/new --against baseline.toml"),
+        run="compare:run",
+        judges=True,
+        options=_compare,
     ),
     "robot": Command(
         summary="fit and measure a robot's collision spheres, list its self-collision pairs and limits",

@@ -15,7 +15,7 @@ from splatctrl_cli.report.github import tell_github
 from splatctrl_cli.report.junit import write_junit
 from splatctrl_cli.report.suites import Case, Suite, cases_of, error_case, notes_of
 
-RECORDINGS = ("log", "source", "reference", "dtu", "scene", "data", "run", "urdf")  # what is judged: logs before maps
+RECORDINGS = ("log", "source", "reference", "dtu", "scene", "data", "output", "urdf")  # logs before maps
 JUNIT = "--junit"
 
 

@@ -1,0 +1,53 @@
+"""``splatctrl compare``: what got worse between two runs, two batches, or since a stored baseline."""
+
+import argparse
+from collections.abc import Iterator
+
+from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.options import request_of
+from splatctrl_cli.jobs.compare import Change, CompareRequest, CompareResult, FigureChange, compare
+
+MOST_ROWS = 20  # of changes that are no regression; --json has all
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the subcommand and return its exit code."""
+    console = Console(args)
+    result = compare(request_of(CompareRequest, args, runs=tuple(args.output)), console)
+    return console.concluded(result.verdict, result.as_dict(), _lines(result, is_long=args.verbose > 0))
+
+
+def _lines(result: CompareResult, *, is_long: bool) -> Iterator[str]:
+    """What got worse, what got better (and with `is_long` what only changed), and what was not alike."""
+    kinds = (Change.WORSE, Change.BETTER, *((Change.OTHER,) if is_long else ()))
+    rows = [_row(one) for one in result.figures if one.change in kinds]
+    num = len(rows) if is_long else max(MOST_ROWS, result.metrics["num_worse"])
+    if rows:
+        yield from table(("figure", "run", "before", "after", "allowed", "unit", "", "where"), rows[:num])
+        yield from [f"and {len(rows) - num} more; -v prints all"] if len(rows) > num else []
+    else:
+        yield "no figure changed by more than its tolerance"
+    if result.jobs:
+        yield ""
+        shown = [one for one in result.jobs if is_long or one.change is not Change.SAME]
+        yield f"{len(result.jobs)} figures over recordings, {len(shown)} changed: mean change for the worse"
+        cells = [
+            (one.metric, one.job, one.harm.num_pairs, *map(_shown, (one.harm.mean, one.harm.low, one.harm.high)))
+            for one in shown
+        ]
+        yield from table(("figure", "job", "recordings", "mean", "low", "high"), cells) if cells else ()
+    if result.differences:
+        yield ""
+        yield from table(("not alike", "before", "after"), [(name, *v) for name, v in result.differences.items()])
+    if result.baseline is not None:
+        yield f"wrote {result.baseline}"
+
+
+def _row(one: FigureChange) -> tuple[object, ...]:
+    where = "" if one.where is None else f"{one.where.time_s:.2f} s, {one.where}"
+    values = map(_shown, (one.before, one.after, one.allowed))
+    return one.metric, one.run, *values, one.unit, one.change, where
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6g}"
