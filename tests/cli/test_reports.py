@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 from junitparser import Error, Failure, JUnitXml, TestSuite
 
-from splatctrl_cli.cli import check
+from splatctrl_cli.cli import check, demo
 from splatctrl_cli.cli.commands import COMMANDS
+from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
+from splatctrl_cli.jobs.demo import DemoRequest, DemoResult, Told
 from tests.cli.here import splatctrl
 from tests.logs.make_log import LogRecipe, make_log
 
@@ -77,7 +79,10 @@ def test_a_verdict_is_a_suite_of_its_recording(log: Path, tmp_path: Path) -> Non
 def test_a_command_that_cannot_run_is_one_error(
     log: Path, tmp_path: Path, words: list[str], code: int, name: str, said: str
 ) -> None:
-    told = splatctrl(*[word.format(log=log) for word in words], f"--junit={tmp_path / 'j.xml'}")
+    words = [word.format(log=log) for word in words]
+    told = splatctrl(*words, "--junit", tmp_path / "j.xml")
+    splatctrl(*words, f"--junit={tmp_path / 'same.xml'}")
+    assert [case.name for case in suite_in(tmp_path / "same.xml")] == [name]
     (case,) = suite_in(tmp_path / "j.xml")
     (error,) = case.result
     assert (told.returncode, case.name, type(error)) == (code, name, Error)
@@ -140,6 +145,24 @@ def test_on_github_a_command_annotates_and_sums_up_and_its_json_is_whole(
     assert told.stderr.splitlines()[1].startswith("::error title=check%3A wrong usage (error)::check: unrecognized")
     assert "did you mean --quick?" in (tmp_path / "summary.md").read_text()
     assert splatctrl("info", log, "--quik").stderr.count("\n") == 1, "it judges nothing"
+
+
+def test_a_demo_tells_of_itself_and_not_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = Reason(criterion="clearance", outcome=Outcome.FAILED, sentence="too near")
+    whole = Reason(criterion="replay", outcome=Outcome.PASSED, sentence="expected 'failed', got 'failed'")
+
+    def one_step(request: DemoRequest, progress: object, told: Told) -> DemoResult:
+        told(verdict_of("replay", [step]), request.out)  # type: ignore[arg-type]
+        return DemoResult(out=request.out, verdict=verdict_of("demo", [whole]), seconds=1.0, pictures={})
+
+    monkeypatch.setattr(demo, "demo", one_step)
+    monkeypatch.setattr(demo, "_show", lambda console, verdict: console.concluded(verdict, {}, ()))
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
+    told = splatctrl("demo", "-o", tmp_path / "out", "--junit", tmp_path / "j.xml")
+    assert (told.returncode, "::error" in told.stderr) == (0, False)
+    assert [case.name for case in suite_in(tmp_path / "j.xml")] == ["replay"]
+    assert (tmp_path / "summary.md").read_text().count("###") == 1
 
 
 def test_a_summary_that_cannot_be_written_is_said_and_changes_nothing(

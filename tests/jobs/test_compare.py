@@ -229,6 +229,15 @@ def test_over_eight_recordings_the_interval_of_the_mean_decides(
         assert "95 % interval 0.004 to 0.004" in result.verdict.decisive[0].sentence
 
 
+def test_a_figure_that_one_recording_lost_is_a_regression_whatever_the_mean(audit: Path, tmp_path: Path) -> None:
+    recordings: dict[str, dict[str, float | None]] = {f"r{i}": {} for i in range(9)}
+    old = batch_of(tmp_path / "old", audit, recordings)
+    result = compared(old, batch_of(tmp_path / "new", audit, recordings | {"r8": {"min_clearance": None}}))
+    (reason,) = result.verdict.decisive
+    assert (reason.criterion, reason.who) == ("min_clearance of r8/audit", "r8")
+    assert [one.harm.num_pairs for one in result.jobs if one.metric == "min_clearance"] == [8]
+
+
 def test_over_seven_recordings_each_is_judged_alone(audit: Path, tmp_path: Path) -> None:
     old = batch_of(tmp_path / "old", audit, {f"r{i}": {} for i in range(7)})
     new = batch_of(
