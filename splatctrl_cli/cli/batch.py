@@ -14,9 +14,18 @@ from splatctrl_cli.cli.commands import build_parser
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.cli.parser import Parser
+from splatctrl_cli.cli.reports import publish
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.jobs.batches.batch import BatchRequest, BatchResult, batch, dry_run, node_document, planned
+from splatctrl_cli.jobs.batches.batch import (
+    BatchRequest,
+    BatchResult,
+    batch,
+    dry_run,
+    node_document,
+    planned,
+    suites_of,
+)
 from splatctrl_cli.jobs.batches.graph import Parsed
 from splatctrl_cli.jobs.batches.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
@@ -28,7 +37,7 @@ OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    console = Console(args)
+    console = Console(args, is_step=True)  # it tells CI of every recording itself
     workers = args.workers or os.cpu_count() or 1
     request = request_of(BatchRequest, args, workers=workers)
     command_line = OfThisProgram(threads=max((os.cpu_count() or 1) // workers, 1))
@@ -48,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
         "kept": result.num_kept,
         "nodes": [node_document(run) for run in result.runs],
     }
-    return console.concluded(result.verdict, printed, _lines(result))
+    code = console.concluded(result.verdict, printed, _lines(result))
+    publish(suites_of(result), junit=args.junit, is_fatal=code != 0)
+    return code
 
 
 class OfThisProgram:

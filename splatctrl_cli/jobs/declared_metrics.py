@@ -4,6 +4,7 @@ from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 
+from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.evaluate import field_accuracy, score_report
 from splatctrl_cli.evaluate.field_truth import FIELDS
 from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
@@ -44,7 +45,7 @@ def scales() -> Mapping[str, Mapping[str, Scale]]:
     replay: dict[str, Scale] = {}
     for mode in MODES:
         replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, baselines=BASELINES, has_twists=True)
-    bands = [field_accuracy.band_name(lower, upper) for lower, upper in field_accuracy.BANDS]
+    bands = [field_accuracy.band_name(lower, upper) for lower, upper in BANDS]
     return {
         "reconstruct": reconstruct_gaussians.GATED | reconstruct_verdict.GATED,
         "sdf-bake": bake.SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS, bands),

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from junitparser import JUnitXml
 
 from splatctrl_cli.cli.main import main
 from tests.conftest import ROOT
@@ -79,3 +80,20 @@ def test_what_cannot_run_is_said_in_a_line(
     assert main(["batch", *place, *words]) == code
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
+
+
+def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    suite, junit = tmp_path / "nightly.toml", tmp_path / "nightly.xml"
+    suite.write_text(SUITE + "[jobs.scene]\ncommand = 'reconstruct'\nurdf = 'missing.urdf'\n")
+    (tmp_path / "missing.urdf").touch()
+    (tmp_path / "damaged.mcap").write_bytes(b"not a log")
+    assert main(["batch", str(suite), "--junit", str(junit), "-q"]) == 1
+    found = {each.name: {case.classname: case for case in each} for each in JUnitXml.fromfile(str(junit))}
+    assert set(found) == {"good", "damaged"}
+    assert {name: [type(result).__name__ for result in case.result] for name, case in found["damaged"].items()} == {
+        "damaged/info": [],
+        "damaged/ingest": ["Error"],
+        "damaged/scene": ["Skipped"],
+    }
+    assert found["good"]["good/ingest"].is_passed
+    assert "missing.urdf" in found["good"]["good/scene"].result[0].text

@@ -5,19 +5,24 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import write_durably, write_json
 from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of
 from splatctrl_cli.jobs.batches.keys import keys_of
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
-from splatctrl_cli.jobs.batches.run import DONE, ERROR, SKIPPED, Scheduler, local_executor, told
-from splatctrl_cli.jobs.batches.suite import Suite, read_suite
+from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Scheduler, local_executor, told, verdict_in
+from splatctrl_cli.jobs.batches.suite import Suite as Asked
+from splatctrl_cli.jobs.batches.suite import read_suite
+from splatctrl_cli.jobs.batches.task import last_lines
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.libraries import distributed
+from splatctrl_cli.report.suites import Case, Kind, Suite, cases_of, error_case, skipped_case
 
 CONNECT_S = 10.0  # to a scheduler
 FORMAT, VERSION = "splatctrl-batch", 1
@@ -70,7 +75,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
     return BatchResult(out=out, suite=suite.name, runs=runs, num_kept=scheduler.num_kept, verdict=verdict)
 
 
-def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Suite, list[Node], Path]:
+def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], Path]:
     """The suite, its nodes after those they need, and where they write."""
     suite = read_suite(request.suite, COMMANDS)
     out = (request.out or suite.out).absolute()
@@ -125,6 +130,35 @@ def _reason(run: Run) -> Reason:
         remedy="" if run.state in (DONE, SKIPPED) else f"see {run.log}",
         count=1,
     )
+
+
+def suites_of(result: BatchResult) -> list[Suite]:
+    """What CI systems are told: a suite for each recording, with the cases of its nodes."""
+    suites = []
+    for recording in dict.fromkeys(run.recording for run in result.runs):
+        runs = [run for run in result.runs if run.recording == recording]
+        began = datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds")
+        cases = [case for run in runs for case in _cases_of(run, result.out)]
+        properties = {"splatctrl": __version__, "batch": result.suite}
+        seconds = sum(run.seconds for run in runs)
+        suites.append(Suite(name=recording, cases=cases, properties=properties, started=began, seconds=seconds))
+    return suites
+
+
+def _cases_of(run: Run, out: Path) -> list[Case]:
+    if run.state == SKIPPED:
+        return [skipped_case(run.node, run.cause)]
+    if run.state == ERROR:
+        said = run.cause or run.sentence or f"exit {run.exit_code}"
+        lines = "\n".join([said, *last_lines(out / run.log)])
+        return [error_case(run.node, lines, exit_code=run.exit_code or 70)]
+    verdict = verdict_in(out / run.result)
+    if run.state == FAILED:
+        wrong = Case(name="expected", group=run.node, kind=Kind.FAILED, sentence=told(run), text=str(_reason(run)))
+        return [wrong, *(cases_of(verdict, run.node) if verdict and run.outcome != Outcome.PASSED else [])]
+    if not verdict:
+        return [Case(name=run.command, group=run.node, kind=Kind.PASSED)]
+    return cases_of(verdict, run.node, expected=run.outcome)
 
 
 def write_batch(out: Path, suite: str, runs: Any) -> None:

@@ -134,7 +134,7 @@ class Scheduler:
 def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
     """What a run came to, by how it ended and what it printed."""
     place = folder / node.name
-    verdict = _verdict_of(Path(f"{place}.json")) if end.exit_code is not None else {}
+    verdict = verdict_in(Path(f"{place}.json")) if end.exit_code is not None else {}
     code, outcome, label = end.exit_code, verdict.get("outcome", ""), verdict.get("label", "")
     if not verdict and code in (0, 3):
         outcome, label = "passed", "done"
@@ -251,7 +251,8 @@ def _stands(node: Node, run: Run) -> bool:
     return node.out is None or run.stamp == stamp_of(node.out) != ""
 
 
-def _verdict_of(result: Path) -> dict[str, Any]:
+def verdict_in(result: Path) -> dict[str, Any]:
+    """The verdict in a command's JSON, empty where it has none."""
     with suppress(OSError, ValueError):
         document = json.loads(result.read_bytes())
         verdict = document.get("verdict") if isinstance(document, dict) else None

@@ -34,6 +34,7 @@ PART = ".part"  # ends the name of a result that is not whole
 _LAST = 4096  # bytes of a log that are looked at for its last lines
 _local = threading.local()  # a runner for each thread that has run a task
 _runners: list["subprocess.Popen[str]"] = []
+BY_THE_BATCH = ("GITHUB_ACTIONS", "GITHUB_STEP_SUMMARY")  # what a batch tells of, and its nodes do not
 WROTE = (0, 1, 3, 5)  # exit codes of a command that left its output
 
 
@@ -144,7 +145,8 @@ def last_lines(log: Path, number: int = 5) -> list[str]:
 
 def _started(entry: str) -> "subprocess.Popen[str]":
     words = [sys.executable, "-m", __name__, entry]
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    told = {name: value for name, value in os.environ.items() if name not in BY_THE_BATCH}
+    environment = {**told, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     pipe = subprocess.PIPE
     runner = subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, start_new_session=True, env=environment)
     _runners.append(runner)
