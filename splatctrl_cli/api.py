@@ -12,6 +12,7 @@ from splatctrl_cli.jobs.compare import CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.query import QueryRequest, QueryResult, query
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
@@ -34,6 +35,8 @@ __all__ = [
     "NotEvaluableError",
     "Outcome",
     "Progress",
+    "QueryRequest",
+    "QueryResult",
     "Reason",
     "ReconstructRequest",
     "ReconstructResult",
@@ -52,6 +55,7 @@ __all__ = [
     "export",
     "load_config",
     "open_to_train",
+    "query",
     "reconstruct",
     "replay",
     "score",

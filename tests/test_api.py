@@ -49,17 +49,19 @@ def test_the_examples_of_the_page_run_on_the_sample_data(
     scope: dict[str, object] = {}
     for example in examples:
         exec(compile(example, PAGE.name, "exec"), scope)
-    made, baked, exported, scored, found = (scope[name] for name in ("made", "baked", "exported", "scored", "found"))
-    since = scope["since"]
+    names = ("made", "baked", "answered", "exported", "scored", "found", "since")
+    made, baked, answered, exported, scored, found, since = (scope[name] for name in names)
     assert isinstance(since, api.CompareResult)
     assert (since.verdict.label, since.figures, dict(since.differences)) == ("no regression", (), {})
     assert isinstance(made, api.ReconstructResult)
     assert isinstance(baked, api.BakeResult)
+    assert isinstance(answered, api.QueryResult) and answered.metrics["num_answered"] == 2
     assert isinstance(exported, api.ExportResult)
     assert isinstance(scored, api.ScoreResult)
     assert isinstance(found, api.ReplayResult)
     assert made.verdict.outcome is scored.verdict.outcome is api.Outcome.PASSED
-    assert {path.name for path in (tmp_path / "api_output").iterdir()} == {
-        *("scene", "field", "objects.spz", "audit", "again", "baseline.toml"),
+    written = {path.name for path in (tmp_path / "api_output").iterdir()}
+    assert written == {
+        *("scene", "field", "points.csv", "answers.csv", "objects.spz", "audit", "again", "baseline.toml"),
     }
     assert str(found.verdict.label) in capsys.readouterr().out

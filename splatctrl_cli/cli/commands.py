@@ -25,7 +25,13 @@ from splatctrl_cli.cli.options import (
 )
 from splatctrl_cli.cli.parser import Options, Parser, real, whole
 from splatctrl_cli.cli.replay_options import replay_options
-from splatctrl_cli.cli.scene_options import export_options, reconstruct_options, score_options, sdf_bake_options
+from splatctrl_cli.cli.scene_options import (
+    export_options,
+    query_options,
+    reconstruct_options,
+    score_options,
+    sdf_bake_options,
+)
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
@@ -292,6 +298,15 @@ COMMANDS = {
         run="sdf_bake:run",
         judges=True,
         options=sdf_bake_options,
+    ),
+    "query": Command(
+        summary="answer points with distance, gradient, certified bound, collision probability and what is nearest",
+        examples=(
+            "query out/scene points.csv -o out/near.csv",
+            "query out/field points.csv --scene out/scene",
+        ),
+        run="query:run",
+        options=query_options,
     ),
     "score": Command(
         summary="compare renders of a scene with recorded views: PSNR, SSIM, depth error; or fit scans first (--fit)",

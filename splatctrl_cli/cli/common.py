@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from splatctrl_cli.cli.reports import reports_of
+from splatctrl_cli.cli.options import names_of
 from splatctrl_cli.evaluate.verdict import Verdict
+from splatctrl_cli.records import Label
 
 _NUMBER = re.compile(r"^[-+]?[\d.]|^(nan|-)$")
 
@@ -87,6 +89,12 @@ def long_table(header: Sequence[str], rows: Callable[[], Iterable[Sequence[objec
     yield line(header)
     yield "  ".join("-" * width for width in widths)
     yield from map(line, rows())
+
+
+def labels_of(text: str) -> frozenset[Label]:
+    """The labels in a field: objects, and those that ``--include`` names. Raises UsageError for another name."""
+    names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
+    return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
 
 
 def _plain(value: object) -> object:

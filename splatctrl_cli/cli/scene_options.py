@@ -1,4 +1,6 @@
-"""The options of the commands that make and judge scenes: ``reconstruct``, ``export``, ``sdf-bake``, ``score``."""
+"""The options of the commands that make and judge scenes: ``reconstruct``, ``export``, ``sdf-bake``, ``query``,
+``score``.
+"""
 
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from splatctrl_cli.cli.options import (
     add_output,
     add_scan,
     add_source,
+    add_threads,
 )
 from splatctrl_cli.cli.parser import MAX_SECONDS, Options, Parser, real, setting, whole, words
 from splatctrl_cli.config import FieldConfig, SceneConfig
@@ -111,6 +114,19 @@ def sdf_bake_options(add: Options, parser: Parser) -> None:
     more("--no-report", "draw no pictures")
     more("--update FIELD", "bake anew only what changed since that field folder was baked", Path)
     more("--previous-scene SCENE", "what --update's field was baked from (default: SCENE)", Path)
+
+
+def query_options(add: Options, parser: Parser) -> None:
+    add("SOURCE", "a folder that sdf-bake or reconstruct wrote, a field.npz, or a splats.ply", Path)
+    add("POINTS", "CSV file with columns x,y,z [m] in the world, with or without a header; - for stdin", Path)
+    add_output(add, "CSV file of the answers, in the order of the points", default="stdout, with --json none")
+    add("--scene SCENE", "what SOURCE, a field, was baked from: adds what a grid does not know", Path)
+    later = "of a scene: as known that long after its start"
+    add("--at SECONDS", later, real(-MAX_SECONDS, MAX_SECONDS, "s"))
+    add("--include NAME,...", "of a scene: labels that count beside object: robot, human, or none", str, "human")
+    add("--config FILE.toml", "configuration, see docs/config.md", Path)
+    add("--set SECTION.KEY=VALUE ...", "one setting, such as field.distance=hard")
+    add_threads(parser)
 
 
 def score_options(add: Options, parser: Parser) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.cli.common import Console, table
+from splatctrl_cli.cli.common import Console, labels_of, table
 from splatctrl_cli.cli.options import names_of, request_of
 from splatctrl_cli.config import load_config
 from splatctrl_cli.config.fixed import PROBABILITY_NEAR
@@ -16,7 +16,7 @@ from splatctrl_cli.field.baker import CHANNELS
 from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.jobs.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake_request import BakeRequest
-from splatctrl_cli.records import Box, Label
+from splatctrl_cli.records import Box
 
 SETTINGS = ("distance", "weights", "unknown", "probability", "voxel", "length_scale")  # of the field, as options
 ERRORS = ("mean", "rmse", "over_95", "over_max")
@@ -47,19 +47,13 @@ def _request(args: argparse.Namespace) -> BakeRequest:
         out=args.out or Path("field"),
         config=replace(config, field=replace(config.field, **given)),
         formats=names_of(args.formats, FORMATS, "--formats"),
-        labels=_labels_of(args.include),
+        labels=labels_of(args.include),
         box=None if args.box is None else Box.from_text(args.box),
         channels=None if args.channels is None else names_of(args.channels, CHANNELS, "--channels"),
         with_probability=args.probability is not None,
         held_out=log,
         held_out_cameras=cameras,
     )
-
-
-def _labels_of(text: str) -> frozenset[Label]:
-    """The labels in the field: objects, and those that --include names."""
-    names = () if text.strip() == "none" else names_of(text, ("robot", "human"), "--include")
-    return frozenset({Label.OBJECT, *(Label[name.upper()] for name in names)})
 
 
 def split_cameras(text: str) -> tuple[Path, tuple[str, ...]]:

@@ -60,7 +60,7 @@ def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -
         names = ", ".join(label.name.lower() for label in sorted(labels))
         raise NotEvaluableError(
             f"splats: none of {len(splats)} is labelled {names}",
-            remedy="give a scene that has some; sdf-bake --include takes other labels",
+            remedy="give a scene that has some; --include takes other labels",
         )
     return kept
 

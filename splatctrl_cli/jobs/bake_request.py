@@ -159,9 +159,8 @@ def read_previous(path: Path, scene: Path) -> Previous:
             f"{run.get('command')} of {run.get('splatctrl')}",
             remedy="bake it once without --update",
         )
-    return Previous(
-        path=path, grid=grid, run=run, source=_its_source(path, grid, scene), digests={str(file): sha256(file)}
-    )
+    source = source_of_grid(f"--update {path}", grid, scene)
+    return Previous(path=path, grid=grid, run=run, source=source, digests={str(file): sha256(file)})
 
 
 def check_same(
@@ -198,8 +197,10 @@ def _run_of(folder: Path) -> dict[str, Any]:
     return run
 
 
-def _its_source(path: Path, grid: DistanceGrid, scene: Path) -> BakeSource:
-    """The splats of `scene` at the field's time. Raises UsageError where they are not those it was baked from."""
+def source_of_grid(where: str, grid: DistanceGrid, scene: Path) -> BakeSource:
+    """The splats of `scene` at the grid's time. Raises UsageError, beginning with `where`, where they are not those
+    that it was baked from.
+    """
     digests, stamp_ns = grid.header.get("digests"), grid.header.get("stamp_ns")
     wanted = next(iter(digests.values()), None) if isinstance(digests, dict) else None
     source = read_bake_source(scene, None)
@@ -208,9 +209,10 @@ def _its_source(path: Path, grid: DistanceGrid, scene: Path) -> BakeSource:
         if snapshots and stamp_ns >= snapshots[0].stamp_ns:
             source = read_bake_source(scene, (stamp_ns - snapshots[0].stamp_ns) * 1e-9)
     if next(iter(source.digests.values())) != wanted:
+        option = "--previous-scene" if where.startswith("--update") else "--scene"
         raise UsageError(
-            f"--update {path}: was not baked from the splats of {scene}",
-            remedy="give the scene that it was baked from as --previous-scene",
+            f"{where}: was not baked from the splats of {scene}",
+            remedy=f"give the scene that it was baked from as {option}",
         )
     return source
 

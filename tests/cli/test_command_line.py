@@ -63,6 +63,7 @@ class Work:
             "reconstruct": [self.log, "--cameras", "cam0", *QUICK],
             "export": [scene],
             "sdf-bake": [scene, "--voxel", "0.5", "--set", "field.max_loss=1"],
+            "query": [scene, self.folder / "points.csv"],
             "score": [scene, "--reference", self.log, "--cameras", "cam1", "--threads", "1"],
             "robot": ["spheres", "--urdf", urdf],
             "replay": [self.log, "--scene", scene, "--urdf", urdf, "--max-unknown", "1"],
@@ -77,6 +78,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Work:
     """A log of two cameras, its scene, and a two-joint arm whose joints are in the log."""
     work = Work(tmp_path_factory.mktemp("work"))
     write_capture(work.folder / "x.capture", open_source(make_log(work.log, LogRecipe(cameras=("cam0", "cam1")))))
+    (work.folder / "points.csv").write_text("x,y,z\n0,0,1\n")
     (work.folder / "robot.urdf").write_text(ARM.format("joint_a", "joint_b"))
     done = splatctrl(*work.arguments("reconstruct", work.folder / "scene"), "-q")
     assert done.returncode == 0, done.stderr
@@ -162,11 +164,12 @@ def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, comma
 
 
 @pytest.mark.parametrize(
-    "command", ["ingest", "info", "check", "reconstruct", "export", "sdf-bake", "score", "replay", "demo"]
+    "command", ["ingest", "info", "check", "reconstruct", "export", "sdf-bake", "query", "score", "replay", "demo"]
 )
 def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command: str) -> None:
     absent = tmp_path / "absent"
     arguments: dict[str, Sequence[object]] = {
+        "query": (absent, work.folder / "points.csv"),
         "score": (absent, "--reference", work.log),
         "replay": (absent, "--scene", work.folder / "scene", "--urdf", work.folder / "robot.urdf"),
         "demo": ("--data", absent),
@@ -176,7 +179,7 @@ def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command
     assert not list(tmp_path.iterdir())
 
 
-FILE_WRITERS = ("export", "robot", "capture")  # the others write a folder
+FILE_WRITERS = ("export", "query", "robot", "capture")  # the others write a folder
 
 
 @pytest.mark.parametrize("command", WRITERS)
@@ -211,7 +214,7 @@ def test_an_output_below_a_file_cannot_be_written(work: Work, tmp_path: Path, co
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.parametrize("command", ["export", "sdf-bake", "score", "replay"])
+@pytest.mark.parametrize("command", ["export", "sdf-bake", "query", "score", "replay"])
 def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path: Path, command: str) -> None:
     more = ["--report-only"] if command == "replay" else []
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--json", *more)

@@ -131,6 +131,25 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--at 3", 2, "is one splat set"),
         ("--truth truth.json", 2, "expected both or neither"),
     ],
+    "query": [
+        ("scene", 2, "required: POINTS; see splatctrl query --help"),
+        ("scene none.csv", 4, "none.csv: no such file; give a CSV file with the columns x,y,z"),
+        (
+            "scene f.csv",
+            4,
+            "f.csv: no column x: expected a header with x, y and z, or three numbers a line, got 'a,b'",
+        ),
+        ("scene far.csv", 4, "far.csv: line 3: column x: expected a finite number up to 1e+06 m, got 'nan'"),
+        ("scene log.mcap", 4, "log.mcap: no UTF-8 text"),
+        ("notes.txt far.csv", 4, "notes.txt: "),
+        ("log.mcap far.csv", 4, "log.mcap: "),
+        ("empty far.csv", 4, "empty: expected a scene folder with splats.ply and run.json"),
+        ("scene far.csv --scene scene", 2, "--scene: belongs to a field, and scene is a scene"),
+        ("scene far.csv --include cat", 2, "--include cat: expected some of: robot, human"),
+        ("scene far.csv --set field.unknown=obstacle", 2, "field.unknown = obstacle: only a baked field has it"),
+        ("robot.ply far.csv", 5, "none of 3 is labelled object, human"),
+        ("scene far.csv -o taken.ply", 2, "taken.ply: already exists; give --force"),
+    ],
     "score": [
         ("a --reference b --thread 3", 2, "--thread 3; did you mean --threads?"),
         ("a --refrence b", 2, "--refrence; did you mean --reference?"),
@@ -270,6 +289,7 @@ TEXTS = {
     "c.toml": "[[waypoint]]\njoints = [1, 2]",
     "d.toml": "",
     "f.csv": "a,b\n1,2\n",
+    "far.csv": "x,y,z\n1,2,3\nnan,2,3\n",
     "g.csv": "x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,a\n",
 }
 
