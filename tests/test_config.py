@@ -63,6 +63,10 @@ def test_what_cannot_be_is_named(assignment: str, words: str) -> None:
     assert words in str(refused.value)
 
 
+def test_a_word_that_toml_takes_for_a_number_is_a_word() -> None:
+    assert load_config(None, ["field.unknown=nan"]).field.unknown == "nan"
+
+
 def test_an_unknown_key_that_is_near_none_is_told_a_few_of_the_known() -> None:
     with pytest.raises(UsageError) as refused:
         load_config(None, ["scene.zzz=9"])

@@ -180,6 +180,12 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
+def _config(add: Options, parser: Parser) -> None:
+    add("FILE", "a TOML file as --config takes it; one with a wrong key or value is refused", Path, nargs="?")
+    add("--set SECTION.KEY=VALUE ...", "one setting")
+    add("--template", "print a file to begin with: every default, commented out, with its meaning and range")
+
+
 def _demo(add: Options, parser: Parser) -> None:
     add("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data)", Path)
     add_output(add, "folder for everything the demo makes", default="demo_output")
@@ -369,6 +375,12 @@ COMMANDS = {
                 options=_robot_info,
             ),
         },
+    ),
+    "config": Command(
+        summary="print every setting with its value and where that comes from, check a file of them, or begin one",
+        examples=("config my.toml --set scene.max_splats=3000", "config --template > my.toml"),
+        run="config:run",
+        options=_config,
     ),
     "demo": Command(
         summary="run the main job on a sample recording, with pictures",

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 import tomllib
 import types
 import typing
@@ -59,6 +60,15 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
     return replace(default, **{name: replace(getattr(default, name), **values) for name, values in given.items()})
 
 
+def sources_of(path: Path | None, assignments: Sequence[str]) -> dict[str, str]:
+    """Which of the file and ``--set`` gives each ``section.key`` that either gives. Raises as `load_config`."""
+    return {
+        f"{section}.{key}": "--set" if where.startswith("--set ") else where
+        for where, section, values in _tables(path, assignments)
+        for key in values
+    }
+
+
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Where it is given, the section, and values by key."""
     for section, values in ({} if path is None else _read_toml(path)).items():
@@ -105,7 +115,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file", remedy="give --config an existing TOML file") from None
+        raise InputError(f"{path}: no such file", remedy="give an existing TOML file") from None
     except ValueError as error:  # no TOML, no UTF-8, or an integer of thousands of digits
         raise UsageError(f"{path}: not valid TOML: {error}") from None
 
@@ -137,6 +147,8 @@ def _options(hint: Any) -> tuple[Any, ...]:
 def _of_type(value: Any, hint: Any) -> Any:
     """The value, an integer as a float and a list as a tuple where the type asks for these."""
     options = _options(hint)
+    if str in options and isinstance(value, float) and math.isnan(value):
+        return "nan"  # a word here, which TOML takes for a number
     if isinstance(value, list) and tuple[float, ...] in options:
         numbers = tuple(_of_type(item, float) for item in value)
         return numbers if all(type(number) is float for number in numbers) else value

@@ -131,6 +131,13 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--at 3", 2, "is one splat set"),
         ("--truth truth.json", 2, "expected both or neither"),
     ],
+    "config": [
+        ("none.toml", 4, "none.toml: no such file; give an existing TOML file"),
+        ("bad.toml", 2, "bad.toml: not valid TOML"),
+        ("odd.toml", 2, "odd.toml: unknown key contrl; did you mean control?"),
+        ("misspelt.toml", 2, "misspelt.toml: unknown key scene.max_splat; did you mean scene.max_splats?"),
+        ("--set scene.fill=2", 2, "scene.fill: expected 0.001 to 1, got 2"),
+    ],
     "query": [
         ("scene", 2, "required: POINTS; see splatctrl query --help"),
         ("scene none.csv", 4, "none.csv: no such file; give a CSV file with the columns x,y,z"),
@@ -283,6 +290,7 @@ TEXTS = {
     "ball.yaml": "collision_spheres: {tip: [{center: [0, 0, 0], radius: 0.05}]}",
     "taken.ply": "taken",
     "bad.toml": "[scene\n",
+    "misspelt.toml": "[scene]\nmax_splat = 3\n",
     "odd.toml": "[contrl]\nmargin = 0.1\n",
     "a.toml": "waypoint = 3",
     "b.toml": "[[waypoint]]\npose = [1, 2]",

@@ -1,0 +1,99 @@
+"""Every key of the configuration with its value and where that comes from, as TOML that ``--config`` takes."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from splatctrl_cli.config import Config, load_config, sources_of
+from splatctrl_cli.config.ranges import Declared
+from splatctrl_cli.control.printed_program import with_preset
+
+DEFAULT, PRESET = "default", "control.preset"
+
+Value = int | float | str | tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """A key with its value; source: `DEFAULT`, the file's name, ``--set``, or `PRESET` (applied by replay)."""
+
+    section: str
+    key: str
+    value: Value
+    default: Value
+    source: str
+    declared: Declared
+
+    @property
+    def name(self) -> str:
+        """``section.key``."""
+        return f"{self.section}.{self.key}"
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return {
+            "value": self.value,
+            "default": self.default,
+            "source": self.source,
+            "expected": self.declared.expected,
+            "meaning": self.declared.reason,
+        }
+
+
+def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Setting, ...]:
+    """All keys as a run would use them: defaults, then the file, then each assignment, then the preset.
+
+    Raises as `load_config`.
+    """
+    given, default = load_config(path, assignments), Config()
+    used, sources = with_preset(given), sources_of(path, assignments)
+    settings = []
+    for section in fields(Config):
+        kind = getattr(default, section.name)
+        for key, declared in kind.declared.items():
+            before, value = (getattr(getattr(config, section.name), key) for config in (given, used))
+            source = sources.get(f"{section.name}.{key}", DEFAULT) if value == before else PRESET
+            settings.append(
+                Setting(
+                    section=section.name,
+                    key=key,
+                    value=value,
+                    default=getattr(kind, key),
+                    source=source,
+                    declared=declared,
+                )
+            )
+    return tuple(settings)
+
+
+def toml_of(settings: Sequence[Setting]) -> Iterator[str]:
+    """Lines of a TOML file with every key; beside what is not the default, where it comes from and the default."""
+    for section, setting in _with_sections(settings):
+        yield from section
+        changed = f"  # {setting.source} (default: {toml_value(setting.default)})"
+        yield f"{setting.key} = {toml_value(setting.value)}" + ("" if setting.source == DEFAULT else changed)
+
+
+def template_of(settings: Sequence[Setting]) -> Iterator[str]:
+    """Lines of a TOML file that sets nothing: every default as a comment, below its meaning and what it may be."""
+    for section, setting in _with_sections(settings):
+        yield from section
+        yield f"# {setting.declared.reason}; {setting.declared.expected}"
+        yield f"# {setting.key} = {toml_value(setting.default)}"
+
+
+def toml_value(value: Value) -> str:
+    """A value as TOML writes it."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(repr, value))}]"
+    return json.dumps(value) if isinstance(value, str) else repr(value)
+
+
+def _with_sections(settings: Sequence[Setting]) -> Iterator[tuple[list[str], Setting]]:
+    """Each setting, with the heading of its section before the first."""
+    before = ""
+    for setting in settings:
+        blank = [""] if before else []
+        yield ([*blank, f"[{setting.section}]"] if setting.section != before else []), setting
+        before = setting.section
