@@ -36,6 +36,7 @@ from splatctrl_cli.cli.scene_options import (
 EXIT_CODES = """\
 exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 3 done, but part of the input was
 damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug; 130 interrupted"""
+SHELLS = ("bash", "zsh", "tcsh")  # as shtab has them, which is not imported for a help text
 QUICK = 30  # images of a topic
 LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yaml"  # of examples
 
@@ -184,6 +185,10 @@ def _config(add: Options, parser: Parser) -> None:
     add("FILE", "a TOML file as --config takes it; one with a wrong key or value is refused", Path, nargs="?")
     add("--set SECTION.KEY=VALUE ...", "one setting")
     add("--template", "print a file to begin with: every default, commented out, with its meaning and range")
+
+
+def _completion(add: Options, parser: Parser) -> None:
+    add("SHELL", "whose script", SHELLS)
 
 
 def _demo(add: Options, parser: Parser) -> None:
@@ -378,9 +383,15 @@ COMMANDS = {
     ),
     "config": Command(
         summary="print every setting with its value and where that comes from, check a file of them, or begin one",
-        examples=("config my.toml --set scene.max_splats=3000", "config --template > my.toml"),
+        examples=("config my.toml --set scene.max_splats=3000", "config --template"),
         run="config:run",
         options=_config,
+    ),
+    "completion": Command(
+        summary="print a script by which a shell completes commands, options and files",
+        examples=("completion bash", "completion zsh"),
+        run="completion:run",
+        options=_completion,
     ),
     "demo": Command(
         summary="run the main job on a sample recording, with pictures",

@@ -131,6 +131,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--at 3", 2, "is one splat set"),
         ("--truth truth.json", 2, "expected both or neither"),
     ],
+    "completion": [("fish", 2, "invalid choice: 'fish' (choose from"), ("", 2, "required: SHELL")],
     "config": [
         ("none.toml", 4, "none.toml: no such file; give an existing TOML file"),
         ("bad.toml", 2, "bad.toml: not valid TOML"),
