@@ -185,6 +185,7 @@ def _config(add: Options, parser: Parser) -> None:
     add("FILE", "a TOML file as --config takes it; one with a wrong key or value is refused", Path, nargs="?")
     add("--set SECTION.KEY=VALUE ...", "one setting")
     add("--template", "print a file to begin with: every default, commented out, with its meaning and range")
+    add("--schema", "print the JSON Schema of what every command prints with --json")
 
 
 def _completion(add: Options, parser: Parser) -> None:

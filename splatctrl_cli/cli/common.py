@@ -7,8 +7,9 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from splatctrl_cli.cli.reports import reports_of
+from splatctrl_cli.cli.envelope import enveloped
 from splatctrl_cli.cli.options import names_of
+from splatctrl_cli.cli.reports import reports_of
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.records import Label
 
@@ -21,6 +22,7 @@ class Console:
     """
 
     def __init__(self, args: argparse.Namespace, *, is_step: bool = False) -> None:
+        self._args = args
         self.is_json = bool(args.json)
         self.is_quiet = bool(args.quiet)
         self.reports = reports_of(args) if hasattr(args, "junit") and not is_step else None
@@ -30,10 +32,12 @@ class Console:
         if not self.is_quiet:
             print(line, file=sys.stderr, flush=True)
 
-    def result(self, result: Mapping[str, Any], lines: Iterable[str]) -> None:
-        """The command's result: `result` as JSON with --json, else `lines`."""
+    def result(self, result: Mapping[str, Any], lines: Iterable[str], *, code: int = 0) -> None:
+        """The command's result, which ends with exit code `code`: `result` as JSON with --json, else `lines`."""
         if self.is_json:
-            print(json.dumps(result, indent=2, allow_nan=False, default=_plain))
+            text = json.dumps(enveloped(result, code), indent=2, allow_nan=False, default=_plain)
+            self._args.is_printed = True
+            print(text)
         else:
             for line in lines:
                 print(line)
@@ -52,7 +56,7 @@ class Console:
         """
         code = verdict.exit_code if code is None else code
         if self.is_json:
-            self.result({"exit_code": code, "verdict": verdict.as_dict(), **result}, ())
+            self.result({"verdict": verdict.as_dict(), **result}, (), code=code)
         else:
             print(verdict.sentence)
             for reason in () if has_findings else verdict.decisive[1:10]:  # --json and summary.json have all

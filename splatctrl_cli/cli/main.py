@@ -3,16 +3,19 @@
 import argparse
 import errno
 import io
+import json
 import os
 import stat
 import sys
 import time
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from splatctrl_cli.cli.commands import build_parser, function_of, judges
+from splatctrl_cli.cli.envelope import enveloped
 from splatctrl_cli.cli.reports import tell_of_failure
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
@@ -53,39 +56,50 @@ def _run(argv: Sequence[str] | None) -> int:
         sys.stderr.close()
         return 0
     except (Exception, KeyboardInterrupt) as error:
-        if args is not None and args.verbose:
-            traceback.print_exception(error)
-        line, code = _line_and_code(error)
-        print(f"splatctrl: {line}", file=sys.stderr)
+        is_json = "--json" in words and not hasattr(args, "is_printed")
+        line, code = _fail(error, is_json=is_json, is_verbose=args is not None and args.verbose > 0)
         if judges(words):
             tell_of_failure(words, args, line, code, start)
         return code
 
 
-def _line_and_code(error: BaseException) -> tuple[str, int]:
-    """What a person is told of an error, in one line, and the exit code."""
+def _fail(error: BaseException, *, is_json: bool, is_verbose: bool) -> tuple[str, int]:
+    """Say an error in a line on stderr, with --json as an object on stdout; that line, and the exit code."""
+    message, remedy, code = _told(error)
+    if is_verbose:
+        traceback.print_exception(error)
+    line = " ".join((f"{message}; {remedy}" if remedy else message).split())
+    print(f"splatctrl: {line}", file=sys.stderr)
+    if is_json and not isinstance(sys.stdout, _Lost):
+        with suppress(OSError):  # the refusal says more than that it could not be printed
+            print(
+                json.dumps(enveloped({"error": {"message": message, "remedy": remedy}}, code), indent=2), flush=True
+            )
+    return line, code
+
+
+def _told(error: BaseException) -> tuple[str, str, int]:
+    """What an error comes to: a message, a remedy and the exit code."""
     match error:
         case SplatCtrlError():
-            line, code = str(error), error.exit_code
+            return error.message, error.remedy, error.exit_code
         case KeyboardInterrupt():
-            line, code = str(error) or "interrupted", 130
+            message, _, remedy = (str(error) or "interrupted").partition("; ")
+            return message, remedy, 130
+        case OSError() if is_write_failure(error):
+            return f"{error.filename or 'output'}: writing failed: {error.strerror or error}", "make room", 6
         case OSError():
-            is_write = is_write_failure(error)
-            does = "writing failed" if is_write else "cannot be read"
-            remedy = "make room" if is_write else "check the path and its permissions"
-            name = error.filename or ("output" if is_write else "input")
-            line, code = f"{name}: {does}: {error.strerror or error}; {remedy}", 6 if is_write else 4
+            what = f"{error.filename or 'input'}: cannot be read: {error.strerror or error}"
+            return what, "check the path and its permissions", 4
         case MemoryError():
-            line = "input: asks for more memory than there is; is it damaged, or too large for this machine"
-            code = 4
+            return "input: asks for more memory than there is", "is it damaged, or too large for this machine", 4
         case UnicodeEncodeError():  # names of files are bytes to Linux
             name = error.object[max(error.start - 40, 0) : error.end + 40]
-            line, code = f"input: the name in {name!a} is not UTF-8 text; give the file another name", 4
+            return f"input: the name in {name!a} is not UTF-8 text", "give the file another name", 4
         case RecursionError():
-            line, code = "input: nested too deeply to be read; is it damaged", 4
+            return "input: nested too deeply to be read", "is it damaged", 4
         case _:
-            line, code = f"internal error: {type(error).__name__}: {error}; please report it", 70
-    return " ".join(line.split()), code
+            return f"internal error: {type(error).__name__}: {error}", "please report it", 70
 
 
 class _Lost(io.TextIOBase):

@@ -61,7 +61,7 @@ def show_ingested(console: Console, result: IngestResult) -> int:
     lines += [f"{name.replace('_', ' ')}: {value}" for name, value in lost.items() if value and name != "notes"]
     lines += [f"note: {note}" for note in lost["notes"]]
     lines += [f"joint states: {result.summary.num_joint_states}", f"wrote {result.capture}"]
-    console.result({"capture": str(result.capture), **result.metrics}, lines)
+    console.result({"capture": str(result.capture), **result.metrics}, lines, code=result.exit_code)
     return result.exit_code
 
 
@@ -72,8 +72,9 @@ def run_info(args: argparse.Namespace) -> int:
 
 def show_described(console: Console, summary: Summary) -> int:
     """Facts and tables, and what a reconstruction lacks."""
-    console.result(summary.as_dict(), _described(summary))
-    return DAMAGED if summary.damaged else 0
+    code = DAMAGED if summary.damaged else 0
+    console.result(summary.as_dict(), _described(summary), code=code)
+    return code
 
 
 def _described(summary: Summary) -> Iterator[str]:

@@ -1,16 +1,21 @@
 """The command line in this process: what one of its own would print and return, without the wait for its start."""
 
+import json
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import IO
+from typing import IO, Any
 
 import pytest
+from jsonschema import Draft202012Validator
 
+from splatctrl_cli.cli.envelope import SCHEMA_FILE
 from splatctrl_cli.cli.main import main
+
+OUTPUT = Draft202012Validator(json.loads(SCHEMA_FILE.read_text(encoding="utf-8")))
 
 
 def splatctrl(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -26,7 +31,17 @@ def splatctrl(*arguments: object) -> subprocess.CompletedProcess[str]:
             patch.setattr(sys, "stderr", err)
             code = main(words)
         texts = [_text(out), _text(err)]
+    if "--json" in words:
+        checked(texts[0], code)
     return subprocess.CompletedProcess(words, code, *texts)
+
+
+def checked(stdout: str, code: int) -> dict[str, Any]:
+    """The one object of ``--json``, which is as the published schema says."""
+    found: dict[str, Any] = json.loads(stdout)
+    OUTPUT.validate(found)
+    assert found["exit_code"] == code
+    return found
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 Each subcommand runs as a process of its own in some tests; what only asks for another line of it runs in this one.
 """
 
-import json
 import os
 import re
 import shlex
@@ -220,8 +219,37 @@ def test_what_reconstruct_wrote_is_taken_by_the_next_steps(work: Work, tmp_path:
     more = ["--report-only"] if command == "replay" else []
     done = splatctrl(*work.arguments(command, tmp_path / "out"), "--json", *more)
     assert done.returncode == 0, done.stderr
-    assert isinstance(json.loads(done.stdout), dict)
+    here.checked(done.stdout, 0)
     assert (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["simulate", "ingest", "reconstruct", "robot", "capture"])
+def test_what_a_command_prints_as_json_is_as_the_schema_says(work: Work, tmp_path: Path, command: str) -> None:
+    done = here.splatctrl(*work.arguments(command, tmp_path / "out"), "--json", "-q")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "info {log}",
+        "check {log}",
+        "config",
+        "config --schema",
+        "completion bash",
+        "robot info --urdf {urdf}",
+    ],
+)
+def test_what_is_only_printed_is_as_the_schema_says(work: Work, words: str) -> None:
+    done = here.splatctrl(*words.format(log=work.log, urdf=work.folder / "robot.urdf").split(), "--json", "-q")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_failed_gate_is_an_object_with_its_verdict(work: Work, tmp_path: Path) -> None:
+    done = here.splatctrl(
+        *work.arguments("reconstruct", tmp_path / "scene"), "-q", "--json", "--require", "splats>1000000"
+    )
+    assert done.returncode == 1 and here.checked(done.stdout, 1)["verdict"]["outcome"] == "failed"
 
 
 def test_an_interrupted_run_is_exit_130_and_leaves_only_what_is_partial(sample_data: Path, tmp_path: Path) -> None:
@@ -259,6 +287,13 @@ def test_a_failed_gate_is_exit_1_and_keeps_the_output(work: Work, tmp_path: Path
     assert (tmp_path / "scene" / "run.json").is_file()
 
 
+def test_our_own_bug_is_an_object_too(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(sys.modules, "splatctrl_cli.cli.config", None)  # importing it fails
+    assert main(["config", "--json"]) == 70
+    found = here.checked(capsys.readouterr().out, 70)
+    assert found["error"]["message"].startswith("internal error: ") and found["error"]["remedy"] == "please report it"
+
+
 def test_an_error_with_v_shows_where_it_came_from(tmp_path: Path) -> None:
     done = splatctrl("info", tmp_path / "absent", "-v")
     assert done.returncode == 4
@@ -277,6 +312,10 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         (">&-", ["info", "{log}"], 6, "splatctrl: stdout: closed, so the result was not printed"),
         (">&-", ["info", "absent"], 4, "splatctrl: absent: no such file"),
+        (">&-", ["info", "absent", "--json"], 4, "splatctrl: absent: no such file"),
+        (">&-", ["info", "{log}", "--json"], 6, "splatctrl: stdout: closed, so the result was not printed"),
+        (">/dev/full", ["info", "absent", "--json"], 4, "splatctrl: absent: no such file"),
+        (">/dev/full", ["info", "{log}", "--json"], 6, "splatctrl: output: writing failed: No space left"),
         ("2>&-", ["info", "absent"], 4, ""),
         ("<&- >&- 2>&-", ["info", "{log}"], 6, ""),
     ],

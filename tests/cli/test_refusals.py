@@ -347,3 +347,24 @@ def test_what_cannot_be_done_is_one_line_with_its_code_and_leaves_nothing(
     lines = [line for line in done.stderr.splitlines() if line.startswith("splatctrl: ")]
     assert len(lines) == 1 and said in lines[0], done.stderr
     assert contents(world) == before
+
+
+@pytest.mark.usefixtures("coverage_once")
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        *((f"{command} {rows[0][0]}".strip(), *rows[0][1:]) for command, rows in REFUSED.items() if rows[0][0]),
+        ("query scene far.csv", 4, "far.csv: line 3"),
+        ("scor", 2, "did you mean score?"),
+        ("query robot.ply far.csv", 5, "none of 3 is labelled"),
+    ],
+)
+def test_with_json_a_refusal_is_an_object_too(
+    world: Path, monkeypatch: pytest.MonkeyPatch, words: str, code: int, said: str
+) -> None:
+    monkeypatch.chdir(world)
+    done = here.splatctrl(*shlex.split(words), "--json")
+    error = here.checked(done.stdout, code)["error"]
+    told = f"{error['message']}; {error['remedy']}" if error["remedy"] else error["message"]
+    assert said in " ".join(told.split())
+    assert done.stderr.splitlines()[-1] == f"splatctrl: {' '.join(told.split())}"

@@ -17,6 +17,7 @@ from splatctrl_cli.jobs import score_fit
 from splatctrl_cli.jobs.reconstruct import ReconstructResult
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult
 from splatctrl_cli.records import LossReport
+from tests.cli import here
 from tests.datasets.make_idr import half_size
 from tests.jobs.wall import FRAMES, FakeScene, FakeSource, set_up, write_scene
 
@@ -83,7 +84,8 @@ def test_a_scene_that_cannot_be_compared_prints_one_line(
     set_up(monkeypatch, FakeScene(), FakeSource(frames=FRAMES[:2]))
     assert run(scored, "--json") == 5
     done = capsys.readouterr()
-    assert done.out == "" and len(done.err.splitlines()) == 1
+    assert "no view of cam3 to score" in here.checked(done.out, 5)["error"]["message"]
+    assert len(done.err.splitlines()) == 1
 
 
 HOLDOUT = ("--protocol", "holdout:0")
