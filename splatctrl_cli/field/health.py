@@ -57,12 +57,12 @@ def _warnings(
     if radius < spacing / np.sqrt(2):
         yield (
             f"radius {radius * 1e3:.1f} mm is below spacing / sqrt 2 = {spacing / np.sqrt(2) * 1e3:.1f} mm: "
-            "the exact field's surface has holes between splats"
+            "the exact field's surface has holes between splats; reconstruct with more splats (--max-splats)"
         )
     if kernels and spacing > length:
         yield (
             f"spacing {spacing * 1e3:.1f} mm exceeds the length scale {length * 1e3:.1f} mm: "
-            "the kernel field does not join neighbouring splats"
+            "the kernel field does not join neighbouring splats; give a larger --length-scale, or more splats"
         )
     if "gpdf" in kernels and zero_level - radius > length:
         yield (
@@ -76,19 +76,19 @@ def _set_warnings(
 ) -> Iterable[str]:
     extent = float(np.ptp(centers.astype(np.float64), axis=0).max())
     if len(centers) > 1 and extent == 0.0:
-        yield f"all {len(centers)} splats stand at one place: the field is that of the largest"
+        yield f"all {len(centers)} splats stand at one place: the field is that of the largest; check the file"
     elif has_kernel and len(centers) > 1 and length > extent:
         yield (
             f"the length scale {length:g} m exceeds the extent of the splats, {extent:.3g} m: "
-            "the kernel field cannot tell them apart"
+            "the kernel field cannot tell them apart; give a smaller --length-scale"
         )
     if has_kernel and length >= ROUGH_LENGTH:
-        yield f"the length scale {length:g} m is so large that rounding shows in the kernel fields"
+        yield f"the length scale {length:g} m is so large that rounding shows in the fields; give a smaller one"
     thick = radii[radii > 0]
     if len(thick) and thick.max() > MAX_RADIUS_SPREAD * thick.min():
         yield (
             f"radii from {thick.min() * 1e3:.3g} to {thick.max() * 1e3:.3g} mm in one set: "
-            "the median radius and its ratios stand for neither end"
+            "the median radius and its ratios stand for neither end; check the splats' unit, metres"
         )
 
 

@@ -14,7 +14,7 @@ from splatctrl_cli.field.grid_cells import GridLayout, check_room
 from splatctrl_cli.field.slabs import Kept, UnknownSpace, baked_planes, bytes_per_cell, check_slab_memory, slabs
 from splatctrl_cli.grid_files.grid_formats import FORMATS
 from splatctrl_cli.grid_files.grid_slabs import GridSlabs, SlabPlan, resume_slabs, start_slabs
-from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.progress import Progress, Wait
 
 FOLDER = "channels"
 CHECKPOINT = f"{FOLDER}/progress.json"
@@ -57,6 +57,7 @@ def bake_to_disk(task: BakeTask, partial: Path, progress: Progress, *, resume: b
     if store.num_layers:
         progress.log(f"{partial}: continues after {store.num_layers} of {layout.shape[0]} planes")
         _set_counts(task, store.counts)
+    wait = Wait(progress, "bakes", "planes", layout.shape[0])
     hidden = True if progress.is_quiet else None
     with tqdm(total=layout.shape[0], initial=store.num_layers, unit=" planes", disable=hidden) as bar:
         for first, last in slabs(layout, baker.channels, store.num_layers):
@@ -65,6 +66,8 @@ def bake_to_disk(task: BakeTask, partial: Path, progress: Progress, *, resume: b
                 planes = task.unknown.apply(planes, first, last, baker.bound_margin)
             store.write(planes, _counts_now(task))
             bar.update(last - first)
+            if bar.disable:
+                wait.at(last)
     return store
 
 

@@ -1,7 +1,10 @@
 """What a job says while it works."""
 
 import sys
-from typing import Protocol
+import time
+from typing import Protocol, Self
+
+TELL_S = 10.0  # between two lines of one wait
 
 
 class Progress(Protocol):
@@ -35,3 +38,45 @@ class Lines:
 
 
 SILENT = Silent()
+
+
+class Wait:
+    """A wait of many steps, announced before it begins; then, while it lasts, how far it is and about how long still.
+
+    total: None where nobody knows how many steps there will be.
+    """
+
+    def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
+        self._progress, self._what, self._unit, self._total = progress, what, unit, total
+        self._begun = self._told = time.monotonic()
+        self._done = 0
+
+    def announce(self) -> Self:
+        """Say what begins, and how long it is."""
+        self._progress.log(self._what + ("" if self._total is None else f": {self._total} {self._unit}"))
+        return self
+
+    def step(self) -> None:
+        """One more step is done."""
+        self.at(self._done + 1)
+
+    def at(self, done: int, more: str = "", *, is_told: bool = False) -> None:
+        """`done` steps are; it is said with `more` where the last line is `TELL_S` ago, or `is_told` asks for it."""
+        self._done, now = done, time.monotonic()
+        if self._total is not None and done > self._total:
+            return  # of what comes after it
+        if not is_told and now - self._told < TELL_S:
+            return
+        self._told, left = now, ""
+        if self._total is not None and done:
+            left = f", about {duration((now - self._begun) * (self._total - done) / done)} left"
+        of = "" if self._total is None else f" of {self._total}"
+        self._progress.log(f"{self._what}: {done}{of} {self._unit}{more}{left if done != self._total else ''}")
+
+
+def duration(seconds: float) -> str:
+    """Seconds as a person says them: 40 s, 6 min, 1 h 20 min."""
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{max(round(seconds), 1)} s"
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

@@ -21,7 +21,7 @@ from splatctrl_cli.files.point_table import point_blocks
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.jobs.bake_request import BakeSource, read_bake_source, source_of_grid
 from splatctrl_cli.jobs.point_answers import TITLES, Answers, GridAnswers, SceneAnswers, rows_of
-from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, DistanceGrid, Float64, Label
 from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.voxels import VoxelState
@@ -180,9 +180,12 @@ def _blocks(points: Path | TextIO, progress: Progress) -> Iterator[Float64]:
     size = points.stat().st_size
     text = TextIOWrapper(raw, encoding="utf-8", newline="")
     with text, tqdm(total=size, unit="B", unit_scale=True, disable=hidden) as bar:
+        wait = Wait(progress, f"answers {points}", "bytes", size)
         for block in point_blocks(text, str(points)):
             yield block
             bar.update(raw.tell() - bar.n)
+            if bar.disable:
+                wait.at(raw.tell())
 
 
 class _Figures:

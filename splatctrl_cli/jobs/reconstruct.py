@@ -58,7 +58,10 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
             fitted.finish()
         for table, index in declared.unused():
             if table == "carried":
-                progress.log(f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it")
+                progress.log(
+                    f"warning: {request.declare}: [[carried]] {index + 1}: no pixel of any frame needed it; check its"
+                    " link and box, or leave it out"
+                )
         made = Reconstructed(
             metrics=fitted.metrics(),
             rows=fitted.rows,
@@ -142,5 +145,8 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         progress.log(f"warning: {doubt}")
     if model.surface.by_spheres:
         links = ", ".join(model.surface.by_spheres)
-        progress.log(f"warning: spheres stand for {links}: their collision geometry is missing or cannot be read")
+        progress.log(
+            f"warning: spheres stand for {links}: their collision geometry is missing or cannot be read; correct the"
+            " paths of the URDF's meshes"
+        )
     return model

@@ -12,7 +12,7 @@ from splatctrl_cli.evaluate.metrics import DESCRIBES
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path
-from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, written_run
 from splatctrl_cli.jobs.reconstruct_verdict import GATED as SPLATS_GATED
 from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
@@ -47,7 +47,8 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
         with stopwatch.stage("fit"):
             fitter = GaussianFitter(config, workspace, frames, seed=request.seed, threads=request.threads)
             progress.log(f"{len(fitter.arrays)} Gaussians seeded, extent of the scene {fitter.extent:.3f} m")
-            fitter.fit(_audit(partial / "audit.jsonl", rows, progress))
+            wait = Wait(progress, f"fits {len(frames)} views", "iterations", config.gaussians.iterations).announce()
+            fitter.fit(_audit(partial / "audit.jsonl", rows, wait))
         with stopwatch.stage("write"):
             comments = {"format": FORMAT, "source": source.name}
             write_gaussian_ply(partial / "splats.ply", fitter.gaussians(), comments)
@@ -96,7 +97,7 @@ def _frames(source: RecordSource) -> list[RgbdFrame]:
     return frames
 
 
-def _audit(path: Path, rows: list[GaussianAuditRow], progress: Progress) -> Callable[[GaussianAuditRow], None]:
+def _audit(path: Path, rows: list[GaussianAuditRow], wait: Wait) -> Callable[[GaussianAuditRow], None]:
     """Keeps every row, writes it to `path`, and says how far it is."""
 
     def audit(row: GaussianAuditRow) -> None:
@@ -105,7 +106,7 @@ def _audit(path: Path, rows: list[GaussianAuditRow], progress: Progress) -> Call
             stream.write(json.dumps(asdict(row)) + "\n")
         quality = "nothing of the workspace in view" if row.psnr is None else f"{row.psnr:.1f} dB"
         full = f", {row.unmet} more had no room (gaussians.max_gaussians)" if row.unmet else ""
-        progress.log(f"iteration {row.iteration}: {row.gaussians} Gaussians, {quality}{full}")
+        wait.at(row.iteration, f", {row.gaussians} Gaussians, {quality}{full}", is_told=True)
 
     return audit
 

@@ -13,7 +13,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
-from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.progress import Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -167,9 +167,13 @@ class Reconstruction:
                 self.fitter.plant(self.cloud)
         elif not self.source.has_clock and self.fitter.num_steps == 1:
             console.log(
-                "warning: more views than fit in one time step: the last are refined on, the others only seed splats"
+                "warning: more views than fit in one time step: the last are refined on, the others only seed splats;"
+                " leave views out, or reconstruct them in parts"
             )
         self._check_cameras(step, console)
+        if not self.source.has_clock and not self.fitter.num_steps:
+            what, scene = f"fits {len(step.frames)} views, seeds first", self.config.scene
+            self.fitter.descent.heard = Wait(console, what, "iterations", scene.first_iterations).announce().step
         self._keep_first_frames(step)
         posture = self._posture(step)
         row = self.fitter.step(step.frames, posture)
@@ -203,7 +207,7 @@ class Reconstruction:
                 raise InputError(
                     line, remedy=f"{CAUSES}: correct poses or depth,{others} or give --allow-disagreement"
                 )
-            console.log(f"warning: {line}")
+            console.log(f"warning: {line}; {CAUSES}: correct poses or depth, or expect surfaces twice")
 
     def _keep_first_frames(self, step: TimeStep) -> None:
         for frame in step.frames:
@@ -227,8 +231,10 @@ class Reconstruction:
     def _refine(self, fitter: SceneFitter, console: Progress) -> None:
         total = self.config.scene.refine_iterations
 
+        wait = Wait(console, "refines", "iterations", total).announce()
+        fitter.descent.heard = wait.step
+
         def progress(done: int) -> None:
-            console.log(f"refined {done} of {total} iterations")
             self._save_if_due()
 
         self._record(fitter.refine(total, progress))

@@ -120,7 +120,7 @@ def score_fits(request: FitRequest, progress: Progress = SILENT) -> ScoreResult:
             made = {}
             for method, about in METHODS.items():
                 progress.log(f"{scan}: fits {about.name}, {request.iterations} iterations")
-                made[method] = _reconstruct(request, scoring, method, folder / scan / method / "scene")
+                made[method] = _reconstruct(request, scoring, method, folder / scan / method / "scene", progress)
             # scored after both were fitted: what scoring leaves in memory then counts for neither
             for method, (scene, memory) in made.items():
                 kept = None if request.out is None else folder / scan / method / "score"
@@ -194,7 +194,7 @@ def _scoring(request: FitRequest, scan: str) -> ScoreRequest:
 
 
 def _reconstruct(
-    request: FitRequest, scoring: ScoreRequest, method: str, out: Path
+    request: FitRequest, scoring: ScoreRequest, method: str, out: Path, progress: Progress
 ) -> tuple[ReconstructResult, float | None]:
     """The scene of one method, and the peak memory [MiB] of this process during the fit, None where the system does
     not tell. Raises InputError with what it says where it does not end well.
@@ -207,7 +207,7 @@ def _reconstruct(
     try:
         source = open_to_train(replace(scoring.recording, options=options, masks=None))
         config, seed, threads = _config(request), request.seed, request.threads
-        made = run(ReconstructRequest(source=source, out=out, config=config, seed=seed, threads=threads))
+        made = run(ReconstructRequest(source=source, out=out, config=config, seed=seed, threads=threads), progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt from None  # its message would name --resume, which score does not have
     except SplatCtrlError as error:

@@ -12,7 +12,7 @@ from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
 from splatctrl_cli.evaluate.score_doubts import Doubts
 from splatctrl_cli.evaluate.views import View, seen_pixels, views_to_score
 from splatctrl_cli.files.output import Stopwatch
-from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.progress import Progress, Wait
 from splatctrl_cli.jobs.score_reference import Reference
 from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
@@ -76,6 +76,7 @@ class Scorer:
             numbered_by_stamp=self.reference.numbered_by_stamp,
         )
         may_train = self.allow_training or self.reference.scores_training
+        wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
         doubts = Doubts(is_still=not has_clock, may_train=may_train, mask_rule=self.reference.mask_rule)
         for view in views:
             if view.frame.stamp_ns in scene.training_stamps_ns and not may_train:
@@ -90,8 +91,7 @@ class Scorer:
             with stopwatch.stage("score"):
                 splats = splats_at(stamps[num_known - 1] if has_clock and self.newest else None)
                 self._score_one(scores, doubts, view, splats)
-            if len(scores.views) % 20 == 0:
-                progress.log(f"scored {len(scores.views)} views")
+            wait.at(len(scores.views))
         self._check(scores)
         scores.doubts += [*self.reference.doubts, *doubts.lines()]
         return scores

@@ -103,7 +103,11 @@ class Declarations:
 
 def carried_words(entry: Mapping[str, Any]) -> str:
     """One of `Declarations.carried_uses` in words, a warning where nothing used it."""
-    used = f"{entry['num_uses']} points" if entry["num_uses"] else "warning: no pixel of any frame needed it"
+    used = (
+        f"{entry['num_uses']} points"
+        if entry["num_uses"]
+        else "warning: no pixel of any frame needed it; check link and box"
+    )
     return f"{entry['link']} carries a box from {entry['start']:g} to {entry['end']:g} s: {used}"
 
 

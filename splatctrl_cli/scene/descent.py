@@ -1,6 +1,6 @@
 """The descent of the loss of eq. 4: renders the splats of a buffer and moves their parameters."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -24,12 +24,13 @@ from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 class Descent:
     """The optimiser of a buffer's M splats; noise is drawn from the seed and the number of the iteration.
 
-    background: the colour behind the splats, None until it is chosen.
+    background: the colour behind the splats, None until it is chosen. heard: called after each iteration.
     """
 
     def __init__(self, config: SceneConfig, buffer: SplatBuffer, seed: int, num_threads: int) -> None:
         self.num_iterations = 0
         self.background: Color | None = None
+        self.heard: Callable[[], None] = lambda: None
         self._config, self._buffer, self._seed, self._num_threads = config, buffer, seed, num_threads
         self._raster = Rasteriser(num_threads)
         self._loss = ImageLoss(num_threads)
@@ -48,6 +49,7 @@ class Descent:
                 self._raster, self._gradients, self._buffer.parameters, self._buffer.moments, settings, step_seed
             )
             self.num_iterations += 1
+            self.heard()
         return terms
 
     def planes(self, view: View) -> Float32:

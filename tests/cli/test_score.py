@@ -85,7 +85,7 @@ def test_a_scene_that_cannot_be_compared_prints_one_line(
     assert run(scored, "--json") == 5
     done = capsys.readouterr()
     assert "no view of cam3 to score" in here.checked(done.out, 5)["error"]["message"]
-    assert len(done.err.splitlines()) == 1
+    assert len([line for line in done.err.splitlines() if line.startswith("splatctrl: ")]) == 1
 
 
 HOLDOUT = ("--protocol", "holdout:0")
@@ -216,7 +216,7 @@ def test_the_mean_is_over_the_scans(
         (tmp_path / "Rectified" / f"{scan}_train").mkdir(parents=True)
     psnr = {("scan1", "3dgs"): 20.0, ("scan1", "budget"): 21.0, ("scan2", "3dgs"): 30.0, ("scan2", "budget"): 32.5}
 
-    def reconstruct(request: Any, scoring: ScoreRequest, method: str, out: Path) -> Any:
+    def reconstruct(request: Any, scoring: ScoreRequest, method: str, out: Path, *_: Any) -> Any:
         metrics = {"splats": 100, "iterations": 5}
         verdict = verdict_of("reconstruct", [])
         scene = ReconstructResult(out=out, metrics=metrics, verdict=verdict, removed={}, seconds={"fit": 3.0})
@@ -260,7 +260,7 @@ def test_what_reconstruct_refuses_is_passed_on(
 def test_an_interrupted_fit_does_not_promise_to_go_on(
     sample_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(request: Any) -> Any:
+    def interrupted(request: Any, progress: Any) -> Any:
         raise KeyboardInterrupt("go on with the same command and --resume")
 
     monkeypatch.setattr(score_fit, "reconstruct_gaussians", interrupted)
@@ -271,7 +271,7 @@ def test_an_interrupted_fit_does_not_promise_to_go_on(
 def test_a_fit_whose_verdict_does_not_pass_is_not_scored(
     sample_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def damaged(request: Any) -> ReconstructResult:
+    def damaged(request: Any, progress: Any) -> ReconstructResult:
         verdict = verdict_of("reconstruct", [noted("x", "y")], scope="7 views", is_damaged=True)
         return ReconstructResult(out=request.out, metrics={}, verdict=verdict, removed={}, seconds={})
 

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.batches.graph import Node
 from splatctrl_cli.jobs.batches.keys import keys_of
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
 from splatctrl_cli.jobs.batches.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
-from splatctrl_cli.jobs.progress import Progress
+from splatctrl_cli.jobs.progress import Progress, duration
 
 DONE, FAILED, ERROR, SKIPPED = "done", "failed", "error", "skipped"
 NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
@@ -232,7 +232,7 @@ class _Clock:
         if not rest or not seen:
             return ""
         seconds = rest * sum(seen) / len(seen) / min(self._slots, rest)
-        return f", about {seconds:.0f} s left" if seconds < 90 else f", about {seconds / 60:.0f} min left"
+        return f", about {duration(seconds)} left"
 
 
 def _end_of(future: "Future[End]") -> End:

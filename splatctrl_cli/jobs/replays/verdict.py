@@ -66,11 +66,14 @@ def _declared_notes(judged: Judged) -> list[str]:
     declared, notes = judged.inputs.declared, []
     for index, entry in enumerate(declared.expected_contact):
         num = declared.num_uses.get(("expected_contact", index), 0)
-        used = f"{num} times" if num else "warning: not used by any state"
+        used = f"{num} times" if num else "warning: not used by any state; check its links and times, or leave it out"
         notes.append(f"contact of {entry.link} declared ({entry.reason}): {used}")
     of_map = judged.inputs.scene.figures().get("carried", [])
     notes += [carried_words(made) for made in of_map]
     for given in declared.carried_uses():
         if not any(given | {"num_uses": 0} == made | {"num_uses": 0} for made in of_map):
-            notes.append(f"{given['link']} carries a box: warning: the map was made without this declaration")
+            notes.append(
+                f"{given['link']} carries a box: warning: the map was made without this declaration; give reconstruct"
+                " the same --declare"
+            )
     return notes
