@@ -71,7 +71,7 @@ def export_options(add: Options, parser: Parser) -> None:
 
 
 def sdf_bake_options(add: Options, parser: Parser) -> None:
-    add("SCENE", "a folder that reconstruct wrote, or a splats.ply", Path)
+    add("SCENE", "a folder that reconstruct wrote, or a file of round splats: .ply, .splat, .spz", Path)
     add_output(add, "folder to write: the grid, field.json, report/, run.json", default="field")
     later = "the scene as known that long after its start"
     add("--at SECONDS", later, real(-MAX_SECONDS, MAX_SECONDS, "s"))
@@ -117,7 +117,7 @@ def sdf_bake_options(add: Options, parser: Parser) -> None:
 
 
 def query_options(add: Options, parser: Parser) -> None:
-    add("SOURCE", "a folder that sdf-bake or reconstruct wrote, a field.npz, or a splats.ply", Path)
+    add("SOURCE", "a folder that sdf-bake or reconstruct wrote, a field.npz, or a file of round splats", Path)
     add("POINTS", "CSV file with columns x,y,z [m] in the world, with or without a header; - for stdin", Path)
     add_output(add, "CSV file of the answers, in the order of the points", default="stdout, with --json none")
     add("--scene SCENE", "what SOURCE, a field, was baked from: adds what a grid does not know", Path)
@@ -130,7 +130,7 @@ def query_options(add: Options, parser: Parser) -> None:
 
 
 def score_options(add: Options, parser: Parser) -> None:
-    scenes = "a folder that reconstruct wrote, or one of such folders, named like the scans of --dtu"
+    scenes = "a folder that reconstruct wrote, one of such folders, named like the scans of --dtu, or a splat file"
     add("SCENE", scenes, Path, nargs="?")
     either = add.either(required=True)
     either("--reference PATH", "a log, a capture, or an image folder's TOML", Path)

@@ -18,7 +18,7 @@ from splatctrl_cli.files.output import sha256
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.records import Box, DistanceGrid, Label, SplatSet
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
-from splatctrl_cli.splat_files.splats import read_world_splats
+from splatctrl_cli.splat_files.splat_formats import read_spheres
 from splatctrl_cli.voxels import Balls, OccupancyGrid
 
 NOT_COMPARED = ("voxel", "padding", "max_loss")  # voxel is compared with the grid's; the others change no cell
@@ -96,7 +96,7 @@ def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
         return _read_folder(path, at_seconds)
     if at_seconds is not None:
         raise UsageError(f"--at {at_seconds:g}: {path} is one splat set", remedy="give the scene's folder")
-    return BakeSource(splats=read_world_splats(path), digests={path.name: sha256(path)})
+    return BakeSource(splats=read_spheres(path), digests={path.name: sha256(path)})
 
 
 def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:

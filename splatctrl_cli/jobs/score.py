@@ -39,7 +39,8 @@ from splatctrl_cli.jobs.score_views import Ranked, Scorer, Scores
 from splatctrl_cli.records import Label
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture
 from splatctrl_cli.report.view_picture import view_picture
-from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene, run_value
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, run_value
+from splatctrl_cli.scene_files.splat_file import open_splats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,12 +135,17 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
     if folder:
         folder.mkdir(exist_ok=True)
     lpips = None if request.lpips is None else Lpips(request.lpips)
-    scene = open_scene(request.scene)
+    scene = open_splats(request.scene)
     if scene.is_anisotropic:
         scene.gaussians()  # either raises where there is none to compare
     else:
         field_splats(scene.splats())
     reference = open_reference(recording, progress)
+    if request.cloud is not None and not scene.names_its_views:
+        raise UsageError(
+            f"--cloud: the surface is looked at from the views that trained, which {request.scene} does not name",
+            remedy="leave it out, or give a folder that reconstruct wrote",
+        )
     cloud = None if request.cloud is None else request.cloud.of_scan(reference.scan)
     wanted, allow_training = recording.options.cameras, request.allow_training
     scorer = Scorer(
@@ -173,7 +179,8 @@ def score_scene(request: ScoreRequest, folder: Path | None, progress: Progress) 
         with stopwatch.stage("pictures"):
             _draw_extremes(folder, {} if request.images == "none" else scores.extremes)
         config = {"cameras": report["cameras"], "snapshots": report["snapshots"], "protocol": protocol}
-        inputs = {**digests, "scene/splats.ply": sha256(request.scene / "splats.ply")}
+        made = request.scene if request.scene.is_file() else request.scene / "splats.ply"
+        inputs = {**digests, f"scene/{made.name}": sha256(made)}
         write_result(folder, result, config=config, inputs=inputs, stopwatch=stopwatch)
     return result
 

@@ -145,7 +145,7 @@ def cameras_to_score(
 
 def check_training(path: Path, scene: SceneFolder, reference: Reference) -> None:
     """Raise UsageError where the scene at `path` was not trained on the views that the protocol trains on."""
-    if reference.protocol is None or reference.split is None:
+    if reference.protocol is None or reference.split is None or not scene.names_its_views:
         return
     trained, expected = scene.training_stamps_ns, reference.training_stamps_ns
     if trained == expected:

@@ -94,6 +94,11 @@ class Scorer:
             wait.at(len(scores.views))
         self._check(scores)
         scores.doubts += [*self.reference.doubts, *doubts.lines()]
+        if not scene.names_its_views:
+            scores.doubts.append(
+                f"{scene.path}: does not say which views trained it, and figures of training views say nothing about"
+                " others; give the --cameras that did not train"
+            )
         return scores
 
     def _check(self, scores: Scores) -> None:
@@ -104,7 +109,8 @@ class Scorer:
                 " scene",
                 remedy="give the recording that the scene was reconstructed from, or other --cameras",
             )
-        if self.reference.has_depth and not any(view.seen.share for view in scores.views):
+        has_training = self.scene.names_its_views
+        if has_training and self.reference.has_depth and not any(view.seen.share for view in scores.views):
             raise NotEvaluableError(
                 f"{where}: no pixel of {cameras} was seen by a training camera ({', '.join(self.scene.cameras)})",
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",

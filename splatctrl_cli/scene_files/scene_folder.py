@@ -149,6 +149,11 @@ class SceneFolder:
         return self._metric("cameras", _names)
 
     @property
+    def names_its_views(self) -> bool:
+        """Whether it is recorded which views trained the scene."""
+        return True
+
+    @property
     def training_stamps_ns(self) -> frozenset[int]:
         """The views that trained a scene without a clock, by their made-up stamps."""
         return self._metric("training_stamps_ns", frozenset[int], ())

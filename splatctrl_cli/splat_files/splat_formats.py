@@ -1,6 +1,7 @@
 """The files that hold splats, by suffix: what any of them holds, read or described."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,15 @@ from splatctrl_cli.records import GaussianSet, Label, SplatSet
 from splatctrl_cli.splat_files import splats
 from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY, gaussians_of
 from splatctrl_cli.splat_files.splat_format import Comments, SplatFormat
-from splatctrl_cli.splat_files.splats import as_gaussians, as_splats, is_isotropic
+from splatctrl_cli.splat_files.splats import (
+    as_gaussians,
+    as_splats,
+    check_world,
+    is_isotropic,
+    read_world_splats,
+)
 
-__all__ = ["FORMATS", "REFERENCE_PLY", "SplatFormat", "describe_splats", "format_of", "read_splats"]
+__all__ = ["FORMATS", "REFERENCE_PLY", "SplatFormat", "describe_splats", "format_of", "read_spheres", "read_splats"]
 
 FORMATS: Mapping[str, SplatFormat] = {kind.suffix: kind for kind in entries_of(__package__, SplatFormat)}
 
@@ -46,6 +53,20 @@ def read_splats(path: Path) -> tuple[SplatSet | GaussianSet, Comments]:
     if splats.num_stretched(ply) == 0 and not has_rest:
         return splats.splats_of(ply), ply.pairs()
     return gaussians_of(ply), ply.pairs()
+
+
+def read_spheres(path: Path) -> SplatSet:
+    """The splats of a file of any format as spheres in the world, which have distances; harmonics above the constant
+    one are only colour and are left out. Raises InputError as `read_splats`, and for splats that are not
+    round, in another unit or another frame.
+    """
+    if (path.suffix.lower() or ".ply") == ".ply":
+        return read_world_splats(path)
+    found, comments = read_splats(path)
+    check_world(path, comments)
+    if isinstance(found, SplatSet):
+        return found
+    return as_splats(replace(found, harmonics=found.harmonics[:, :1]), str(path))
 
 
 def describe_splats(path: Path, _head: bytes) -> Summary:

@@ -129,6 +129,12 @@ def read_world_splats(path: Path) -> SplatSet:
     file whose comments name other units or another frame; one that names none is taken at its word.
     """
     splats, comments = read_ply(path)
+    check_world(path, comments)
+    return splats
+
+
+def check_world(path: Path, comments: Mapping[str, str]) -> None:
+    """Raise InputError for comments that name other units than metres or another frame than the world."""
     for key, known in (("units", METRES), ("frame", ("world",))):
         said = comments.get(key)
         if said is not None and said.lower() not in known:
@@ -136,7 +142,6 @@ def read_world_splats(path: Path) -> SplatSet:
                 f"{path}: comment '{key}: {said}': expected {known[0]}",
                 remedy="distances are in metres in the world: transform the splats, and correct the comment",
             )
-    return splats
 
 
 def splats_of(ply: PlyFile) -> SplatSet:
@@ -145,7 +150,8 @@ def splats_of(ply: PlyFile) -> SplatSet:
     if num := num_stretched(ply):
         raise InputError(
             f"{path}: expected isotropic splats (three equal scale_*), got {num} of {len(ply)} whose scales differ",
-            remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set",
+            remedy="distances are defined on spheres: 'splatctrl export --isotropic' writes the nearest such set;"
+            " score renders them as they are",
         )
     splats = SplatSet(
         centers=np.column_stack([ply.column(name) for name in "xyz"]).astype(np.float32),

@@ -76,6 +76,7 @@ class FakeScene:
     snapshots: tuple[FakeSnapshot, ...] = (FakeSnapshot(stamp_ns=SECOND), FakeSnapshot(stamp_ns=2 * SECOND))
     training_stamps_ns: frozenset[int] = frozenset()
     is_anisotropic: bool = False
+    names_its_views: bool = True
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     run: dict[str, Any] = field(default_factory=lambda: {"config": {"occupancy": {"free_below": 0.3}}})
 
@@ -110,5 +111,5 @@ def write_scene(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def set_up(monkeypatch: pytest.MonkeyPatch, scene: FakeScene, recording: FakeSource) -> None:
     """Every scene is `scene`, and every recording `recording`."""
-    monkeypatch.setattr(score, "open_scene", lambda path: scene)
+    monkeypatch.setattr(score, "open_splats", lambda path: scene)
     monkeypatch.setattr(score_reference, "open_source", lambda path, options: recording)
