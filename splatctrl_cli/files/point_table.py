@@ -7,8 +7,9 @@ from typing import TextIO
 
 import numpy as np
 
+from splatctrl_cli.config.ranges import MAX_PLACE
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.records import MAX_PLACE, Float64
+from splatctrl_cli.records import Float64
 
 AXES = ("x", "y", "z")
 POINTS_PER_BLOCK = 1 << 15

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import Config
+from splatctrl_cli.config.fixed import MARCH_STEPS
 from splatctrl_cli.control.audit import observed_lookup
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.field.clustered_splats import Spheres
-from splatctrl_cli.field.distance import MARCH_STEPS, SphereField, field_over, march
+from splatctrl_cli.field.distance import SphereField, field_over, march
 from splatctrl_cli.field.grid_field import GridField
 from splatctrl_cli.field.obstacles import ObstacleSpheres
 from splatctrl_cli.field.probability import make_probability
