@@ -17,7 +17,9 @@ from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
+from splatctrl_cli.jobs.report import ReportRequest, ReportResult, report
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.view import ViewRequest, ViewResult, view
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 
@@ -43,12 +45,16 @@ __all__ = [
     "RecordingRequest",
     "ReplayRequest",
     "ReplayResult",
+    "ReportRequest",
+    "ReportResult",
     "ScoreRequest",
     "ScoreResult",
     "SourceOptions",
     "SplatCtrlError",
     "UsageError",
     "Verdict",
+    "ViewRequest",
+    "ViewResult",
     "WriteError",
     "bake",
     "compare",
@@ -58,5 +64,7 @@ __all__ = [
     "query",
     "reconstruct",
     "replay",
+    "report",
     "score",
+    "view",
 ]

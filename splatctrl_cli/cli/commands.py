@@ -25,6 +25,7 @@ from splatctrl_cli.cli.options import (
 )
 from splatctrl_cli.cli.parser import Options, Parser, real, whole
 from splatctrl_cli.cli.replay_options import replay_options
+from splatctrl_cli.cli.report_options import report_options, view_options
 from splatctrl_cli.cli.scene_options import (
     export_options,
     query_options,
@@ -353,6 +354,18 @@ COMMANDS = {
         run="compare:run",
         judges=True,
         options=_compare,
+    ),
+    "report": Command(
+        summary="write one HTML file on a run or a batch: verdict, timelines, worst moments, scenes in 3-D",
+        examples=("report out/audit", "report out/batch --changes changes.json -o report.html"),
+        run="report:run",
+        options=report_options,
+    ),
+    "view": Command(
+        summary="show a replay, scene, field or splats in 3-D in a browser",
+        examples=("view out/audit", "view out/scene --no-open -o scene.html"),
+        run="report:run_view",
+        options=view_options,
     ),
     "robot": Command(
         summary="fit and measure a robot's collision spheres, list its self-collision pairs and limits",

@@ -1,0 +1,281 @@
+"""A report from its request to its page: one run, or every job of a batch, in one file that opens from disk."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from splatctrl_cli.errors import InputError, SplatCtrlError
+from splatctrl_cli.files.output import output_path
+from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.reports.batch_folder import AS_EXPECTED, BatchFolder, Node, is_batch, open_batch
+from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, open_run
+from splatctrl_cli.jobs.reports.sections import section_of
+from splatctrl_cli.jobs.reports.spaces import space_of
+from splatctrl_cli.report.page import Cell, Page, Row, RunSection, Table, rendered
+from splatctrl_cli.report.viewer import packed
+
+MOST_SCENES = 6  # of a batch, without `all_scenes`
+PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]
+ID = "id"  # of a job, in a row of changes
+LOG_LINES = 12  # of a job that ended in an error
+WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportRequest:
+    """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
+
+    changes: a JSON list of objects, a row each, of what differs from a baseline; an `id` names a job of the batch.
+    roots: folders in which the scenes and robots of the runs' command lines are looked for. all_scenes: of a batch,
+    every scene in 3-D and not only the failed, changed and worst.
+    """
+
+    path: Path
+    out: Path | None = None
+    changes: Path | None = None
+    roots: tuple[Path, ...] = ()
+    all_scenes: bool = False
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportResult:
+    """The page: how many runs it tells of, how many of them in 3-D, and why others are not."""
+
+    file: Path
+    bytes: int
+    num_runs: int
+    num_scenes: int
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as --json has them."""
+        return asdict(self)
+
+
+def report(request: ReportRequest, progress: Progress = SILENT) -> ReportResult:
+    """Write the page. Raises InputError for a folder that is no run and no batch, that is not whole, or that a newer
+    version wrote.
+    """
+    changes = _changes(request.changes)
+    if is_batch(request.path):
+        page = _of_batch(request, open_batch(request.path), changes, progress)
+    else:
+        page = _of_run(request, open_run(request.path), changes)
+    out = request.out or beside(request.path)
+    with output_path(out, force=request.force, is_folder=False) as partial:
+        partial.write_text(rendered(page), encoding="utf-8")
+        size = partial.stat().st_size
+    return ReportResult(
+        file=out,
+        bytes=size,
+        num_runs=len(page.runs),
+        num_scenes=len(page.scenes),
+        notes=tuple(f"{run.title or run.anchor}: {run.no_space}" for run in page.runs if run.no_space),
+    )
+
+
+def beside(path: Path) -> Path:
+    """NAME.html for a folder or file."""
+    place = path.absolute() if not path.name.strip(".") else path
+    return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
+
+
+def _of_run(request: ReportRequest, run: RunFolder, changes: Table) -> Page:
+    section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), {}
+    if run.command in WITH_SPACE:
+        try:
+            scenes["scene"] = packed(space_of(run.path, request.roots))
+            section = replace(section, space="scene")
+        except SplatCtrlError as error:
+            section = replace(section, no_space=f"not in 3-D: {error}")
+    return Page(
+        title=f"{run.command} {run.path.absolute().name}",
+        state=section.state,
+        sentence=section.sentence,
+        tables=[changes] if changes.rows else [],
+        runs=[replace(section, title="", sentence="")],
+        scenes=scenes,
+        opens=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """A job of a batch with its folder, if that can be read, and else why not."""
+
+    node: Node
+    run: RunFolder | None
+    why: str
+    is_changed: bool
+
+    @property
+    def least(self) -> float:
+        """The least clearance [m], infinity where there is none."""
+        metrics = {} if self.run is None else self.run.metrics
+        values = [metrics.get(name) for name in ("min_clearance", "min_clearance_true")]
+        return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
+
+    @property
+    def order(self) -> tuple[bool, bool, bool, float, str]:
+        """Not as expected first, then changed, then not passed, then by clearance."""
+        node = self.node
+        return (
+            node.state == AS_EXPECTED,
+            not self.is_changed,
+            node.outcome in ("passed", None),
+            self.least,
+            node.id,
+        )
+
+
+def _of_batch(request: ReportRequest, batch: BatchFolder, changes: Table, progress: Progress) -> Page:
+    changed = {cell.link for row in changes.rows for cell in row.cells if isinstance(cell, Cell)}
+    jobs = sorted((_job(batch, node, node.id in changed) for node in batch.nodes), key=lambda job: job.order)
+    told = [job for job in jobs if _is_told(job)]
+    wanted = [job for job in told if job.run is not None and job.run.command == REPLAY]
+    chosen = {job.node.id for job in (wanted if request.all_scenes else wanted[:MOST_SCENES])}
+    scenes: dict[str, str] = {}
+    sections = []
+    for number, job in enumerate(told, start=1):
+        progress.log(f"{number} of {len(told)}: {job.node.id}")
+        sections.append(_section(request, batch, job, scenes, has_space=job.node.id in chosen))
+    unexpected = [job for job in jobs if job.node.state != AS_EXPECTED]
+    linked = {job.node.id for job in told}
+    return Page(
+        title=f"batch {batch.suite}",
+        state="failed" if unexpected else "passed",
+        sentence=_sentence(jobs, unexpected),
+        lines=[_versions(batch)],
+        tables=[
+            *([changes] if changes.rows else []),
+            *([_list("Not as expected", unexpected, linked)] if unexpected else []),
+            _matrix(jobs, linked),
+            replace(_list("All jobs, with time and memory", jobs, linked), is_folded=True),
+        ],
+        runs=sections,
+        scenes=scenes,
+    )
+
+
+def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
+    """How many jobs are as expected, and the first that is not."""
+    count = len(jobs) - len(unexpected)
+    if not unexpected:
+        return f"all {count} jobs as expected"
+    node = unexpected[0].node
+    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {node.id}: {node.sentence or node.cause}"
+
+
+def _job(batch: BatchFolder, node: Node, is_changed: bool) -> _Job:
+    try:
+        place = batch.inside(node.out)
+        run = open_run(place) if place.is_dir() or node.command == REPLAY else None
+        return _Job(node=node, run=run, why="", is_changed=is_changed)
+    except InputError as error:
+        return _Job(node=node, run=None, why=str(error), is_changed=is_changed)
+
+
+def _is_told(job: _Job) -> bool:
+    """Replays, and whatever did not come out as expected or as before, have a section of their own."""
+    return job.node.command == REPLAY or job.node.state != AS_EXPECTED or job.is_changed
+
+
+def _section(
+    request: ReportRequest, batch: BatchFolder, job: _Job, scenes: dict[str, str], *, has_space: bool
+) -> RunSection:
+    node, run = job.node, job.run
+    if run is None:
+        lines = [line for line in (node.cause, job.why) if line]
+        details = [_log(batch, node)]
+        return RunSection(
+            anchor=node.id,
+            title=node.id,
+            state=node.state,
+            sentence=node.sentence or node.state,
+            lines=lines,
+            details=details,
+        )
+    most, width = PICTURES[has_space]
+    section = section_of(run, anchor=node.id, title=node.id, most_pictures=most, width=width)
+    if node.state != AS_EXPECTED:
+        lines = [f"expected: {node.expect}", *([node.cause] if node.cause else []), *section.lines]
+        section = replace(section, state=node.state, lines=lines, details=[*section.details, _log(batch, node)])
+    if not has_space:
+        hint = "not in 3-D: --all-scenes has it" if run.command == REPLAY else ""
+        return replace(section, no_space=hint)
+    try:
+        scenes[f"scene-{len(scenes)}"] = packed(space_of(run.path, (batch.path, *request.roots)))
+        return replace(section, space=f"scene-{len(scenes) - 1}")
+    except SplatCtrlError as error:
+        return replace(section, no_space=f"not in 3-D: {error}")
+
+
+def _matrix(jobs: Sequence[_Job], linked: set[str]) -> Table:
+    """A row for each recording, those with the worst jobs first, and a column for each job."""
+    nodes = {(job.node.recording, job.node.job): job.node for job in jobs}
+    recordings = dict.fromkeys(job.node.recording for job in jobs)
+    names = sorted(dict.fromkeys(job.node.job for job in jobs))
+    rows = [
+        Row(cells=[recording, *(_cell(nodes.get((recording, name)), linked) for name in names)])
+        for recording in recordings
+    ]
+    return Table(title="Recordings", header=("recording", *names), rows=rows)
+
+
+def _cell(node: Node | None, linked: set[str]) -> Cell:
+    """The verdict of a job; in the colour of its state where that is not as expected."""
+    if node is None:
+        return Cell(text="-")
+    state = node.outcome if node.state == AS_EXPECTED and node.outcome else node.state
+    is_expected = node.state == AS_EXPECTED and node.outcome not in ("passed", None)
+    words = f"{node.label or node.state}{', as expected' if is_expected else ''}"
+    return Cell(text=words, state="" if is_expected else state, link=node.id if node.id in linked else "")
+
+
+def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
+    rows = []
+    for job in jobs:
+        node = job.node
+        name = Cell(text=node.id, link=node.id if node.id in linked else "")
+        least = None if job.least == math.inf else round(1e3 * job.least, 1)
+        words = node.sentence or node.cause
+        cells = (name, node.label or node.state, node.expect, least, words, node.seconds, node.peak_mb)
+        rows.append(Row(cells=cells, state=node.state))
+    return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
+
+
+def _versions(batch: BatchFolder) -> str:
+    versions = sorted({node.version for node in batch.nodes if node.version})
+    recordings = len({node.recording for node in batch.nodes})
+    return f"{recordings} recordings, {len(batch.nodes)} jobs; splatctrl {', '.join(versions) or 'unknown'}"
+
+
+def _log(batch: BatchFolder, node: Node) -> Table:
+    try:
+        lines = batch.inside(node.log).read_text(encoding="utf-8", errors="replace").splitlines()
+    except (OSError, InputError):
+        lines = ["no log"]
+    return Table(title="Log", text="\n".join(lines[-LOG_LINES:]))
+
+
+def _changes(path: Path | None) -> Table:
+    """The rows of a JSON list of objects; columns in the order in which they come up."""
+    if path is None:
+        return Table()
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
+        raise InputError(f"{path}: expected a JSON list of objects", remedy='like [{"id": "a/audit", "now": 1}]')
+    header = list(dict.fromkeys(str(name) for row in rows for name in row))
+    made = [Row(cells=[_linked(name, row.get(name)) for name in header]) for row in rows]
+    return Table(title="What changed", header=header, rows=made)
+
+
+def _linked(name: str, value: object) -> object:
+    return Cell(text=str(value), link=str(value)) if name == ID and value else value

@@ -1,0 +1,180 @@
+"""The folder of one run as a report reads it: its ``run.json``, a replay's states and events, its pictures."""
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli import __version__
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.digests import Parts
+from splatctrl_cli.files.output import PARTIAL, sha256
+from splatctrl_cli.records import Float64, Stamps
+
+REPLAY = "replay"
+
+
+@dataclass(frozen=True, kw_only=True)
+class States:
+    """The columns of a replay's ``steps.csv`` (T rows) that a report shows; NaN where a cell is empty.
+
+    stamps_ns, seconds [s] since the first; joints by name (T,); clearance [m] by measure (T,), `truth` among them;
+    rungs (T,), empty without a controller; obstacles (T,) in words.
+    """
+
+    stamps_ns: Stamps
+    seconds: Float64
+    joints: Mapping[str, Float64]
+    clearance: Mapping[str, Float64]
+    rungs: tuple[str, ...]
+    obstacles: tuple[str, ...]
+
+    def worst(self) -> int | None:
+        """The state of least clearance by any measure, None where there is no value."""
+        if not self.clearance or not len(self.seconds):
+            return None
+        least = np.fmin.reduce(list(self.clearance.values()))
+        return int(np.nanargmin(least)) if np.isfinite(least).any() else None
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A folder that a command wrote."""
+
+    path: Path
+    run: Mapping[str, Any]
+
+    @cached_property
+    def parts(self) -> Parts:
+        """By which each file is checked when it is opened."""
+        return Parts.of_run(self.path, self.run)
+
+    @property
+    def command(self) -> str:
+        """The subcommand."""
+        return str(self.run.get("command", ""))
+
+    @property
+    def verdict(self) -> Mapping[str, Any]:
+        """As ``run.json`` has it, empty for a command that does not judge."""
+        return self._object("verdict")
+
+    @property
+    def metrics(self) -> Mapping[str, Any]:
+        """By name."""
+        return self._object("metrics")
+
+    def _object(self, name: str) -> Mapping[str, Any]:
+        value = self.run.get(name, {})
+        if not isinstance(value, dict):
+            raise InputError(f"{self.path / 'run.json'}: {name}: expected an object, got {type(value).__name__}")
+        return value
+
+    @property
+    def arguments(self) -> list[str]:
+        """As typed."""
+        given = self.run.get("arguments", [])
+        return [str(word) for word in given] if isinstance(given, list) else []
+
+    def options(self, name: str) -> list[str]:
+        """The values of a repeatable option of the command line."""
+        words = self.arguments
+        found = [words[i + 1] for i, word in enumerate(words[:-1]) if word == name]
+        return found + [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
+
+    def option(self, name: str) -> str | None:
+        """The last value of an option, None where it was not given."""
+        return next(iter(self.options(name)[::-1]), None)
+
+    def json_of(self, name: str) -> Any:
+        """What a JSON file of the folder holds, None where it is not there. Raises InputError for one that is not."""
+        file = self.path / name
+        if not self.parts.has(file):
+            return None
+        try:
+            return json.loads(self.parts.checked(file).read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise InputError(f"{file}: is not JSON: {error}") from None
+
+    def pictures(self) -> list[Path]:
+        """The PNG files of the folder and of its folders of pictures, by name."""
+        return [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
+
+    @cached_property
+    def states(self) -> States | None:
+        """Of a replay, None of other commands. Raises InputError for a table that is not the one written."""
+        file = self.path / "steps.csv"
+        if self.command != REPLAY or not self.parts.has(file):
+            return None
+        try:
+            with self.parts.checked(file).open(encoding="utf-8", newline="") as stream:
+                rows = csv.reader(stream)
+                header = next(rows)
+                columns = dict(zip(header, zip(*rows, strict=True), strict=False))
+            return _states(columns)
+        except (ValueError, KeyError, StopIteration) as error:
+            raise InputError(f"{file}: expected the columns of a replay: {error}") from None
+
+    def place_of(self, given: str, roots: tuple[Path, ...], digest: str | None = None) -> Path | None:
+        """Where a path of the command line lies now: as typed, below a folder above the run, or below `roots`.
+
+        digest: of the file, which it is to have. None where there is no such file.
+        """
+        above = [Path(), *self.path.absolute().parents, *roots]
+        found = [root / given for root in above if (root / given).exists()]
+        return next((path for path in found if digest is None or sha256(path) == digest), None)
+
+
+def open_run(path: Path) -> RunFolder:
+    """The run in a folder. Raises InputError where it is none, is not whole, or a newer version wrote it."""
+    partial = path if path.name.endswith(PARTIAL) else path.with_name(path.name + PARTIAL)
+    if partial.exists() and (partial == path or not path.exists()):
+        raise InputError(
+            f"{partial}: not whole: its run is still writing, or was interrupted",
+            remedy="wait for it, or run its command again",
+        )
+    if not path.exists():
+        raise InputError(f"{path}: no such folder", remedy="give the folder that a command wrote with --out")
+    file = path / "run.json"
+    if not file.is_file():
+        raise InputError(
+            f"{path}: no run: it has no run.json", remedy="give a folder that a command wrote with --out"
+        )
+    try:
+        run = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from None
+    if not isinstance(run, dict) or "command" not in run:
+        raise InputError(f"{file}: expected what a command of splatctrl writes", remedy="make the run again")
+    check_version(file, str(run.get("splatctrl", "")))
+    return RunFolder(path, run)
+
+
+def check_version(file: Path, version: str) -> None:
+    """Raise InputError for what a newer splatctrl wrote: its values may mean something else."""
+    if _numbers(version) > _numbers(__version__):
+        raise InputError(f"{file}: written by splatctrl {version}, this is {__version__}", remedy="update splatctrl")
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in version.split(".") if part.isdigit())
+
+
+def _states(columns: Mapping[str, tuple[str, ...]]) -> States:
+    def floats(name: str) -> Float64:
+        return np.array([float(cell) if cell else np.nan for cell in columns[name]], np.float64)
+
+    measures = {name.removeprefix("clearance_"): name for name in columns if name.startswith("clearance_")}
+    return States(
+        stamps_ns=np.array([int(cell) for cell in columns["stamp_ns"]], np.int64),
+        seconds=floats("time_s"),
+        joints={name.removeprefix("q_"): floats(name) for name in columns if name.startswith("q_")},
+        clearance={"truth" if key == "true" else key: floats(name) for key, name in measures.items()},
+        rungs=columns.get("rung", ()),
+        obstacles=columns.get("obstacle", ()),
+    )
