@@ -10,6 +10,7 @@ from splatctrl_cli.jobs.bake import BakeResult, bake
 from splatctrl_cli.jobs.bake_request import BakeRequest
 from splatctrl_cli.jobs.compare import CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
+from splatctrl_cli.jobs.export_run import ExportRunRequest, ExportRunResult, export_run
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.jobs.query import QueryRequest, QueryResult, query
@@ -17,7 +18,7 @@ from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.report import ReportRequest, ReportResult, report
+from splatctrl_cli.jobs.report import WriteReportRequest, WriteReportResult, write_report
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.view import ViewRequest, ViewResult, view
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -32,6 +33,8 @@ __all__ = [
     "Config",
     "ExportRequest",
     "ExportResult",
+    "ExportRunRequest",
+    "ExportRunResult",
     "InputError",
     "Label",
     "NotEvaluableError",
@@ -45,8 +48,6 @@ __all__ = [
     "RecordingRequest",
     "ReplayRequest",
     "ReplayResult",
-    "ReportRequest",
-    "ReportResult",
     "ScoreRequest",
     "ScoreResult",
     "SourceOptions",
@@ -56,15 +57,18 @@ __all__ = [
     "ViewRequest",
     "ViewResult",
     "WriteError",
+    "WriteReportRequest",
+    "WriteReportResult",
     "bake",
     "compare",
     "export",
+    "export_run",
     "load_config",
     "open_to_train",
     "query",
     "reconstruct",
     "replay",
-    "report",
     "score",
     "view",
+    "write_report",
 ]

@@ -35,8 +35,9 @@ def test_importing_loads_neither_what_is_heavy_nor_what_is_used_late(module: str
 
 def test_the_page_lists_every_job_with_its_request_and_result() -> None:
     rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \| `(\w+)` \|", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    jobs = {name for name in api.__all__ if f"{name.title()}Request" in api.__all__}
-    assert rows == [(job, f"{job.title()}Request", f"{job.title()}Result") for job, *_ in rows]
+    kinds = {name: name.title().replace("_", "") for name in api.__all__}
+    jobs = {name for name, kind in kinds.items() if f"{kind}Request" in api.__all__}
+    assert rows == [(job, f"{kinds[job]}Request", f"{kinds[job]}Result") for job, *_ in rows]
     assert {job for job, *_ in rows} == jobs
 
 
@@ -53,6 +54,9 @@ def test_the_examples_of_the_page_run_on_the_sample_data(
     made, baked, answered, exported, scored, found, since = (scope[name] for name in names)
     assert isinstance(since, api.CompareResult)
     assert (since.verdict.label, since.figures, dict(since.differences)) == ("no regression", (), {})
+    assert isinstance(scope["logged"], api.ExportRunResult)
+    assert isinstance(scope["told"], api.WriteReportResult)
+    assert isinstance(scope["seen"], api.ViewResult)
     assert isinstance(made, api.ReconstructResult)
     assert isinstance(baked, api.BakeResult)
     assert isinstance(answered, api.QueryResult) and answered.metrics["num_answered"] == 2
@@ -63,5 +67,6 @@ def test_the_examples_of_the_page_run_on_the_sample_data(
     written = {path.name for path in (tmp_path / "api_output").iterdir()}
     assert written == {
         *("scene", "field", "points.csv", "answers.csv", "objects.spz", "audit", "again", "baseline.toml"),
+        *("audit.html", "scene.html", "scene.mcap"),
     }
     assert str(found.verdict.label) in capsys.readouterr().out

@@ -39,7 +39,7 @@ USERS_OWN = {  # what stands for a user's data in commands that are shown; the c
         "scene.toml",
         "truth.json",
     ),
-    *("old/audit", "new/audit", "old_batch", "baseline.toml"),
+    *("old/audit", "new/audit", "old_batch", "baseline.toml", "audit/", "batch/"),
     *("scene", "scene/", "scenes/", "dtu/", "robot.urdf", "spheres.yaml", "panda.urdf"),
 }
 TOO_LONG = {  # for a test: minutes; the page has their figures

@@ -298,7 +298,10 @@ COMMANDS = {
     ),
     "export": Command(
         summary="write splats as a file that viewers open, and check what reads back",
-        examples=("export out/scene -o out/scene.ply", "export out/scene --labels object -o out/scene.spz"),
+        examples=(
+            "export out/scene --labels object -o out/scene.spz",
+            "export out/audit --mcap",
+        ),
         run="export:run",
         options=export_options,
     ),

@@ -7,6 +7,7 @@ from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.export import ExportRequest, ExportResult, export
+from splatctrl_cli.jobs.export_run import ExportRunRequest, export_run
 from splatctrl_cli.records import Label
 
 SHOWN = {  # of Differences: what the table calls it, and the unit it is shown in
@@ -22,7 +23,20 @@ SHOWN = {  # of Differences: what the table calls it, and the unit it is shown i
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     console = Console(args)
+    if args.mcap:
+        return _run_mcap(console, args)
     return show_exported(console, export(request_of(ExportRequest, args, labels=_labels(args.labels)), console))
+
+
+def _run_mcap(console: Console, args: argparse.Namespace) -> int:
+    for name in ("labels", "layout", "isotropic"):
+        if getattr(args, name):
+            raise UsageError(f"--{name}: not with --mcap", remedy="leave it out")
+    request = request_of(ExportRunRequest, args, path=args.scene, roots=tuple(args.root))
+    result = export_run(request)
+    rows = [(topic, count) for topic, count in result.messages.items()]
+    console.result(result.as_dict(), [f"{result.file}: {result.bytes} bytes", *table(("topic", "messages"), rows)])
+    return 0
 
 
 def show_exported(console: Console, result: ExportResult) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from splatctrl_cli.cli.common import Console
 from splatctrl_cli.cli.options import request_of
-from splatctrl_cli.jobs.report import ReportRequest, report
+from splatctrl_cli.jobs.report import WriteReportRequest, write_report
 from splatctrl_cli.jobs.view import ViewRequest, view
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")  # one of which is set on Linux where a browser can open a window
@@ -18,7 +18,7 @@ MOST_NOTES = 5
 def run(args: argparse.Namespace) -> int:
     """Write a report, and return the exit code."""
     console = Console(args)
-    result = report(request_of(ReportRequest, args, roots=tuple(args.root)), console)
+    result = write_report(request_of(WriteReportRequest, args, roots=tuple(args.root)), console)
     lines = [f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes"]
     lines += result.notes[:MOST_NOTES]
     more = len(result.notes) - MOST_NOTES

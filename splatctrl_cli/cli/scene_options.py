@@ -58,8 +58,9 @@ def reconstruct_options(add: Options, parser: Parser) -> None:
 
 def export_options(add: Options, parser: Parser) -> None:
     suffixes = ", ".join(SPLAT_FORMATS)
-    add("SCENE", f"a scene folder, or a splat file: {suffixes}", Path)
+    add("SCENE", f"a scene folder, or a splat file: {suffixes}; with --mcap also a replay or a field", Path)
     add_output(add, f"the file to write; its suffix is the format: {suffixes}", default="SCENE.ply, beside SCENE")
+    add("--mcap", "write an MCAP of Foxglove's schemas, over time (default of --out: SCENE.mcap); docs/report.md")
     add("--labels NAME,...", "only splats of these labels: object, robot, human (default: all)")
     add(
         "--layout",
@@ -68,6 +69,11 @@ def export_options(add: Options, parser: Parser) -> None:
         ("short", "full"),
     )
     add("--isotropic", "make anisotropic Gaussians round: same volume, opacity and mean colour")
+    add(
+        "--root DIR ...",
+        "with --mcap: folder in which the scene and robot of a replay's command line are looked for",
+        Path,
+    )
 
 
 def sdf_bake_options(add: Options, parser: Parser) -> None:

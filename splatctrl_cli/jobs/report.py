@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reports.batch_folder import AS_EXPECTED, BatchFolder, Node, is_batch, open_batch
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, open_run
 from splatctrl_cli.jobs.reports.sections import section_of
-from splatctrl_cli.jobs.reports.spaces import space_of
+from splatctrl_cli.jobs.reports.spaces import space_of_run
 from splatctrl_cli.report.page import Cell, Page, Row, RunSection, Table, rendered
 from splatctrl_cli.report.viewer import packed
 
@@ -25,7 +25,7 @@ WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportRequest:
+class WriteReportRequest:
     """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
 
     changes: a JSON list of objects, a row each, of what differs from a baseline; an `id` names a job of the batch.
@@ -42,7 +42,7 @@ class ReportRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportResult:
+class WriteReportResult:
     """The page: how many runs it tells of, how many of them in 3-D, and why others are not."""
 
     file: Path
@@ -56,7 +56,7 @@ class ReportResult:
         return asdict(self)
 
 
-def report(request: ReportRequest, progress: Progress = SILENT) -> ReportResult:
+def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
     """Write the page. Raises InputError for a folder that is no run and no batch, that is not whole, or that a newer
     version wrote.
     """
@@ -69,7 +69,7 @@ def report(request: ReportRequest, progress: Progress = SILENT) -> ReportResult:
     with output_path(out, force=request.force, is_folder=False) as partial:
         partial.write_text(rendered(page), encoding="utf-8")
         size = partial.stat().st_size
-    return ReportResult(
+    return WriteReportResult(
         file=out,
         bytes=size,
         num_runs=len(page.runs),
@@ -84,11 +84,11 @@ def beside(path: Path) -> Path:
     return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
 
 
-def _of_run(request: ReportRequest, run: RunFolder, changes: Table) -> Page:
+def _of_run(request: WriteReportRequest, run: RunFolder, changes: Table) -> Page:
     section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), {}
     if run.command in WITH_SPACE:
         try:
-            scenes["scene"] = packed(space_of(run.path, request.roots))
+            scenes["scene"] = packed(space_of_run(run, request.roots))
             section = replace(section, space="scene")
         except SplatCtrlError as error:
             section = replace(section, no_space=f"not in 3-D: {error}")
@@ -132,7 +132,7 @@ class _Job:
         )
 
 
-def _of_batch(request: ReportRequest, batch: BatchFolder, changes: Table, progress: Progress) -> Page:
+def _of_batch(request: WriteReportRequest, batch: BatchFolder, changes: Table, progress: Progress) -> Page:
     changed = {cell.link for row in changes.rows for cell in row.cells if isinstance(cell, Cell)}
     jobs = sorted((_job(batch, node, node.id in changed) for node in batch.nodes), key=lambda job: job.order)
     told = [job for job in jobs if _is_told(job)]
@@ -174,6 +174,7 @@ def _job(batch: BatchFolder, node: Node, is_changed: bool) -> _Job:
     try:
         place = batch.inside(node.out)
         run = open_run(place) if place.is_dir() or node.command == REPLAY else None
+        run = None if run is None else replace(run, words=tuple(map(str, node.words)))
         return _Job(node=node, run=run, why="", is_changed=is_changed)
     except InputError as error:
         return _Job(node=node, run=None, why=str(error), is_changed=is_changed)
@@ -185,7 +186,7 @@ def _is_told(job: _Job) -> bool:
 
 
 def _section(
-    request: ReportRequest, batch: BatchFolder, job: _Job, scenes: dict[str, str], *, has_space: bool
+    request: WriteReportRequest, batch: BatchFolder, job: _Job, scenes: dict[str, str], *, has_space: bool
 ) -> RunSection:
     node, run = job.node, job.run
     if run is None:
@@ -208,7 +209,7 @@ def _section(
         hint = "not in 3-D: --all-scenes has it" if run.command == REPLAY else ""
         return replace(section, no_space=hint)
     try:
-        scenes[f"scene-{len(scenes)}"] = packed(space_of(run.path, (batch.path, *request.roots)))
+        scenes[f"scene-{len(scenes)}"] = packed(space_of_run(run, (batch.path, *request.roots)))
         return replace(section, space=f"scene-{len(scenes) - 1}")
     except SplatCtrlError as error:
         return replace(section, no_space=f"not in 3-D: {error}")

@@ -67,6 +67,8 @@ class Work:
             "score": [scene, "--reference", self.log, "--cameras", "cam1", "--threads", "1"],
             "robot": ["spheres", "--urdf", urdf],
             "replay": [self.log, "--scene", scene, "--urdf", urdf, "--max-unknown", "1"],
+            "report": [scene],
+            "view": [scene, "--no-open"],
             "demo": [],
             "capture": ["pack", self.folder / "x.capture"],
         }
@@ -179,7 +181,7 @@ def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command
     assert not list(tmp_path.iterdir())
 
 
-FILE_WRITERS = ("export", "query", "robot", "capture")  # the others write a folder
+FILE_WRITERS = ("export", "query", "report", "view", "robot", "capture")  # the others write a folder
 
 
 @pytest.mark.parametrize("command", WRITERS)

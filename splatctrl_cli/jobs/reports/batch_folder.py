@@ -16,8 +16,8 @@ AS_EXPECTED = "done"
 class Node:
     """One job of a batch: its command on a recording, and what came of it.
 
-    state: done (as expected), failed (judged, not as expected), error, or skipped (what it needs is not there). out,
-    log: paths below the batch. peak_mb: of memory. cause: of an error.
+    words: the command line. state: done (as expected), failed (judged, not as expected), error, or skipped (what it
+    needs is not there). out, log: paths below the batch. peak_mb: of memory. cause: of an error.
     """
 
     id: str
@@ -25,6 +25,7 @@ class Node:
     job: str = ""
     command: str = ""
     variant: Mapping[str, Any] = field(default_factory=dict)
+    words: tuple[str, ...] = ()
     key: str = ""
     state: str = ""
     expect: str | None = None

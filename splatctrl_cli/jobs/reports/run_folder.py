@@ -44,10 +44,11 @@ class States:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A folder that a command wrote."""
+    """A folder that a command wrote; words: its command line, where ``run.json`` has that of a program around it."""
 
     path: Path
     run: Mapping[str, Any]
+    words: tuple[str, ...] = ()
 
     @cached_property
     def parts(self) -> Parts:
@@ -78,7 +79,7 @@ class RunFolder:
     @property
     def arguments(self) -> list[str]:
         """As typed."""
-        given = self.run.get("arguments", [])
+        given = list(self.words) or self.run.get("arguments", [])
         return [str(word) for word in given] if isinstance(given, list) else []
 
     def options(self, name: str) -> list[str]:
@@ -103,7 +104,8 @@ class RunFolder:
 
     def pictures(self) -> list[Path]:
         """The PNG files of the folder and of its folders of pictures, by name."""
-        return [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
+        found = [*sorted(self.path.glob("*.png")), *sorted(self.path.glob("report/*.png"))]
+        return [self.parts.checked(path) for path in found if self.parts.has(path)]
 
     @cached_property
     def states(self) -> States | None:

@@ -19,7 +19,7 @@ from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, States, ope
 from splatctrl_cli.records import DistanceGrid, Float64, SplatSet
 from splatctrl_cli.report.space import Deciding, Motion, Space, SplatsAt, Surface, bodies_of, coarsened
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, Snapshot, open_scene
 from splatctrl_cli.splat_files.splat_formats import read_splats
 from splatctrl_cli.splat_files.splats import nearest_splats
 from splatctrl_cli.voxels import OccupancyGrid, VoxelState
@@ -38,7 +38,12 @@ def space_of(path: Path, roots: tuple[Path, ...] = ()) -> Space:
     """
     if path.is_file():
         return space_of_grid(path) if path.suffix == ".npz" else _of_file(path)
-    run = open_run(path)
+    return space_of_run(open_run(path), roots)
+
+
+def space_of_run(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
+    """As `space_of`, of an open run."""
+    path = run.path
     if run.command == REPLAY:
         return space_of_replay(run, roots)
     if (path / "field.npz").is_file():
@@ -118,7 +123,8 @@ def _robot(
 
 
 @lru_cache(maxsize=4)
-def _bodies(robot: RobotModel) -> dict[str, Surface]:
+def robot_bodies(robot: RobotModel) -> dict[str, Surface]:
+    """The collision geometry of its links, by name."""
     return bodies_of(robot.surface)
 
 
@@ -139,6 +145,19 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
     if grid is not None:
         place = _file(run, grid, roots)
         return space_of_grid(place / "field.npz" if place.is_dir() else place)
+    scene = scene_of(run, roots)
+    known = sets_known(run, states, scene)
+    times, used = [time for time, _ in known], [snapshot for _, snapshot in known]
+    when = 0.0 if deciding is None else deciding.time_s
+    chosen = spread(times, when)
+    sets = [SplatsAt(time_s=times[i] if n else 0.0, splats=used[i].splats()) for n, i in enumerate(chosen)]
+    at = max((i for i in chosen if times[i] <= when), default=None)
+    grid_then = None if at is None else used[at].occupancy()
+    return _with_unknown(Space(splats=sets), grid_then, scene)
+
+
+def scene_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> SceneFolder:
+    """The scene of a replay, as its command line named it. Raises InputError where it is not found."""
     given = run.option("--scene")
     folder = run.path / "scene" if given is None else run.place_of(given, roots)
     if folder is None or not folder.exists():
@@ -146,23 +165,20 @@ def _scene_of(run: RunFolder, states: States, roots: tuple[Path, ...], deciding:
             f"{run.path}: the scene {given or 'scene/'} of its command line is not found",
             remedy="give the folder that it was relative to with --root",
         )
-    scene = open_scene(folder)
+    return open_scene(folder)
+
+
+def sets_known(run: RunFolder, states: States, scene: SceneFolder) -> list[tuple[float, Snapshot]]:
+    """The snapshots that a replay came to, each with the time [s] of the motion from which it was known."""
     latency_ns = round(1e9 * float(run.option("--latency") or 0.0))
     first, last = (int(stamp) - latency_ns for stamp in (states.stamps_ns[0], states.stamps_ns[-1]))
     known = [s for s in scene.snapshots if s.stamp_ns <= last] if scene.has_clock else list(scene.snapshots[-1:])
     early = [s for s in known if s.stamp_ns <= first]
     used = [*early[-1:], *known[len(early) :]]
-    start = int(states.stamps_ns[0]) - latency_ns
-    times = [max(0.0, 1e-9 * (s.stamp_ns - start)) for s in used]
-    when = 0.0 if deciding is None else deciding.time_s
-    chosen = _spread(times, when)
-    sets = [SplatsAt(time_s=times[i] if n else 0.0, splats=used[i].splats()) for n, i in enumerate(chosen)]
-    at = max((i for i in chosen if times[i] <= when), default=None)
-    grid_then = None if at is None else used[at].occupancy()
-    return _with_unknown(Space(splats=sets), grid_then, scene)
+    return [(max(0.0, 1e-9 * (snapshot.stamp_ns - first)), snapshot) for snapshot in used]
 
 
-def _spread(times: list[float], when: float) -> list[int]:
+def spread(times: list[float], when: float) -> list[int]:
     """At most MOST_SETS of the sets known from `times` on: the first, the last, the one at `when`, others evenly."""
     if not times:
         return []
@@ -192,11 +208,11 @@ def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
     chosen = set(np.linspace(0, count - 1, min(count, MOST_STATES)).round().astype(int).tolist())
     worst = states.worst()
     which = sorted(chosen if worst is None else chosen | {worst})
-    bodies = _bodies(robot)
+    bodies = robot_bodies(robot)
     end = run.option("--frame") or robot.frame_names[-1]
     poses, path = [], []
     for state in which:
-        q = _position(states, robot, state)
+        q = position_of(states, robot, state)
         poses.append([robot.frame_pose(q, link) for link in bodies])
         path.append(robot.frame_pose(q, end)[:3, 3])
     least = np.fmin.reduce(list(states.clearance.values())) if states.clearance else np.full(count, np.nan)
@@ -211,7 +227,8 @@ def _motion(run: RunFolder, states: States, robot: RobotModel) -> Motion:
     )
 
 
-def _position(states: States, robot: RobotModel, state: int) -> Float64:
+def position_of(states: States, robot: RobotModel, state: int) -> Float64:
+    """Joint positions (J,) of a state, in the robot's order."""
     try:
         return np.array([states.joints[name][state] for name in robot.joint_names], np.float64)
     except KeyError as error:
@@ -239,7 +256,7 @@ def _deciding(run: RunFolder, states: States, robot: RobotModel) -> Deciding | N
 def _decided(states: States, robot: RobotModel, words: str, time_s: float, place: list[float], who: str) -> Deciding:
     """With the sphere that is named, else the nearest to the place among those that move."""
     state = int(np.argmin(np.abs(states.seconds - time_s)))
-    centers, radii = robot.sphere_centers(_position(states, robot, state)), robot.sphere_set.radii
+    centers, radii = robot.sphere_centers(position_of(states, robot, state)), robot.sphere_set.radii
     names = sphere_names(robot.sphere_set)
     gaps = np.linalg.norm(centers - np.array(place), axis=1) - radii
     sphere = names.index(who) if who in names else int(np.argmin(np.where(robot.moving_spheres, gaps, np.inf)))
