@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels.surface import BALL, BOX, CAPSULE
+from splatctrl_cli.kernels.surface_image import BALL, BOX, CAPSULE
 from splatctrl_cli.libraries import trimesh
 from splatctrl_cli.records import Float32, Float64, SplatSet
 from splatctrl_cli.robot.surface import RobotSurface
