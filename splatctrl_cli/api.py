@@ -4,6 +4,7 @@
 """
 
 from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.control.user_controller import ClearanceRow, Controller, ControllerInput, ControllerStart
 from splatctrl_cli.errors import InputError, NotEvaluableError, SplatCtrlError, UsageError, WriteError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict
 from splatctrl_cli.jobs.bake import BakeResult, bake
@@ -28,9 +29,13 @@ __all__ = [
     "BakeRequest",
     "BakeResult",
     "Box",
+    "ClearanceRow",
     "CompareRequest",
     "CompareResult",
     "Config",
+    "Controller",
+    "ControllerInput",
+    "ControllerStart",
     "ExportRequest",
     "ExportResult",
     "ExportRunRequest",

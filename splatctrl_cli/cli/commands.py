@@ -25,7 +25,7 @@ from splatctrl_cli.cli.options import (
 )
 from splatctrl_cli.cli.parser import Options, Parser, real, whole
 from splatctrl_cli.cli.replay_options import replay_options
-from splatctrl_cli.cli.report_options import report_options, view_options
+from splatctrl_cli.cli.run_options import batch_options, compare_options, report_options, view_options
 from splatctrl_cli.cli.scene_options import (
     export_options,
     query_options,
@@ -160,28 +160,6 @@ def _num_images(text: str) -> int:
         raise argparse.ArgumentTypeError(f"expected a number of images, got {text!r}: {hint}") from None
 
 
-def _batch(add: Options, parser: Parser) -> None:
-    add("SUITE", "TOML file of recordings and jobs (docs/batch.md); with --list also a batch's folder", Path)
-    add("-o/--out DIR", "folder of the batch, where it goes on (default: what the suite says, or SUITE.out)", Path)
-    add("--workers N", "nodes that run at once (default: one per core)", whole(1, 256))
-    add("--shard I/N", "only every N-th recording, from the I-th on", _shard)
-    add("--again", "run what is done, too")
-    add("--dry-run", "print the nodes and their command lines, and run nothing")
-    add("--dask ADDRESS", "run the nodes on a Dask cluster that shares this folder")
-    listing = add.group("ledger")
-    listing("--list", "print what ran last, and run nothing")
-    listing("--failed", "as --list, of what did not end as expected")
-    listing("--where COLUMN=VALUE ...", "as --list, of the runs for which it holds; also !=, <, >, <=, >=")
-    listing("--csv FILE", "as --list, into a table with every column", Path)
-
-
-def _shard(text: str) -> tuple[int, int]:
-    index, _, count = text.partition("/")
-    if not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)):
-        raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, got {text!r}")
-    return int(index), int(count)
-
-
 def _config(add: Options, parser: Parser) -> None:
     add("FILE", "a TOML file as --config takes it; one with a wrong key or value is refused", Path, nargs="?")
     add("--set SECTION.KEY=VALUE ...", "one setting")
@@ -197,12 +175,6 @@ def _demo(add: Options, parser: Parser) -> None:
     add("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data)", Path)
     add_output(add, "folder for everything the demo makes", default="demo_output")
     add_threads(parser)
-
-
-def _compare(add: Options, parser: Parser) -> None:
-    add("OUTPUT", "folder that a command or a batch wrote; of two the earlier first", Path, nargs="+")
-    add("--against FILE", "compare the only OUTPUT with this stored baseline", Path)
-    add("--update-baseline FILE", "write the last OUTPUT as a baseline, alone or after the comparison", Path)
 
 
 def _robot(add: Options, parser: Parser, spheres: str = "those of the URDF itself") -> None:
@@ -316,7 +288,7 @@ COMMANDS = {
         options=sdf_bake_options,
     ),
     "query": Command(
-        summary="answer points with distance, gradient, certified bound, collision probability and what is nearest",
+        summary="answer a table of points: distance, gradient, bound, what is nearest",
         examples=(
             "query out/scene points.csv -o out/near.csv",
             "query out/field points.csv --scene out/scene",
@@ -345,10 +317,10 @@ COMMANDS = {
         options=replay_options,
     ),
     "batch": Command(
-        summary="run many recordings through many commands, again only what changed, with one verdict",
+        summary="run many recordings through many commands, with one verdict",
         examples=("batch nightly.toml --shard 2/4", "batch nightly.toml --failed"),
         run="batch:run",
-        options=_batch,
+        options=batch_options,
         judges=True,
     ),
     "compare": Command(
@@ -356,10 +328,10 @@ COMMANDS = {
         examples=("compare out/old out/new", "compare out/new --against baseline.toml"),
         run="compare:run",
         judges=True,
-        options=_compare,
+        options=compare_options,
     ),
     "report": Command(
-        summary="write one HTML file on a run or a batch: verdict, timelines, worst moments, scenes in 3-D",
+        summary="write one HTML file on a run or a batch, with scenes in 3-D",
         examples=("report out/audit", "report out/batch --changes changes.json -o report.html"),
         run="report:run",
         options=report_options,
@@ -371,7 +343,7 @@ COMMANDS = {
         options=view_options,
     ),
     "robot": Command(
-        summary="fit and measure a robot's collision spheres, list its self-collision pairs and limits",
+        summary="fit and measure a robot's collision spheres, list its pairs and limits",
         examples=("robot spheres --urdf arm.urdf --max-spheres 80 -o spheres.yaml", f"robot check {ROBOT}"),
         actions={
             "spheres": Command(
@@ -399,7 +371,7 @@ COMMANDS = {
         },
     ),
     "config": Command(
-        summary="print every setting with its value and where that comes from, check a file of them, or begin one",
+        summary="print every setting and where it comes from, check a file, begin one",
         examples=("config my.toml --set scene.max_splats=3000", "config --template"),
         run="config:run",
         options=_config,

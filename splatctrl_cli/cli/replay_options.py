@@ -21,7 +21,8 @@ from splatctrl_cli.cli.parser import MAX_SECONDS, Options, Parser, real, whole
 from splatctrl_cli.config.fixed import GOLDEN_TOLERANCE
 
 MODES = ("audit", "open-loop", "closed-loop")
-BASELINES = ("standstill", "birrt", "birrt-ik")
+BASELINES = ("standstill", "birrt", "birrt-ik", "qp-ik")
+STEP_LIMIT = 10.0  # [s]
 
 
 def replay_options(add: Options, parser: Parser) -> None:
@@ -43,6 +44,7 @@ def replay_options(add: Options, parser: Parser) -> None:
     add_source(add)
     _add_robot(add.group("robot"))
     _add_goal(add.group("goal"))
+    _add_controller(add.group("controller"))
     _add_evidence(add.group("evidence"))
     _add_comparison(add.group("comparison"))
     _add_reported(add.group("report"))
@@ -71,6 +73,16 @@ def _add_goal(add: Options) -> None:
     add("--re-anchor S", back, real(1e-3, MAX_SECONDS, "s"))
 
 
+def _add_controller(add: Options) -> None:
+    """A controller of the user's own in place of ours (docs/controllers.md)."""
+    own = add.either()
+    own("--controller MODULE:CLASS", "ask this Python class, found from the current folder on, instead of ours")
+    own("--controller-command 'PROGRAM ARGS'", "ask this program, by lines of JSON on its stdin and stdout")
+    limit = "a controller that takes longer for a step has failed"
+    add("--controller-step-limit S", limit, real(1e-3, MAX_SECONDS, "s"), STEP_LIMIT)
+    add("--controller-twice", "ask two of it the same: a difference is a failure")
+
+
 def _add_evidence(add: Options) -> None:
     add("--max-unknown SHARE", "never-seen share allowed", real(0, 1), 0.05)
     add("--max-map-age S", "a scene older than this is no evidence", real(1e-3, MAX_SECONDS, "s"), 1.0)
@@ -96,7 +108,8 @@ def _add_comparison(add: Options) -> None:
     add(
         "--baseline NAME,...",
         "beside the closed loop (repeatable): standstill, the logged path held while a person is in the zone; birrt,"
-        " a path planned in the scene known at the start, followed by the joints; birrt-ik, by the controller",
+        " a path planned in the scene known at the start, followed by the joints; birrt-ik, by the controller;"
+        " qp-ik, our controller beside one of --controller",
         _baselines,
         action="extend",
         default=[],

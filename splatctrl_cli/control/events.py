@@ -34,6 +34,7 @@ class EventKind(StrEnum):
     MINIMUM_VIOLATION = "minimum-violation"  # largest residual
     HOLD = "hold"  # least barrier clearance [m]
     SCALED_BACK = "scaled-back"  # least scale
+    ROW_BROKEN = "row-broken"  # largest excess over a barrier row, of a controller that is not ours [m/s]
     CANNOT_ACT = "cannot-act"  # least distance [m] of a violated row that has no joint to turn
 
 

@@ -20,6 +20,7 @@ class Rung(StrEnum):
     RELAXED = "relaxed"
     MINIMUM_VIOLATION = "minimum-violation"
     HOLD = "hold"
+    OUTSIDE = "outside"  # given by a controller that is not ours
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from splatctrl_cli.control.fallbacks import Rung
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack, guided_goal
 from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
-from splatctrl_cli.control.step import ControlStep, QpIkController, VelocityMargin
+from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController, VelocityMargin
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, DistanceField, Float64
 
@@ -36,7 +36,8 @@ class OpenLoopTask:
 class OpenLoopTrace:
     """T states: the step that the controller would have taken and the room that the logged velocity left.
 
-    Both are None where the field has no distance. logged, commanded (T, J) [rad/s]; commanded is NaN there.
+    Both are None where the field has no distance, the step also where nobody was left to ask.
+    logged, commanded (T, J) [rad/s]; commanded is NaN there.
     """
 
     logged: Float64
@@ -60,11 +61,12 @@ def open_loop(
     has_distance: Bool,
     scene_step_at: SceneStepAt | None = None,
     solver: QpSolver | None = None,
+    commander: Commander = OURS,
 ) -> OpenLoopTrace:
-    """Ask the controller at every logged state, each in the field known at its stamp; nothing is integrated.
+    """Ask the commander at every logged state, each in the field known at its stamp; nothing is integrated.
 
     Asked for the logged motion itself, the command is the logged velocity wherever no row shapes it: what differs is
-    the intervention. has_distance (T,): where it is False the controller is not asked;
+    the intervention. has_distance (T,): where it is False nobody is asked, nor after the commander's last step;
     scene_step_at as in `closed_loop`.
     """
     field = field_at(int(motion.stamp_ns[0]))
@@ -86,18 +88,24 @@ def open_loop(
         elif goal is None:
             goal, guide = guided_goal(model, task.frame, q, v)
         rate = rate_of(config, model, scene_step_at, int(stamp), q)
-        step = controller.step(q, goal, distance_rate=rate, guide=guide, last_velocity=v)
+        margins.append(controller.margin_of(q, v, distance_rate=rate))
+        if commander.is_over:
+            steps.append(None)
+            continue
+        moment = Moment(stamp_ns=int(stamp), q=q, T_world_goal=goal, guide=guide, last_velocity=v, distance_rate=rate)
+        step = commander.step(controller, moment)
         commanded[index] = step.velocity
         steps.append(step)
-        margins.append(controller.margin_of(q, v, distance_rate=rate))
     return OpenLoopTrace(
         logged=np.asarray(motion.velocity), commanded=commanded, steps=tuple(steps), margins=tuple(margins)
     )
 
 
 def is_shaped(step: ControlStep | None, kind: RowKind | None = None) -> bool:
-    """True where a row (of a kind) shapes the command, or without a kind where the step was not plainly taken."""
-    if step is None:
+    """True where a row (of a kind) shapes the command, or without a kind where the step was not plainly taken; what
+    shapes the command of a controller that is not ours is not known.
+    """
+    if step is None or step.rung is Rung.OUTSIDE:
         return False
     if kind is not None:
         return any(row.kind is kind for row in step.interventions)

@@ -85,7 +85,7 @@ class ClarabelSolver:
         """Solve; a program whose numbers are not finite comes back unsolved."""
         num_rows = len(program.h)
         if not is_finite(program):
-            return unsolved(program, "NotFinite")
+            return unsolved(len(program.c), len(program.h), "NotFinite")
         solver = clarabel.DefaultSolver(
             sparse.csc_matrix(np.triu(program.H)),
             program.c,
@@ -123,7 +123,7 @@ class DaqpSolver:
     def solve(self, program: QuadraticProgram) -> QpSolution:
         """Solve; a program whose numbers are not finite comes back unsolved."""
         if not is_finite(program):
-            return unsolved(program, "NotFinite")
+            return unsolved(len(program.c), len(program.h), "NotFinite")
         z, _, flag, info = daqp.solve(
             np.ascontiguousarray(program.H),
             np.ascontiguousarray(program.c),
@@ -155,11 +155,11 @@ def is_finite(program: QuadraticProgram) -> bool:
     return all(bool(np.isfinite(a).all()) for a in (program.H, program.c, program.G, program.h))
 
 
-def unsolved(program: QuadraticProgram, status: str) -> QpSolution:
+def unsolved(num_variables: int, num_rows: int, status: str) -> QpSolution:
     """A solution that says why there is none."""
     return QpSolution(
-        z=np.full(len(program.c), np.nan),
-        multipliers=np.full(len(program.h), np.nan),
+        z=np.full(num_variables, np.nan),
+        multipliers=np.full(num_rows, np.nan),
         status=status,
         is_solved=False,
         residuals=Residuals(primal=np.inf, dual=np.inf, gap=np.inf),

@@ -23,7 +23,7 @@ from splatctrl_cli.control.preconditions import (
 )
 from splatctrl_cli.control.qp import QpSolver
 from splatctrl_cli.control.scene_field import SceneStepAt, rate_of
-from splatctrl_cli.control.step import ControlStep, QpIkController
+from splatctrl_cli.control.step import OURS, Commander, ControlStep, Moment, QpIkController
 from splatctrl_cli.records import DistanceField, Float64, FloatRows, Stamps
 
 FieldAt = Callable[[int], DistanceField]
@@ -36,6 +36,7 @@ class Outcome(StrEnum):
     STALLED = "stalled"
     TIMEOUT = "timeout"
     LOG_ENDED = "log-ended"
+    CONTROLLER_FAILED = "controller-failed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,13 +165,14 @@ def closed_loop(
     solver: QpSolver | None = None,
     plan_detour: PlanDetour | None = None,
     record: StepRecord | None = None,
+    commander: Commander = OURS,
 ) -> ReplayTrace:
-    """Integrate the controller's velocities at `config.period` until the goal, a stall or `config.max_time`.
+    """Integrate the commander's velocities at `config.period` until the goal, a stall or `config.max_time`.
 
     field_at gives the field known at a stamp [ns], the same object for the same scene; scene_step_at the two newest
     scenes, for `config.distance_rate`. At a stall plan_detour is asked for a way out, `config.max_detours` times.
-    record: where the steps are kept, None for memory. Raises InputError for a start outside the limits or a goal out
-    of reach, NotEvaluableError for a start in collision or outside the field.
+    record: where the steps are kept, None for memory; commander: who gives the velocities. Raises InputError for a
+    start outside the limits or a goal out of reach, NotEvaluableError for a start in collision or outside the field.
     """
     q = checked_posture(model, task.start, what="start")
     check_within_limits(model, q, config.limit_tolerance)
@@ -195,8 +197,14 @@ def closed_loop(
             controller = controller.with_field(field)
         rate = rate_of(config, model, scene_step_at, stamp, q)
         goal, guide = course.goal(stamp, q)
-        step = controller.step(q, goal, distance_rate=rate, guide=guide, last_velocity=last_velocity)
+        moment = Moment(
+            stamp_ns=stamp, q=q, T_world_goal=goal, guide=guide, last_velocity=last_velocity, distance_rate=rate
+        )
+        step = commander.step(controller, moment)
         kept.add(stamp, q, step)
+        if commander.is_over:
+            outcome = Outcome.CONTROLLER_FAILED
+            break
         if task.last_ns is None:
             positions.append(q)
         if course.has_ended(stamp, index, step):

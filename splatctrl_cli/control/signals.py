@@ -87,16 +87,18 @@ def stale_signal(age_s: Float64, max_age_s: float) -> Signal:
 
 def step_signals(steps: Sequence[ControlStep | None]) -> list[Signal]:
     """What the controller did at T states; None where it was not asked."""
+
+    def relaxed(i: int) -> Sequence[str]:
+        return [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)]
+
     signals = [_intervention_signal(steps, kind) for kind in RowKind]
     slack = _of(steps, lambda step: max((row.slack for row in step.relaxed), default=0.0))
-    signals.append(
-        Signal(
-            kind=EventKind.RELAXED,
-            is_on=slack > 0,
-            value=slack,
-            names_at=lambda i: [row.name for row in sorted(_asked(steps, i).relaxed, key=lambda row: -row.slack)],
-        )
-    )
+    is_outside = _of(steps, lambda step: float(step.rung is Rung.OUTSIDE)) > 0
+    for kind, is_on in (
+        (EventKind.RELAXED, (slack > 0) & ~is_outside),
+        (EventKind.ROW_BROKEN, (slack > 0) & is_outside),
+    ):
+        signals.append(Signal(kind=kind, is_on=is_on, value=slack, names_at=relaxed))
     residual, clearance = _of(steps, lambda step: step.residual), _of(steps, lambda step: step.clearance)
     is_least = _of(steps, lambda step: float(step.rung is Rung.MINIMUM_VIOLATION)) > 0
     is_hold = _of(steps, lambda step: float(step.rung is Rung.HOLD)) > 0

@@ -1,19 +1,20 @@
 """One step of the QP-IK controller of III-E: query the field, build the rows, solve, look at the field again."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MULTIPLIER, STEP_SCALES, WITHIN_SHARE
 from splatctrl_cli.control.arm import ArmModel
-from splatctrl_cli.control.fallbacks import Choice, Rung, descend
+from splatctrl_cli.control.fallbacks import Choice, Rung, descend, held
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
 from splatctrl_cli.control.printed_program import PAPER, solve_printed
-from splatctrl_cli.control.qp import QpSolver, solver_named
+from splatctrl_cli.control.qp import QpSolver, solver_named, unsolved
 from splatctrl_cli.control.qp_rows import RowBuilder, Rows
 from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
 from splatctrl_cli.records import Bool, DistanceField, Float64
@@ -82,6 +83,27 @@ class ControlStep:
         return tuple(intervention.name for intervention in self.interventions)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """What a controller is told at a step: the stamp [ns], and the rest as `QpIkController.step` takes it."""
+
+    stamp_ns: int
+    q: Float64
+    T_world_goal: Float64
+    guide: Guide | None
+    last_velocity: Float64
+    distance_rate: float | Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """What is known at a moment before anyone decides: the pose error (6,) [m, rad], the state and its rows."""
+
+    error: Float64
+    state: State
+    rows: Rows
+
+
 class QpIkController:
     """Drives a frame of an arm to a goal pose under the barrier rows of a distance field (paper, III-E)."""
 
@@ -137,10 +159,32 @@ class QpIkController:
         held until now, from which accelerations and smoothness count (None: they do not). Raises InputError for a q
         that is not finite, NotEvaluableError where the field has no distance.
         """
-        q = checked_posture(self._model, q)
         config = self._config
-        error = pose_error(self._model.frame_pose(q, self._frame), T_world_goal)
         rest = self._limits.rest(last_velocity)
+        view = self._viewed(q, T_world_goal, distance_rate, guide, last_velocity)
+        error, state, rows = view.error, view.state, view.rows
+        costs = [term.rows(state) for term in self._costs]
+        if config.preset == PAPER:
+            printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
+            return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
+        rows, choice, is_kept = self._descended(state, [*costs, self._reach.rows(state)], rows)
+        scale = 1.0 if is_kept else self._kept_scale(q, choice, rows, rest)
+        return self._reported(error, rows, choice, rest, scale)
+
+    def view(self, moment: Moment) -> View:
+        """What a step at a moment would go by. Raises as `step`."""
+        return self._viewed(moment.q, moment.T_world_goal, moment.distance_rate, moment.guide, moment.last_velocity)
+
+    def _viewed(
+        self,
+        q: Float64,
+        T_world_goal: Float64,
+        distance_rate: float | Float64,
+        guide: Guide | None,
+        last_velocity: Float64 | None,
+    ) -> View:
+        q = checked_posture(self._model, q)
+        error = pose_error(self._model.frame_pose(q, self._frame), T_world_goal)
         state = State(
             model=self._model,
             frame=self._frame,
@@ -151,14 +195,33 @@ class QpIkController:
             last_velocity=last_velocity,
             distance_rate=distance_rate,
         )
-        rows = self._builder.at(state)
-        costs = [term.rows(state) for term in self._costs]
-        if config.preset == PAPER:
-            printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
-            return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
-        rows, choice, is_kept = self._descended(state, [*costs, self._reach.rows(state)], rows)
-        scale = 1.0 if is_kept else self._kept_scale(q, choice, rows, rest)
-        return self._reported(error, rows, choice, rest, scale)
+        return View(error=error, state=state, rows=self._builder.at(state))
+
+    def given(self, view: View, velocity: Float64 | None, status: str = "") -> ControlStep:
+        """A velocity (J,) [rad/s] of somebody else as a step, whose slack is by how much it breaks the rows; None
+        where there is none: the arm comes to rest. status: what there is to say of it.
+        """
+        rest, rows = self._limits.rest(view.state.last_velocity), view.rows
+        J, M = len(rest), int(rows.in_qp.sum())
+        choice = replace(
+            held(J, M, unsolved(J, M, status), num_refused=0),
+            velocity=rest if velocity is None else velocity,
+            rung=Rung.HOLD if velocity is None else Rung.OUTSIDE,
+        )
+        if velocity is not None and M:
+            broken = np.concatenate([barrier.G @ velocity - barrier.h for barrier in rows.for_qp])
+            choice = replace(choice, slack=np.maximum(broken, 0.0))
+        return self._reported(view.error, rows, choice, rest, 1.0)
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """Of every row (M,)."""
+        return self._row_names
+
+    @property
+    def row_kinds(self) -> tuple[RowKind, ...]:
+        """Of every row (M,)."""
+        return self._builder.kinds
 
     def margin_of(
         self,
@@ -283,6 +346,38 @@ class QpIkController:
 
     def _named(self, rows: Bool) -> tuple[str, ...]:
         return tuple(self._row_names[i] for i in np.flatnonzero(rows))
+
+
+class Commander(Protocol):
+    """Who commands the arm; `controller` is ours in the scene of the moment, to ask or to go by."""
+
+    @property
+    def is_over(self) -> bool:
+        """True once there is nobody left to ask: the last step was to rest."""
+        ...
+
+    def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
+        """The step at a moment."""
+        ...
+
+
+class Ours:
+    """The `Commander` that leaves it to our own controller."""
+
+    is_over = False
+
+    def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
+        """See `Commander`."""
+        return controller.step(
+            moment.q,
+            moment.T_world_goal,
+            distance_rate=moment.distance_rate,
+            guide=moment.guide,
+            last_velocity=moment.last_velocity,
+        )
+
+
+OURS = Ours()
 
 
 def _blend(velocity: Float64, rest: Float64, scale: float) -> Float64:

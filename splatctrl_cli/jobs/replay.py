@@ -29,6 +29,7 @@ from splatctrl_cli.jobs.replays.inputs import (
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene, reads_whole_log
 from splatctrl_cli.jobs.replays.metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replays.modes import replayed
+from splatctrl_cli.jobs.replays.outside import check_controller
 from splatctrl_cli.jobs.replays.pictures import draw_worst_frames, worst_sights
 from splatctrl_cli.jobs.replays.provenance import Mismatch, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replays.request import MODES, ReplayInputs, ReplayRequest
@@ -119,6 +120,7 @@ def check_request(request: ReplayRequest) -> None:
     check_evidence(request)
     check_twists(request)
     check_goal(request)
+    check_controller(request)
 
 
 def _seen_by_cameras(

@@ -233,7 +233,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--evidence cam0", 2, "the camera trained"),
         ("--evidence cam9 --set verdict.evidence_reach=nan", 2, "expected 0.001 to 10 m"),
         ("--baseline standstill", 2, "--baseline: expected --mode closed-loop"),
-        ("--baseline prm", 2, "expected standstill, birrt, birrt-ik, got 'prm'"),
+        ("--baseline prm", 2, "expected standstill, birrt, birrt-ik, qp-ik, got 'prm'"),
     ],
     ASK: [
         ("--re-anchor 1", 2, "--re-anchor: expected --mode closed-loop, got open-loop"),

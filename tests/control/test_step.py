@@ -140,7 +140,7 @@ def test_usable_needs_the_status_and_the_residual() -> None:
     good = ClarabelSolver().solve(program)
     assert is_usable(good, 1e-6)
     assert not is_usable(good, 0.0)
-    assert not is_usable(unsolved(program, "x"), np.inf)
+    assert not is_usable(unsolved(1, 1, "x"), np.inf)
 
 
 class Cliff:

@@ -12,7 +12,8 @@ from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Outcome, Reason
 from splatctrl_cli.jobs.replays import evidence_criteria as evidence
-from splatctrl_cli.jobs.replays.motion_criteria import controller, surface_clearance
+from splatctrl_cli.jobs.replays.control_criteria import controller
+from splatctrl_cli.jobs.replays.motion_criteria import surface_clearance
 
 NUM = 11
 UNKNOWN = np.full(NUM, np.nan)
@@ -23,6 +24,7 @@ def judged(**replay: Any) -> Any:
     """What the criteria look at, of a run with nothing broken but `replay`."""
     stamps = np.arange(NUM, dtype=np.int64) * 100_000_000
     run = {
+        "outside": None,
         "audit": SimpleNamespace(stamp_ns=stamps, clearance={}, unknown_share=np.zeros(NUM)),
         "between": {"unbounded": np.zeros(NUM - 1), "surface": np.full(NUM, 0.1)},
         "margin": 0.02,

@@ -12,7 +12,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.control.audit import DistanceFunction
 from splatctrl_cli.control.goals import PlanDetour
 from splatctrl_cli.control.open_loop import is_shaped
-from splatctrl_cli.control.replay import ReplayTask
+from splatctrl_cli.control.replay import ReplayTask, ReplayTrace
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, GAP, TIME, Better, Scale
 from splatctrl_cli.jobs.progress import Progress
@@ -26,7 +26,7 @@ from splatctrl_cli.planner.tracking import follow_joints, follow_with_controller
 from splatctrl_cli.records import Float64
 from splatctrl_cli.report.replay_pictures import methods_picture
 
-BIRRT, BIRRT_IK = "birrt", "birrt-ik"
+BIRRT, BIRRT_IK, QP_IK = "birrt", "birrt-ik", "qp-ik"
 ALWAYS = ("closed_loop", "log")  # what stands in every comparison
 ROUNDING = 1e-5  # [m] taken off distances to splats, far above what float32 rounds within 8 m
 MOTION = {
@@ -104,7 +104,12 @@ def draw_methods(folder: Path, comparison: Comparison, period: float, margin: fl
 
 
 def check_comparable(request: ReplayRequest, baselines: Sequence[str]) -> None:
-    """Raise UsageError where a planner is asked for more than one goal."""
+    """Raise UsageError where a planner is asked for more than one goal, or our own controller beside itself."""
+    if QP_IK in baselines and request.controller is None and request.controller_command is None:
+        raise UsageError(
+            f"--baseline {QP_IK}: the closed loop is that already",
+            remedy="leave it out, or give --controller or --controller-command",
+        )
     if not {BIRRT, BIRRT_IK} & set(baselines):
         return
     for option, given in (
@@ -134,16 +139,17 @@ def compared(
     start_ns, control = int(trace.stamp_ns[0]), config.control
     log = inputs.motion()
     task = _task(request, inputs, trace.position[0], start_ns, log.position[-1])
-    shaped = np.array([is_shaped(step) for step in trace.steps], dtype=np.bool_)
     num = max(math.ceil((log.last_ns - start_ns) * 1e-9 / control.period - 1e-6), 0) + 1
     stamps = _stamps(start_ns, num, control.period)
     motions = {
-        "closed_loop": Motion(stamp_ns=trace.stamp_ns, position=np.asarray(trace.position), is_intervened=shaped),
+        "closed_loop": _driven(trace, is_ours=replay.outside is None),
         "log": Motion(stamp_ns=stamps, position=np.array([log.at(int(stamp))[0] for stamp in stamps])),
     }
     if "standstill" in baselines:
         held = replay.separations["standstill"]
         motions["standstill"] = Motion(stamp_ns=held.stamp_ns, position=held.position, is_intervened=held.is_stopped)
+    if replay.ours is not None:
+        motions[method_named(QP_IK)] = _driven(replay.ours, is_ours=True)
     plans: dict[str, PlannedPath] = {}
     if {BIRRT, BIRRT_IK} & set(baselines):
         plans, followed = _planned(baselines, inputs, task, config, console)
@@ -156,6 +162,13 @@ def compared(
         figures={method: yardstick.figures(motion) for method, motion in motions.items()},
         plans=plans,
     )
+
+
+def _driven(trace: ReplayTrace, *, is_ours: bool) -> Motion:
+    """The motion of a closed loop; where a user's own controller intervened is not known."""
+    shaped = np.array([is_shaped(step) for step in trace.steps], dtype=np.bool_)
+    position = np.asarray(trace.position)
+    return Motion(stamp_ns=trace.stamp_ns, position=position, is_intervened=shaped if is_ours else None)
 
 
 def _planned(

@@ -25,7 +25,7 @@ from splatctrl_cli.records import Float64
 
 UNITS = {
     **dict.fromkeys(("below-margin", "in-collision", "between-states", "self-collision", "hold", "cannot-act"), "m"),
-    **{"outside-limits": "rad", "stale-map": "s", "not-bounded": "s", "relaxed": "m/s"},
+    **{"outside-limits": "rad", "stale-map": "s", "not-bounded": "s", "relaxed": "m/s", "row-broken": "m/s"},
 }
 _SPECIAL = re.compile('[,"\r\n]')
 
@@ -153,6 +153,8 @@ def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, coverage: str
         "units": "m, rad, s",
         "min_clearance": "the smallest exact distance from a moving sphere's surface to the splats",
     }
+    if replay.outside is not None:
+        words["controller"] = replay.outside.name
     return {
         "verdict": verdict.as_dict(),
         "when_and_why": when_and_why(replay),
@@ -180,7 +182,7 @@ def events_document(replay: Replay) -> dict[str, Any]:
 def when_and_why(replay: Replay) -> list[str]:
     """The first intervention and the first trouble in a sentence each, and how often each kind of event came up."""
     lines = []
-    if replay.steps:
+    if replay.steps and replay.outside is None:
         first = first_intervention(replay.events)
         lines.append("first intervention: none" if first is None else f"first intervention: {told(first)}")
     troubles = [event for event in replay.events if event.kind not in INTERVENTIONS and event.source in SHOWN]

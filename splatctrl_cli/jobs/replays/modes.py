@@ -10,13 +10,15 @@ from splatctrl_cli.control.barriers import scene_margin
 from splatctrl_cli.control.goals import LoggedMotion, TwistTrack
 from splatctrl_cli.control.open_loop import OpenLoopTask, open_loop
 from splatctrl_cli.control.preconditions import StaticViolation, check_within_limits, static_violations
-from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, closed_loop, divergence, scene_change
+from splatctrl_cli.control.replay import ReplayTask, ReplayTrace, StepRecord, closed_loop, divergence, scene_change
+from splatctrl_cli.control.step import OURS, Commander
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.jobs.progress import Progress
-from splatctrl_cli.jobs.replays.compare import compared, planned_ways_out
+from splatctrl_cli.jobs.replays.compare import QP_IK, compared, planned_ways_out
 from splatctrl_cli.jobs.replays.goal import goal_waypoints, twist_figures, twist_track
 from splatctrl_cli.jobs.replays.inputs import check_inside
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
+from splatctrl_cli.jobs.replays.outside import commander_of, outside_run
 from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone, separations
@@ -58,23 +60,29 @@ def _asked(request: ReplayRequest, inputs: ReplayInputs, config: Config, console
         task = OpenLoopTask(frame=frame, T_world_goal=goals[-1].T_world_goal, home=goals[-1].posture)
     console.log(f"replay: asking the controller at {len(states) - first} states")
     asked = StoredOpenLoop()
-    for stamps, positions, velocities in _blocks(record, states, first):
-        part = record.measured(stamps, positions, velocities)
-        trace = open_loop(
-            model,
-            config.control,
-            LoggedMotion(stamp_ns=stamps, position=positions, velocity=velocities),
-            task,
-            lambda stamp: scene.at(stamp).barrier,
-            has_distance=np.all([np.isfinite(c.distance) for c in part.clearance.values()], axis=0),
-            scene_step_at=scene.step_at,
-        )
-        asked.add(trace)
-        record.explain(part, trace.steps)
+    with commander_of(request, model, config.control, console, frame=frame, home=task.home) as commander:
+        for stamps, positions, velocities in _blocks(record, states, first):
+            part = record.measured(stamps, positions, velocities)
+            trace = open_loop(
+                model,
+                config.control,
+                LoggedMotion(stamp_ns=stamps, position=positions, velocity=velocities),
+                task,
+                lambda stamp: scene.at(stamp).barrier,
+                has_distance=np.all([np.isfinite(c.distance) for c in part.clearance.values()], axis=0),
+                scene_step_at=scene.step_at,
+                commander=commander,
+            )
+            asked.add(trace)
+            record.explain(part, trace.steps)
     audit = record.audit
     figures = twist_figures(model, config.control, frame, twists, audit.stamp_ns, audit.position, asked.steps)
     return replace(
-        _logged(request, inputs, config, record, first), open_loop=asked, kept_steps=asked.kept, twist_figures=figures
+        _logged(request, inputs, config, record, first),
+        open_loop=asked,
+        kept_steps=asked.kept,
+        twist_figures=figures,
+        outside=outside_run(commander),
     )
 
 
@@ -99,15 +107,8 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
     limit = "to the log's end" if task.last_ns is not None else f"at most {config.control.max_time:g} s"
     console.log(f"replay: from {start_s:.2f} s of the log, {limit}")
     loop = StoredLoop(model.num_joints)
-    trace = closed_loop(
-        model,
-        config.control,
-        task,
-        lambda stamp: scene.at(stamp).barrier,
-        scene_step_at=scene.step_at,
-        plan_detour=planned_ways_out(inputs, task, config),
-        record=loop,
-    )
+    with commander_of(request, model, config.control, console, frame=task.frame, home=task.home) as commander:
+        trace = _trace(inputs, task, config, loop, commander)
     trace = _with_next_scene(trace, scene, model)
     apart = Figures()
     for first, last in record.blocks(trace.stamp_ns):
@@ -125,6 +126,29 @@ def _driven(request: ReplayRequest, inputs: ReplayInputs, config: Config, consol
         twist_figures=twist_figures(
             model, config.control, task.frame, task.twists, trace.stamp_ns, trace.position, trace.steps
         ),
+        outside=outside_run(commander),
+        ours=_trace(inputs, task, config) if QP_IK in request.baseline else None,
+    )
+
+
+def _trace(
+    inputs: ReplayInputs,
+    task: ReplayTask,
+    config: Config,
+    record: StepRecord | None = None,
+    commander: Commander = OURS,
+) -> ReplayTrace:
+    """The closed loop of a commander."""
+    scene = inputs.scene
+    return closed_loop(
+        inputs.model,
+        config.control,
+        task,
+        lambda stamp: scene.at(stamp).barrier,
+        scene_step_at=scene.step_at,
+        plan_detour=planned_ways_out(inputs, task, config),
+        record=record,
+        commander=commander,
     )
 
 

@@ -7,12 +7,11 @@ import numpy as np
 
 from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, MOUNTED_CHANGE, STATIC_CHANGE
 from splatctrl_cli.control.events import Event, EventKind
-from splatctrl_cli.control.replay import Outcome as LoopOutcome
-from splatctrl_cli.evaluate.verdict import Criterion, Outcome, Reason, failed, held, lacking
+from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
+from splatctrl_cli.jobs.replays.control_criteria import commanded, controller, goal, scene_hits
 from splatctrl_cli.jobs.replays.criteria_input import (
     BROKEN,
     CONTACT,
-    CONTROL,
     LIMITS,
     MARGIN,
     SLOW,
@@ -192,8 +191,12 @@ def position_limits(judged: Judged) -> Iterator[Reason]:
 
 
 def velocity_limits(judged: Judged) -> Iterator[Reason]:
-    """At most one percent above those of the URDF."""
-    yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST)
+    """At most one percent above those of the URDF, in the motion and in the commands of a controller of one's own."""
+    too_fast = commanded(judged)
+    if too_fast is None:
+        yield from _share_of_limit(judged, "velocity", EventKind.TOO_FAST)
+    else:
+        yield too_fast
 
 
 def acceleration_limits(judged: Judged) -> Iterator[Reason]:
@@ -217,65 +220,6 @@ def _share_of_limit(judged: Judged, column: str, kind: EventKind) -> Iterator[Re
         yield _at_worst(worst, reason)
     elif len(judged.replay.model.joint_names) and (kind is EventKind.TOO_FAST or most > 0):
         yield held(f"at most {most:.2f} of the limit", most, 1.0, "", judged.num_states)
-
-
-def controller(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: every step is solved."""
-    trace, metrics = judged.replay.closed_loop, judged.metrics
-    if trace is None:
-        return
-    bad = {name: metrics[f"num_{name}"] or 0 for name in ("relaxed", "minimum_violation", "hold")}
-    if not sum(bad.values()):
-        yield held(f"all {len(trace.steps)} steps solved", 0.0, 0.0, "", len(trace.steps))
-        return
-    kinds = (EventKind.RELAXED, EventKind.MINIMUM_VIOLATION, EventKind.HOLD)
-    first = min((e for kind in kinds for e in events_of(judged.replay, kind)), key=lambda e: e.first_ns)
-    found = ", ".join(f"{int(count)} {name.replace('_', ' ')}" for name, count in bad.items() if count)
-    yield failed(
-        sentence=f"its rows could not be kept at {found} of {len(trace.steps)} steps, first",
-        value=float(sum(bad.values())),
-        threshold=0.0,
-        time_s=first.start_s,
-        who=first.worst_name,
-        cause="" if first.obstacle is None else f"near {first.obstacle}",
-        count=len(trace.steps),
-        label=CONTROL,
-    )
-
-
-def scene_hits(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: nothing appears inside the arm."""
-    trace = judged.replay.closed_loop
-    if trace is None:
-        return
-    hits = judged.metrics["num_scene_hits"] or 0
-    if hits:
-        change = next(change for change in trace.scene_changes if change.is_hit)
-        yield failed(
-            sentence=f"the scene came into the arm {int(hits)} times, first",
-            value=float(hits),
-            threshold=0.0,
-            time_s=float(change.stamp_ns - judged.replay.audit.stamp_ns[0]) * 1e-9,
-            count=len(trace.scene_changes),
-            label=CONTACT,
-        )
-
-
-def goal(judged: Judged) -> Iterator[Reason]:
-    """Closed loop: the goal is reached."""
-    trace, request = judged.replay.closed_loop, judged.request
-    if trace is None or request.follow or request.twist_topic is not None:
-        return
-    reached = trace.outcome is LoopOutcome.GOAL_REACHED
-    yield Reason(
-        outcome=Outcome.PASSED if reached else Outcome.FAILED,
-        sentence="reached" if reached else f"not reached: {trace.outcome}",
-        value=float(reached),
-        threshold=1.0,
-        count=len(trace.steps),
-        label="goal not reached",
-        remedy="" if reached else "--set control.max_detours=3 lets the planner find a way round",
-    )
 
 
 def surface_clearance(judged: Judged) -> Iterator[Reason]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.control.arm import sphere_names
-from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event
+from splatctrl_cli.control.events import INTERVENTIONS, SHOWN, Event, EventKind
 from splatctrl_cli.evaluate.worst_frames import Moment, Sight, draw_sight, sights_of, worst_moments
 from splatctrl_cli.jobs.replays.request import ReplayInputs
 from splatctrl_cli.jobs.replays.result import Replay
@@ -42,13 +42,15 @@ def draw_replay(folder: Path, replay: Replay, seconds: Float64) -> None:
         title += f", from {replay.start_time_s:.2f} s of the log"
     clearance_picture(folder / "clearance.png", seconds, curves, replay.margin, title, happened)
     if replay.kept_steps is not None:
+        broken = frozenset({EventKind.ROW_BROKEN})
+        kinds, rows = (INTERVENTIONS, ROWS) if replay.outside is None else (broken, tuple(broken))
         commands_picture(
             folder / "commands.png",
             seconds,
             replay.kept_steps.velocity,
             replay.model.joint_names,
             replay.model.velocity_limit,
-            _intervals(replay, lambda event: event.kind in INTERVENTIONS, at_least=ROWS),
+            _intervals(replay, lambda event: event.kind in kinds, at_least=rows),
             None if replay.open_loop is None else replay.open_loop.logged,
         )
     if replay.open_loop is not None:

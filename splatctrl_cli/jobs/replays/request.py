@@ -8,6 +8,7 @@ from pathlib import Path
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.control.goals import LoggedMotion
+from splatctrl_cli.control.outside import STEP_LIMIT
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.provenance import Mismatch
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -29,7 +30,8 @@ class ReplayRequest:
     baked grid) and `lockstep` (reconstruct the log on the way) says what is known of the scene. base: pose of the
     URDF's root in world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves. Times in
     seconds; start_time may be FIRST_MAP. evidence: a camera, or every how many frame sets, that did not train the
-    scene and bounds its error; with require_evidence no verdict passes without. report_only: the verdict alone does
+    scene and bounds its error; with require_evidence no verdict passes without. controller: a user's own class,
+    ``module:Class``, or controller_command: a program (docs/controllers.md). report_only: the verdict alone does
     not set the exit code.
     """
 
@@ -64,6 +66,10 @@ class ReplayRequest:
     max_map_age: float = 1.0
     evidence: str | None = None
     require_evidence: bool = False
+    controller: str | None = None
+    controller_command: str | None = None
+    controller_step_limit: float = STEP_LIMIT
+    controller_twice: bool = False
     golden: Path | None = None
     golden_tolerance: float = 1e-6
     baseline: tuple[str, ...] = ()

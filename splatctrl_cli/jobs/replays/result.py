@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from splatctrl_cli.config import Config
 from splatctrl_cli.control.events import Event
+from splatctrl_cli.control.outside import Failure
 from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.replay import ReplayTrace
 from splatctrl_cli.control.standstill import Separation
@@ -34,6 +35,15 @@ class Comparison:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OutsideRun:
+    """A user's own controller: what people call it, how often it answered as it should, and what ended it."""
+
+    name: str
+    num_answers: int
+    failure: Failure | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Replay:
     """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
 
@@ -42,7 +52,8 @@ class Replay:
     obstacles (T,): what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps:
     of a controller; divergence: of a closed loop from the log, by columns joints [rad], position [m], rotation [rad];
     map_error: where the request names evidence of it; separations: with a standstill the distances from people, by
-    name of the motion, sampled at `period` [s]; comparison: every motion of --baseline and its figures.
+    name of the motion, sampled at `period` [s]; comparison: every motion of --baseline and its figures; outside: of a
+    user's own controller, and ours, with the baseline qp-ik: our controller in its place.
     """
 
     model: RobotModel
@@ -71,6 +82,8 @@ class Replay:
     comparison: Comparison = field(default_factory=Comparison)
     twist_figures: Mapping[str, float | None] = field(default_factory=dict)
     map_error: MapError | None = None
+    outside: OutsideRun | None = None
+    ours: ReplayTrace | None = None
 
     @property
     def margin(self) -> float:

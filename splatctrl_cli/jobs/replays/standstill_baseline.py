@@ -20,7 +20,7 @@ from splatctrl_cli.control.standstill import (
 )
 from splatctrl_cli.errors import NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, GAP, Better, Scale
-from splatctrl_cli.jobs.replays.compare import BIRRT, BIRRT_IK, check_comparable
+from splatctrl_cli.jobs.replays.compare import BIRRT, BIRRT_IK, QP_IK, check_comparable
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.records import Box, Float64
@@ -39,7 +39,7 @@ FIGURES = {
 }
 STANDSTILL = "standstill"
 BESIDE = ("closed_loop", STANDSTILL)
-BASELINES = (STANDSTILL, BIRRT, BIRRT_IK)
+BASELINES = (STANDSTILL, BIRRT, BIRRT_IK, QP_IK)
 
 
 def read_baselines(request: ReplayRequest) -> tuple[str, ...]:

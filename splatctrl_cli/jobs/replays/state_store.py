@@ -239,7 +239,9 @@ class StoredSteps:
 
 def _figures_of(step: ControlStep) -> tuple[float, ...]:
     """`STEP_FIGURES` of a step."""
-    shaped = (is_shaped(step), *(is_shaped(step, kind) for kind in RowKind))
+    shaped: tuple[float, ...] = (is_shaped(step), *(is_shaped(step, kind) for kind in RowKind))
+    if step.rung is Rung.OUTSIDE:
+        shaped = (np.nan,) * len(shaped)
     return (step.clearance, step.residual, step.scale, RUNGS.index(step.rung), step.num_refused, *shaped)
 
 

@@ -1,5 +1,6 @@
 """The verdict of a replay: every criterion of *safe*, with what it found, when, where and what to do about it."""
 
+from splatctrl_cli.control.line_process import shown
 from splatctrl_cli.evaluate.gates import gate_reasons
 from splatctrl_cli.evaluate.verdict import Verdict, verdict_of
 from splatctrl_cli.jobs.replays.criteria_input import CONTACT, SAFE, Judged, nearby
@@ -32,10 +33,11 @@ def replay_verdict(judged: Judged, golden: Golden | None = None) -> Verdict:
     stamps = replay.audit.stamp_ns
     first, last = replay.start_time_s, replay.start_time_s + float(stamps[-1] - stamps[0]) * 1e-9
     motion = "driven" if replay.closed_loop else "logged"
+    who = "" if replay.outside is None else f", controller {shown(replay.outside.name)}"
     return verdict_of(
         "replay",
         reasons,
-        scope=f"{motion} motion from {first:.2f} to {last:.2f} s of the log, {len(stamps)} states",
+        scope=f"{motion} motion from {first:.2f} to {last:.2f} s of the log, {len(stamps)} states{who}",
         passed=SAFE,
         notes=_notes(judged),
         counts=counts,

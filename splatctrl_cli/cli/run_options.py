@@ -1,0 +1,60 @@
+"""The options of ``batch``, ``compare``, ``report`` and ``view``: of many runs, and of looking at them."""
+
+import argparse
+from pathlib import Path
+
+from splatctrl_cli.cli.options import add_output
+from splatctrl_cli.cli.parser import Options, Parser, whole
+
+ROOT = "folder in which the scene and robot of a replay's command line are looked for, if they were moved"
+
+
+def report_options(add: Options, parser: Parser) -> None:
+    """Of ``report``."""
+    add("PATH", "the folder of a run, or of a batch", Path)
+    add_output(add, "HTML file to write", default="PATH.html, beside PATH")
+    add(
+        "--changes FILE.json",
+        "what changed against a baseline: a JSON list of objects, a row each (docs/report.md)",
+        Path,
+    )
+    add("--all-scenes", "of a batch, every replay in 3-D, not only the failed, changed and worst")
+    add("--root DIR ...", ROOT, Path)
+
+
+def view_options(add: Options, parser: Parser) -> None:
+    """Of ``view``."""
+    add("PATH", "a run, scene or field folder, a field.npz, or a splat file", Path)
+    add_output(add, "HTML file to write", default="PATH.html, beside PATH")
+    add("--no-open", "do not open it in a browser")
+    add("--root DIR ...", ROOT, Path)
+
+
+def batch_options(add: Options, parser: Parser) -> None:
+    """Of ``splatctrl batch``."""
+    add("SUITE", "TOML file of recordings and jobs (docs/batch.md); with --list also a batch's folder", Path)
+    add("-o/--out DIR", "folder of the batch, where it goes on (default: what the suite says, or SUITE.out)", Path)
+    add("--workers N", "nodes that run at once (default: one per core)", whole(1, 256))
+    add("--shard I/N", "only every N-th recording, from the I-th on", _shard)
+    add("--again", "run what is done, too")
+    add("--dry-run", "print the nodes and their command lines, and run nothing")
+    add("--dask ADDRESS", "run the nodes on a Dask cluster that shares this folder")
+    listing = add.group("ledger")
+    listing("--list", "print what ran last, and run nothing")
+    listing("--failed", "as --list, of what did not end as expected")
+    listing("--where COLUMN=VALUE ...", "as --list, of the runs for which it holds; also !=, <, >, <=, >=")
+    listing("--csv FILE", "as --list, into a table with every column", Path)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)):
+        raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, got {text!r}")
+    return int(index), int(count)
+
+
+def compare_options(add: Options, parser: Parser) -> None:
+    """Of ``splatctrl compare``."""
+    add("OUTPUT", "folder that a command or a batch wrote; of two the earlier first", Path, nargs="+")
+    add("--against FILE", "compare the only OUTPUT with this stored baseline", Path)
+    add("--update-baseline FILE", "write the last OUTPUT as a baseline, alone or after the comparison", Path)

@@ -1,0 +1,154 @@
+"""A process of somebody else that is asked a line at a time; what it may do wrong has a name, and bounds in time and
+memory.
+"""
+
+import os
+import selectors
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from enum import StrEnum
+
+MAX_LINE = 1 << 20  # bytes
+LEAVE_LIMIT = 20.0  # [s] for a process to end once it has closed its stdout: a busy machine takes seconds
+TAIL = 4096  # bytes of stderr that are kept
+
+
+class Fault(StrEnum):
+    """What a controller can do wrong."""
+
+    LATE = "late"
+    HUNG = "hung"
+    OUT_OF_TIME = "out of time"
+    CRASHED = "crashed"
+    ENDED = "ended"
+    NOT_JSON = "not JSON"
+    ENDLESS_LINE = "endless line"
+    OUT_OF_TURN = "out of turn"
+    OTHER_PROTOCOL = "other protocol"
+    WRONG_LENGTH = "wrong length"
+    NOT_FINITE = "not finite"
+    TOO_FAST = "too fast"
+    DIFFERS = "differs"
+
+
+class Misbehaved(Exception):  # noqa: N818  (a result, kept by name)
+    """A controller's fault, in a sentence."""
+
+    def __init__(self, fault: Fault, sentence: str) -> None:
+        super().__init__(f"{fault}: {sentence}")
+        self.fault, self.sentence = fault, sentence
+
+
+class LineProcess:
+    """A process that is asked a line at a time; its lines and what is kept of its stderr are bounded."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        """Raises OSError where it cannot be started."""
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0, start_new_session=True
+        )
+        streams = (self._process.stdin, self._process.stdout, self._process.stderr)
+        self._stdin, self._stdout, self._stderr = (stream.fileno() for stream in streams if stream is not None)
+        self._unsent, self._received, self._tail = bytearray(), bytearray(), b""
+        self._selector = selectors.DefaultSelector()
+        for number in (self._stdin, self._stdout, self._stderr):
+            os.set_blocking(number, False)
+        for number in (self._stdout, self._stderr):
+            self._selector.register(number, selectors.EVENT_READ)
+
+    def exchange(self, line: bytes, limit: float) -> bytes:
+        """Send a line, and return the next one that comes. Raises Misbehaved where none comes within `limit` [s]."""
+        deadline = time.monotonic() + limit
+        if not self._unsent:
+            self._selector.register(self._stdin, selectors.EVENT_WRITE)
+        self._unsent += line
+        while (end := self._received.find(b"\n")) < 0:
+            if len(self._received) > MAX_LINE:
+                raise Misbehaved(Fault.ENDLESS_LINE, f"printed more than {MAX_LINE >> 20} MiB without an end of line")
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise Misbehaved(Fault.HUNG, f"no answer within {limit:g} s{self.last_words()}")
+            self._transfer(left)
+        answer = bytes(self._received[:end])
+        del self._received[: end + 1]
+        return answer
+
+    def last_words(self) -> str:
+        """The last line of its stderr as an addition to a sentence, empty without one."""
+        lines = [line.strip() for line in self._tail.decode("utf-8", "replace").splitlines() if line.strip()]
+        return f": {shown(lines[-1])}" if lines else ""
+
+    def close(self) -> None:
+        """End it, with whatever it has started."""
+        self._selector.close()
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
+            if stream is not None:
+                with suppress(OSError):
+                    stream.close()
+        self._has_left(0.2)  # by itself, now that there is nothing to read
+        self._kill()
+
+    def _has_left(self, seconds: float) -> bool:
+        """Whether it ends by itself within so long. It is left as it is, so that nobody else gets its number."""
+        deadline, how = time.monotonic() + seconds, os.WEXITED | os.WNOWAIT | os.WNOHANG
+        while self._process.returncode is None and os.waitid(os.P_PID, self._process.pid, how) is None:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.005)
+        return True
+
+    def _kill(self) -> None:
+        """End it, with whatever it has started."""
+        if self._process.returncode is None:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+
+    def _transfer(self, timeout: float) -> None:
+        """Write and read what can be, after `timeout` [s] at most."""
+        for key, _ in self._selector.select(timeout):
+            if key.fd == self._stdin:
+                self._send()
+            elif key.fd == self._stderr:
+                if not self._keep_tail():
+                    self._selector.unregister(self._stderr)
+            elif not (part := os.read(self._stdout, 1 << 16)):
+                raise self._ended()
+            else:
+                self._received += part
+
+    def _send(self) -> None:
+        try:
+            del self._unsent[: os.write(self._stdin, self._unsent)]
+        except BrokenPipeError:  # what it says last, or how it ended, is still to come
+            self._unsent.clear()
+        if not self._unsent:
+            self._selector.unregister(self._stdin)
+
+    def _keep_tail(self) -> bool:
+        """Read of stderr what is there; False at its end."""
+        part = os.read(self._stderr, 1 << 16)
+        self._tail = (self._tail + part)[-TAIL:]
+        return bool(part)
+
+    def _ended(self) -> Misbehaved:
+        """How it ended, after its stdout did."""
+        has_left = self._has_left(LEAVE_LIMIT)
+        self._kill()
+        with suppress(BlockingIOError):
+            while self._keep_tail():
+                pass
+        status = self._process.returncode
+        if not has_left or status == 0:
+            return Misbehaved(Fault.ENDED, ("exit status 0" if has_left else "closed its stdout") + self.last_words())
+        how = f"exit status {status}" if status > 0 else f"killed by signal {-status} ({signal.strsignal(-status)})"
+        return Misbehaved(Fault.CRASHED, f"{how}{self.last_words()}")
+
+
+def shown(text: str) -> str:
+    """A program's words, short, on one line, and nothing in it that a terminal acts on."""
+    printable = "".join(c if c.isprintable() else "?" for c in text[:120])
+    return f"{printable} ..." if len(text) > 120 else printable

@@ -1,0 +1,290 @@
+"""A controller that is not ours, in a process of its own: a line of JSON goes in, a line comes back
+(docs/controllers.md).
+
+A Python class is asked in the same way, by a process of ours that has it (`user_controller.serve`).
+"""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig
+from splatctrl_cli.control.arm import ArmModel
+from splatctrl_cli.control.limits import JointLimits
+from splatctrl_cli.control.line_process import Fault, LineProcess, Misbehaved, shown
+from splatctrl_cli.control.step import ControlStep, Moment, QpIkController, View
+from splatctrl_cli.control.terms import RowKind
+from splatctrl_cli.control.user_controller import PROTOCOL
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.records import Float64
+
+STEP_LIMIT = 10.0  # [s] for one answer: of a machine that has other things to do, too
+PATIENCE = 3.0  # times that limit, after which an answer is not waited for any more
+START_LIMIT = 120.0  # [s] for the first answer: a program may load much
+RUN_LIMIT = 3600.0  # [s] for all answers together
+MAX_SPEED = 10.0  # times a joint's velocity limit; faster is no command
+SERVE = "import sys; from splatctrl_cli.control.user_controller import serve; serve(sys.argv[1])"
+
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """The fault that ended a controller at a stamp [ns]."""
+
+    fault: Fault
+    sentence: str
+    stamp_ns: int
+
+
+class Program:
+    """A controller that speaks the lines of docs/controllers.md."""
+
+    def __init__(self, name: str, command: Sequence[str], start: Document, step_limit: float) -> None:
+        """Start it and tell it the `start`. Raises InputError for one that cannot be started or is none."""
+        self._step_limit, self._seconds, self._num = step_limit, 0.0, 0
+        self.spent = 0.0  # [s] on the last step
+        try:
+            self._process = LineProcess(command)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(
+                f"{name}: cannot be started: {reason}", remedy="check its path, and that it may be executed"
+            ) from None
+        try:
+            limit = max(START_LIMIT, step_limit)
+            version = _document(self._process.exchange(_line(start), limit)).get("protocol")
+            if version != PROTOCOL:
+                raise Misbehaved(Fault.OTHER_PROTOCOL, f"expected protocol {PROTOCOL}, got {shown(repr(version))}")
+        except Misbehaved as error:
+            self.close()
+            is_gone = error.fault in {Fault.CRASHED, Fault.ENDED}
+            remedy = "what it is to do" if is_gone else "answer each line with one, and flush it"
+            raise InputError(f"{name}: at the start: {error}", remedy=f"{remedy}: docs/controllers.md") from None
+        except BaseException:
+            self.close()
+            raise
+
+    def velocity(
+        self, question: Document, rows: Callable[[], list[Document]], limits: Mapping[str, float]
+    ) -> Float64:
+        """The answer (J,) [rad/s] to a question, and where it asks for them the rows. limits (J) [rad/s]: by
+        joint. Raises Misbehaved.
+        """
+        self._num += 1
+        self.spent, has_rows = 0.0, False
+        line = _line({"id": self._num} | question)
+        while True:
+            answer = self._asked(line)
+            if answer.get("id") != self._num:
+                got = shown(repr(answer.get("id")))
+                raise Misbehaved(Fault.OUT_OF_TURN, f"expected the answer to id {self._num}, got one to {got}")
+            if answer.get("ask") != "rows" or has_rows:
+                return _velocity(answer, limits)
+            line, has_rows = _line({"rows": rows()}), True
+
+    def close(self) -> None:
+        """End it."""
+        self._process.close()
+
+    def _asked(self, line: bytes) -> Document:
+        """The answer to a line, within the limits."""
+        if self._seconds > RUN_LIMIT:
+            raise Misbehaved(Fault.OUT_OF_TIME, f"took {RUN_LIMIT:g} s for all its answers together")
+        began = time.monotonic()
+        answer = self._process.exchange(line, PATIENCE * self._step_limit)
+        seconds = time.monotonic() - began
+        self.spent, self._seconds = self.spent + seconds, self._seconds + seconds
+        if self.spent > self._step_limit:
+            raise Misbehaved(
+                Fault.LATE, f"answered after {self.spent:.3g} s, --controller-step-limit {self._step_limit:g}"
+            )
+        return _document(answer)
+
+
+class OutsideController:
+    """The `Commander` that asks a user's controller, or two of the same kind, which must agree to the bit.
+
+    num_answers, seconds, slowest: of the answers so far how many, how long [s] all of them and the slowest took.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        model: ArmModel,
+        config: ControlConfig,
+        *,
+        frame: str,
+        home: Float64 | None = None,
+        step_limit: float = STEP_LIMIT,
+        is_twice: bool = False,
+    ) -> None:
+        """name: as people call it. frame, home: as of `QpIkController`. Raises InputError where it cannot start."""
+        self.name, self.num_answers, self.seconds, self.slowest = name, 0, 0.0, 0.0
+        self.failure: Failure | None = None
+        self._model, self._frame = model, frame
+        self._programs: list[Program] = []
+        start = _start(model, config, frame, model.middle if home is None else home)
+        try:
+            for _ in range(2 if is_twice else 1):
+                self._programs.append(Program(name, command, start, step_limit))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End its processes."""
+        while self._programs:
+            self._programs.pop().close()
+
+    @property
+    def is_over(self) -> bool:
+        """See `Commander`."""
+        return self.failure is not None
+
+    def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
+        """See `Commander`."""
+        view = controller.view(moment)
+        question = _question(self._model, self._frame, moment, view)
+        try:
+            velocity = self._agreed(question, lambda: _rows(controller, view))
+        except Misbehaved as error:
+            self.failure = Failure(fault=error.fault, sentence=error.sentence, stamp_ns=moment.stamp_ns)
+            self.close()
+            return controller.given(view, None, str(error))
+        spent = max(program.spent for program in self._programs)
+        self.num_answers, self.seconds, self.slowest = (
+            self.num_answers + 1,
+            self.seconds + spent,
+            max(self.slowest, spent),
+        )
+        return controller.given(view, velocity)
+
+    def _agreed(self, question: Document, rows: Callable[[], list[Document]]) -> Float64:
+        limits = dict(zip(self._model.joint_names, self._model.velocity_limit.tolist(), strict=True))
+        velocity, *others = [program.velocity(question, rows, limits) for program in self._programs]
+        for other in others:
+            differs = np.flatnonzero(velocity != other)
+            if len(differs):
+                joint = int(differs[0])
+                name, values = self._model.joint_names[joint], (float(velocity[joint]), float(other[joint]))
+                raise Misbehaved(
+                    Fault.DIFFERS, f"two of it, asked the same, differ: {name} {values[0]} and {values[1]} rad/s"
+                )
+        return velocity
+
+
+def class_command(target: str) -> tuple[str, ...]:
+    """The command of a Python class ``module:Class``."""
+    return sys.executable, "-P", "-c", SERVE, target
+
+
+def _start(model: ArmModel, config: ControlConfig, frame: str, home: Float64) -> Document:
+    """The first line; see `ControllerStart`."""
+    acceleration = JointLimits.of(model, config).acceleration
+    return {
+        "protocol": PROTOCOL,
+        "joints": list(model.joint_names),
+        "lower": _list(model.lower),
+        "upper": _list(model.upper),
+        "velocity_limit": _list(model.velocity_limit),
+        "acceleration_limit": None if acceleration is None else _list(acceleration),
+        "frame": frame,
+        "home": _list(home),
+        "period": config.period,
+        "margin": config.margin,
+    }
+
+
+def _question(model: ArmModel, frame: str, moment: Moment, view: View) -> Document:
+    """The line of a step; see `ControllerInput`."""
+    guide = moment.guide
+    return {
+        "stamp_ns": moment.stamp_ns,
+        "q": _list(moment.q),
+        "dq": _list(moment.last_velocity),
+        "goal": _list(moment.T_world_goal),
+        "goal_twist": None if guide is None else _list(guide.twist),
+        "goal_posture": None if guide is None else _list(guide.posture),
+        "goal_velocity": None if guide is None else _list(guide.velocity),
+        "pose": _list(model.frame_pose(moment.q, frame)),
+        "error": _list(view.error),
+        "jacobian": _list(view.state.jacobian),
+    }
+
+
+def _rows(controller: QpIkController, view: View) -> list[Document]:
+    """The rows of the moving spheres, and of the pairs that the program needs; see `ClearanceRow`."""
+    rows, kinds = view.rows, controller.row_kinds
+    G = np.concatenate([barrier.G for barrier in rows.barriers])
+    h, distance = rows.h, rows.distance
+    return [
+        {
+            "name": name,
+            "kind": str(kinds[i]),
+            "distance": float(distance[i]),
+            "margin": float(rows.margin[i]),
+            "G": _list(G[i]),
+            "h": float(h[i]),
+        }
+        for i, name in enumerate(controller.row_names)
+        if rows.in_qp[i] or kinds[i] is RowKind.SCENE
+    ]
+
+
+def _list(values: Float64) -> list[Any]:
+    found: list[Any] = np.asarray(values, np.float64).tolist()
+    return found
+
+
+def _line(document: Mapping[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":")).encode() + b"\n"
+
+
+def _document(line: bytes) -> Document:
+    try:
+        document = json.loads(line.decode("utf-8"), parse_int=_whole)
+    except (ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict):
+        got = shown(line[:200].decode("utf-8", "replace"))
+        raise Misbehaved(Fault.NOT_JSON, f"expected a JSON object on a line, got {got!r}")
+    return document
+
+
+def _whole(digits: str) -> int | float:
+    """A whole number of JSON; infinite where it has more digits than any float."""
+    return int(digits) if len(digits) < 300 else math.inf
+
+
+def _velocity(answer: Document, limits: Mapping[str, float]) -> Float64:
+    """The velocity (J,) of an answer, none of it absurd."""
+    values = answer.get("velocity")
+    if not isinstance(values, list) or len(values) != len(limits) or any(type(v) not in (int, float) for v in values):
+        got = (
+            f"{len(values)}" if isinstance(values, list) and len(values) != len(limits) else shown(json.dumps(answer))
+        )
+        raise Misbehaved(Fault.WRONG_LENGTH, f"velocity: expected {len(limits)} numbers, got {got}")
+    for value, (joint, limit) in zip(values, limits.items(), strict=True):
+        if not math.isfinite(value):
+            raise Misbehaved(Fault.NOT_FINITE, f"velocity: expected finite numbers, got {value} of {joint}")
+        if abs(value) > MAX_SPEED * limit:
+            got = shown(repr(value))
+            raise Misbehaved(Fault.TOO_FAST, f"velocity: {got} rad/s of {joint}, whose limit is {limit:g}")
+    return np.array(values, np.float64)

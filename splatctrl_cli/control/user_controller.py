@@ -1,0 +1,178 @@
+"""A controller that is a Python class: what it is told, and the process that asks it (docs/controllers.md).
+
+The class runs in a process of its own and speaks the same lines as a program in any other language.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from splatctrl_cli.records import Float64
+
+PROTOCOL = 1
+"""The version of the lines; another one is refused."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerStart:
+    """What a controller is told once: the names (J,) of the joints in the order of all that follows, position limits
+    lower and upper (J,) [rad], velocity_limit (J,) [rad/s], acceleration_limit (J,) [rad/s^2] (None: no limit), the
+    frame that it drives, the posture home (J,) [rad] to lean to, the period [s] that a velocity is held for, and the
+    margin [m] to keep from the scene.
+    """
+
+    joints: tuple[str, ...]
+    lower: Float64
+    upper: Float64
+    velocity_limit: Float64
+    acceleration_limit: Float64 | None
+    frame: str
+    home: Float64
+    period: float
+    margin: float
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> "ControllerStart":
+        """Of the first line."""
+        arrays = ("lower", "upper", "velocity_limit", "acceleration_limit", "home")
+        return cls(
+            joints=tuple(document["joints"]),
+            frame=document["frame"],
+            period=document["period"],
+            margin=document["margin"],
+            **{name: _array(document[name]) for name in arrays},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClearanceRow:
+    """A velocity v (J,) [rad/s] keeps this row where ``G @ v <= h``; G (J,) [m/rad], h [m/s].
+
+    name: the moving sphere (kind "scene") or the pair of the arm's spheres (kind "self"); its distance [m] and the
+    margin [m] to keep.
+    """
+
+    name: str
+    kind: str
+    distance: float
+    margin: float
+    G: Float64
+    h: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerInput:
+    """What a controller is told at a step, in world: the stamp [ns], position q (J,) [rad] and velocity dq (J,)
+    [rad/s] of the joints, the goal's pose (4, 4), the frame's pose (4, 4), the error (6,) [m, rad] that is left (the
+    twist that carries the frame to the goal in a second, linear part first), and the frame's jacobian (6, J).
+
+    Of a goal that moves its goal_twist (6,) [m/s, rad/s]; the posture to lean to, goal_posture (J,) [rad], and its
+    velocity, goal_velocity (J,) [rad/s]. All three are None of a pose alone.
+    """
+
+    stamp_ns: int
+    q: Float64
+    dq: Float64
+    goal: Float64
+    goal_twist: Float64 | None
+    goal_posture: Float64 | None
+    goal_velocity: Float64 | None
+    pose: Float64
+    error: Float64
+    jacobian: Float64
+    ask_rows: Callable[[], Sequence[ClearanceRow]] = field(repr=False)
+
+    def rows(self) -> Sequence[ClearanceRow]:
+        """The clearance rows of our own controller here: one for each moving sphere, and one for each pair of spheres
+        of the arm that some allowed velocity could bring too near.
+        """
+        return self.ask_rows()
+
+
+class Controller(Protocol):
+    """A class of a user's own: made with a `ControllerStart`."""
+
+    def step(self, now: ControllerInput) -> Sequence[float] | Float64:
+        """The joint velocities (J,) [rad/s] to hold for a period."""
+        ...
+
+
+def serve(target: str) -> None:
+    """Answer the lines on stdin by the class ``module:Class`` until they end; what it prints goes to stderr."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    questions = os.fdopen(os.dup(0), encoding="utf-8")
+    os.dup2(2, 1)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    sys.stdout = sys.stderr
+
+    def answer(**document: object) -> None:
+        answers.write(json.dumps(document) + "\n")
+        answers.flush()
+
+    def line() -> dict[str, Any]:
+        text = questions.readline()
+        if not text:
+            sys.exit(0)
+        document: dict[str, Any] = json.loads(text)
+        return document
+
+    controller = class_named(target)(ControllerStart.of(line()))
+    answer(protocol=PROTOCOL)
+    while True:
+        asked = line()
+        known: list[Sequence[ClearanceRow]] = []
+
+        def rows(number: int = asked["id"], known: list[Sequence[ClearanceRow]] = known) -> Sequence[ClearanceRow]:
+            if not known:
+                answer(id=number, ask="rows")
+                known.append([_row(row) for row in line()["rows"]])
+            return known[0]
+
+        answer(id=asked["id"], velocity=_velocities(target, controller.step(_input(asked, rows))))
+
+
+def class_named(target: str) -> Callable[[ControllerStart], Controller]:
+    """The class ``module:Class``, the current folder being on the path. Exits with a sentence where there is none."""
+    module_name, _, name = target.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        module = import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise
+        sys.exit(f"no module {error.name} in {Path.cwd()} nor installed")
+    made: Callable[[ControllerStart], Controller] | None = getattr(module, name, None)
+    if not callable(made):
+        sys.exit(f"module {module_name} ({module.__file__}) has no class {name}")
+    return made
+
+
+def _input(asked: Mapping[str, Any], rows: Callable[[], Sequence[ClearanceRow]]) -> ControllerInput:
+    arrays = ("q", "dq", "goal", "goal_twist", "goal_posture", "goal_velocity", "pose", "error", "jacobian")
+    return ControllerInput(
+        stamp_ns=asked["stamp_ns"], ask_rows=rows, **{name: _array(asked[name]) for name in arrays}
+    )
+
+
+def _row(document: Mapping[str, Any]) -> ClearanceRow:
+    return ClearanceRow(**{**document, "G": np.array(document["G"], np.float64)})
+
+
+def _array(values: Sequence[Any] | None) -> Any:
+    return None if values is None else np.array(values, np.float64)
+
+
+def _velocities(target: str, velocity: Sequence[float] | Float64) -> object:
+    with suppress(TypeError, ValueError):
+        values = np.asarray(velocity, np.float64)
+        if values.ndim == 1:
+            return values.tolist()
+    raise TypeError(f"{target}.step: expected a row of joint velocities, got {repr(velocity)[:80]}")
