@@ -17,7 +17,6 @@ from splatctrl_cli import config
 from splatctrl_cli.checks.finding import CHECKS, Check
 from splatctrl_cli.cli.commands import COMMANDS, EXIT_CODES, build_parser
 from splatctrl_cli.cli.parser import Parser, invocation
-from splatctrl_cli.config import fixed
 from splatctrl_cli.config.load import type_name
 from splatctrl_cli.config.ranges import OneOf, Section
 from splatctrl_cli.datasets.layout import Layout
@@ -183,22 +182,15 @@ def config_page() -> str:
         f"margin = {config.ControlConfig.margin}",
         "```",
         "",
-        "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it.",
+        "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it. What is",
+        "fixed on purpose stands in `splatctrl_cli/config/fixed.py` with its unit and reason, the limits of `check` in",
+        "`splatctrl_cli/checks/limits.py`.",
     ]
     for section in fields(config.Config):
         kind: Any = type(getattr(config.Config(), section.name))
         rows = [_setting_row(kind, key) for key in kind.declared]
         lines += ["", f"## [{section.name}]", "", inspect.cleandoc(kind.__doc__), "", *_list(rows)]
-    return "\n".join([*lines, *_fixed_numbers()]) + "\n"
-
-
-def _fixed_numbers() -> list[str]:
-    """Name, value and meaning of what is not a setting, as its module declares them, by group."""
-    source = inspect.getsource(fixed)
-    lines = ["", "## Fixed numbers", "", inspect.cleandoc(fixed.__doc__ or "")]
-    for group, row, meaning in re.findall(r"^# (.*)|^(\w+ = .*?)  # (.*)", source, re.MULTILINE):
-        lines += ["", f"### {group}", ""] if group else _list([(f"`{row}`", meaning)])
-    return lines
+    return "\n".join(lines) + "\n"
 
 
 def _setting_row(section: type[Section], key: str) -> Row:

@@ -1,11 +1,15 @@
 """What a configuration may say, and what it is told when it may not."""
 
+import inspect
+import re
 from dataclasses import fields, replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from splatctrl_cli.config import Config, load_config
+from splatctrl_cli.checks import limits
+from splatctrl_cli.config import Config, fixed, load_config
 from splatctrl_cli.errors import InputError, UsageError
 
 
@@ -158,3 +162,10 @@ def test_every_number_is_of_one_plain_type() -> None:
     for section in fields(Config):
         for key, value in Config().as_dict()[section.name].items():
             assert isinstance(value, int | float | str), key
+
+
+@pytest.mark.parametrize("module", [fixed, limits])
+def test_every_fixed_number_says_what_it_decides(module: ModuleType) -> None:
+    source = inspect.getsource(module)
+    told = re.findall(r"^(\w+) = .*?  # \S", source, re.MULTILINE)
+    assert told == [name for name in vars(module) if name.isupper()]

@@ -13,7 +13,7 @@ import pytest
 
 from splatctrl_cli.cli.commands import COMMANDS, build_parser
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.config import fixed, load_config
+from splatctrl_cli.config import load_config
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines
@@ -75,12 +75,6 @@ def test_generated_pages_do_not_depend_on_the_terminal(monkeypatch: pytest.Monke
     narrow = generated()
     monkeypatch.setenv("COLUMNS", "200")
     assert generated() == narrow
-
-
-def test_every_fixed_number_is_in_the_page() -> None:
-    section = (ROOT / "docs" / "config.md").read_text(encoding="utf-8").partition("\n## Fixed numbers\n")[2]
-    names = [name for name in vars(fixed) if name.isupper()]
-    assert re.findall(r"^- `(\w+) = [^`]+`: .", section, re.MULTILINE) == names
 
 
 def test_every_option_that_help_shows_is_in_the_page() -> None:
