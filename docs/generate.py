@@ -182,9 +182,9 @@ def config_page() -> str:
         f"margin = {config.ControlConfig.margin}",
         "```",
         "",
-        "III-C and the like are sections of the paper; see [paper.md](paper.md) for where the defaults leave it. What is",
-        "fixed on purpose stands in `splatctrl_cli/config/fixed.py` with its unit and reason, the limits of `check` in",
-        "`splatctrl_cli/checks/limits.py`.",
+        "III-C and the like are sections of the paper; [paper.md](paper.md) says where the defaults leave it.",
+        "What is fixed on purpose stands with its reason in `splatctrl_cli/config/fixed.py`, the limits of `check`",
+        "in `splatctrl_cli/checks/limits.py`.",
     ]
     for section in fields(config.Config):
         kind: Any = type(getattr(config.Config(), section.name))
