@@ -62,6 +62,8 @@ class Case:
             value = tomllib.loads(f"value = {self.text}")["value"]
         except ValueError:
             value = self.text
+        if kind is str and type(value) is not str:  # a bare word that is a number to TOML
+            value = self.text
         if kind is float and type(value) is int:
             value = float(value) if abs(value) < 1 << 1023 else math.inf
         return type(value) is kind and section_of(self.section).declared[self.key].holds(value)

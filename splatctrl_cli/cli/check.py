@@ -1,13 +1,16 @@
-"""``splatctrl check``: what is wrong with a recording, before it costs an hour."""
+"""``splatctrl check`` and ``info``: what is wrong with a recording, and what a file holds."""
 
 import argparse
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from splatctrl_cli.checks.finding import CheckReport, Rate
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
+from splatctrl_cli.evaluate.verdict import DAMAGED
+from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs.check import CheckRequest, check
+from splatctrl_cli.sources.describe import describe
 
 WIDTH = 118  # columns of text
 
@@ -74,3 +77,45 @@ def _rate_row(rate: Rate) -> list[object]:
 
 def _shown(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def run_info(args: argparse.Namespace) -> int:
+    """Describe what the path leads to, and return the exit code."""
+    return show_described(Console(args), describe(args.path, source_options(args)))
+
+
+def show_described(console: Console, summary: Summary) -> int:
+    """Facts and tables, and what a reconstruction lacks."""
+    code = DAMAGED if summary.damaged else 0
+    console.result(summary.as_dict(), _described(summary), code=code)
+    return code
+
+
+def _described(summary: Summary) -> Iterator[str]:
+    yield f"{summary.path}: {summary.kind}"
+    yield from _facts(summary.facts, "  ")
+    for grid in summary.grids:
+        yield ""
+        yield from table(grid.header, grid.rows) if grid.rows else [f"no {grid.name}"]
+    if summary.missing:
+        yield ""
+        yield from (f"missing for a reconstruction: {item}" for item in summary.missing)
+    yield from (f"note: {note}" for note in summary.notes)
+
+
+def _facts(facts: Mapping[str, object], indent: str) -> Iterator[str]:
+    for key, value in facts.items():
+        if isinstance(value, dict):
+            yield f"{indent}{key}:"
+            yield from _facts(value, indent + "  ")
+        elif isinstance(value, list):
+            yield f"{indent}{key}: {', '.join(map(_fact, value)) or '-'}"
+        else:
+            yield f"{indent}{key}: {_fact(value)}"
+
+
+def _fact(value: object) -> str:
+    """A float with up to six decimals, more digits where it is small; a dash for nothing."""
+    if not isinstance(value, float):
+        return "-" if value is None else str(value)
+    return f"{value:.6f}".rstrip("0").rstrip(".") if value == 0 or abs(value) >= 1e-3 else f"{value:.6g}"

@@ -236,7 +236,7 @@ COMMANDS = {
     "simulate": Command(
         summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
         examples=("simulate -o out/log", "simulate --human-arm near-goal --seed 3 -o out/shared"),
-        run="recordings:run_simulate",
+        run="demo:run_simulate",
         options=_simulate,
     ),
     "ingest": Command(
@@ -248,7 +248,7 @@ COMMANDS = {
     "info": Command(
         summary="describe a log, capture, scene, grid, robot or other file",
         examples=(f"info {LOG}", "info out/scene --json"),
-        run="recordings:run_info",
+        run="check:run_info",
         options=_info,
     ),
     "check": Command(

@@ -1,15 +1,16 @@
-"""``splatctrl demo``: the whole main job on the sample recording, one command after the other, with pictures."""
+"""``splatctrl simulate`` and ``demo``: a recording that is made, and the whole main job on one, with pictures."""
 
 import argparse
 import contextlib
 import io
 from pathlib import Path
 
-from splatctrl_cli.cli.common import Console
+from splatctrl_cli.cli.check import show_described
+from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.export import show_exported
 from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.cli.reconstruct import show_reconstructed
-from splatctrl_cli.cli.recordings import show_described, show_ingested
+from splatctrl_cli.cli.recordings import show_ingested
 from splatctrl_cli.cli.replay import show_replayed
 from splatctrl_cli.cli.score import show_scored
 from splatctrl_cli.cli.sdf_bake import show_baked
@@ -20,6 +21,9 @@ from splatctrl_cli.jobs.export import ExportResult
 from splatctrl_cli.jobs.ingest import IngestResult
 from splatctrl_cli.jobs.reconstruct import ReconstructResult
 from splatctrl_cli.jobs.score import ScoreResult
+from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
+from splatctrl_cli.simulate.recording import RecordingOptions
+from splatctrl_cli.simulate.shared_workspace import DURATION_S
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,3 +64,34 @@ def _show(console: Console, result: StepResult) -> int:
             return show_scored(console, result)
         case _:
             return show_replayed(console, result, code=result.exit_code(report_only=False))
+
+
+def run_simulate(args: argparse.Namespace) -> int:
+    """Record a log, and return the exit code."""
+    console, given = Console(args), {"duration_s": args.duration, "with_person": args.person}
+    if args.duration is None and args.human_arm is not None:
+        given["duration_s"] = DURATION_S
+    options = request_of(RecordingOptions, args, **{name: v for name, v in given.items() if v is not None})
+    result = simulate(
+        SimulateRequest(out=args.out or Path("simulated"), options=options, dtu=args.dtu, force=args.force), console
+    )
+    console.result({"out": str(result.out), "bytes": result.sizes, **result.metrics}, _simulated(result))
+    return 0
+
+
+def _simulated(result: SimulateResult) -> list[str]:
+    truth = result.truth
+    cameras = [
+        (
+            camera.name,
+            "training" if camera.is_training else "scoring",
+            result.num_frames[camera.name],
+            f"{camera.intrinsics.width}x{camera.intrinsics.height}",
+            f"{truth.luminance_std[camera.name]:.3f}",
+        )
+        for camera in truth.cameras
+    ]
+    lines = [f"{result.out}", "", *table(("file", "bytes"), list(result.sizes.items())), ""]
+    lines += table(("camera", "role", "frames", "size", "luminance std"), cameras)
+    lines += ["", f"joint states {len(truth.stamps)}, true clearance at least {truth.clearance.min() * 100:.1f} cm"]
+    return lines

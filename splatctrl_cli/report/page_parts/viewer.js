@@ -300,7 +300,7 @@ class Viewer {
   }
 
   draw() {
-    if (this.asked) return;
+    if (this.asked || this.isClosed) return;
     this.asked = requestAnimationFrame(() => { this.asked = null; this.paint(); });
   }
 
@@ -333,6 +333,8 @@ class Viewer {
   close() {
     if (this.timer) this.togglePlay();
     this.watch.disconnect();
+    if (this.asked) cancelAnimationFrame(this.asked);
+    this.isClosed = true;  // what is still to be painted, is not: a lost context has no shaders
     this.renderer.dispose();
     this.renderer.forceContextLoss();
     this.host.replaceChildren();
