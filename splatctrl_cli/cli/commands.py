@@ -172,7 +172,7 @@ def _completion(add: Options, parser: Parser) -> None:
 
 
 def _demo(add: Options, parser: Parser) -> None:
-    add("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data)", Path)
+    add("--data DIR", "what 'splatctrl simulate' wrote (default: sample_data; without it, simulated first)", Path)
     add_output(add, "folder for everything the demo makes", default="demo_output")
     add_threads(parser)
 

@@ -50,6 +50,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _show(console: Console, result: StepResult) -> int:
     match result:
+        case SimulateResult():
+            return show_simulated(console, result)
         case Summary():
             return show_described(console, result)
         case IngestResult():
@@ -75,6 +77,11 @@ def run_simulate(args: argparse.Namespace) -> int:
     result = simulate(
         SimulateRequest(out=args.out or Path("simulated"), options=options, dtu=args.dtu, force=args.force), console
     )
+    return show_simulated(console, result)
+
+
+def show_simulated(console: Console, result: SimulateResult) -> int:
+    """Print what a simulation wrote."""
     console.result({"out": str(result.out), "bytes": result.sizes, **result.metrics}, _simulated(result))
     return 0
 

@@ -30,6 +30,7 @@ from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
+from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import JointState, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
@@ -42,7 +43,7 @@ from splatctrl_cli.sources.source import open_source
 TRAINING, SCORING = ("cam0", "cam1", "cam2"), ("cam3",)
 CLOSED_LOOP_START = 1.6  # [s]: the visitor appears ahead of the driven arm; started earlier, right where it is
 INPUTS = ("log.mcap", "truth.json", "robot.urdf", "robot_spheres.yaml")
-SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"  # of a checkout; an installed package has none
 CAPTURE, USING, TRUTH = "{out}/tabletop.capture", "--threads {threads}", "--truth {data}/truth.json"
 ROBOT = "--urdf {data}/robot.urdf --spheres {data}/robot_spheres.yaml"
 RECONSTRUCT = f"reconstruct {CAPTURE} --cameras {','.join(TRAINING)} {ROBOT} -o {{out}}/scene {USING}"
@@ -57,15 +58,27 @@ PICTURES = {
     "closed_loop/clearance.png": "clearance of the controller's motion over time",
 }
 
-StepResult = Summary | IngestResult | ReconstructResult | ExportResult | BakeResult | ScoreResult | ReplayResult
+StepResult = (
+    SimulateResult
+    | Summary
+    | IngestResult
+    | ReconstructResult
+    | ExportResult
+    | BakeResult
+    | ScoreResult
+    | ReplayResult
+)
 Told = Callable[[StepResult, Path], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoRequest:
-    """Run on the folder `data`, which `splatctrl simulate` wrote, and write everything into the folder `out`."""
+    """Run on the folder `data`, which `splatctrl simulate` wrote, and write everything into the folder `out`.
 
-    data: Path = SAMPLE
+    data: None for the sample recording; where that is not installed, the same is simulated into `out` first.
+    """
+
+    data: Path | None = None
     out: Path = Path("demo_output")
     threads: int = 0
     force: bool = False
@@ -102,17 +115,15 @@ def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda 
 
     told: takes the result of each step at once, and the folder that stands for `out` until all is done.
     """
-    start, stopwatch, data, out = time.perf_counter(), Stopwatch(), request.data, request.out
-    missing = [name for name in INPUTS if not (data / name).is_file()]
-    if missing:
-        raise InputError(
-            f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
-        )
-    if out.resolve() == data.resolve():
-        raise UsageError(f"{out}: is the input folder", remedy="give another --out")
+    start, stopwatch, out = time.perf_counter(), Stopwatch(), request.out
+    recorded = request.data or (SAMPLE if SAMPLE.is_dir() else None)
+    if recorded is not None:
+        _refuse_unusable(recorded, out)
     with output_path(out, force=request.force, is_folder=True) as folder:
+        data = recorded or folder / "recording"
         with stopwatch.stage("commands"):
-            steps = _steps(request, folder, progress)
+            steps = [] if recorded else [_simulation(data, progress)]
+            steps += _steps(data, folder, request.threads, progress)
             reasons = [_reason(step, request, folder, progress, told) for step in steps]
         with stopwatch.stage("pictures"):
             _draw(data, folder, request.threads)
@@ -130,9 +141,25 @@ def demo(request: DemoRequest, progress: Progress = SILENT, told: Told = lambda 
     return DemoResult(out=out, verdict=verdict, seconds=time.perf_counter() - start, pictures=pictures)
 
 
-def _steps(request: DemoRequest, out: Path, progress: Progress) -> list[Step]:
-    """The steps, to be run in this order; each writes into the folder `out`, which stands for the request's."""
-    data, threads = request.data, request.threads
+def _refuse_unusable(data: Path, out: Path) -> None:
+    """Raises InputError where `data` is no recording, UsageError where it is the output, too."""
+    missing = [name for name in INPUTS if not (data / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{data}: has no {', '.join(missing)}", remedy="make a recording with 'splatctrl simulate -o DIR'"
+        )
+    if out.resolve() == data.resolve():
+        raise UsageError(f"{out}: is the input folder", remedy="give another --out")
+
+
+def _simulation(data: Path, progress: Progress) -> Step:
+    """The step that makes the sample recording anew: the same options as sample_data/make.py, the same bytes."""
+    asked = SimulateRequest(out=data)
+    return Step(words=["simulate", "-o", str(data)], run=lambda: simulate(asked, progress), expected="done")
+
+
+def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step]:
+    """The steps, to be run in this order, on the folder `data`; each writes into the folder `out`."""
     log, truth, urdf, spheres = (data / name for name in INPUTS)
     capture, scene = out / "tabletop.capture", out / "scene"
     training = RecordingRequest(path=capture, options=SourceOptions(cameras=TRAINING))
@@ -217,7 +244,7 @@ def _label(result: StepResult) -> str:
         return f"exit code {DAMAGED}" if result.damaged else "done"
     if isinstance(result, IngestResult):
         return f"exit code {result.exit_code}" if result.exit_code else "done"
-    return "done" if isinstance(result, ExportResult) else result.verdict.label
+    return "done" if isinstance(result, (ExportResult, SimulateResult)) else result.verdict.label
 
 
 def _draw(data: Path, out: Path, threads: int) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.summary import Summary
 from splatctrl_cli.jobs import demo as module
 from splatctrl_cli.jobs.demo import SAMPLE, DemoRequest, Step, demo
+from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
+from splatctrl_cli.simulate.recording import RecordingOptions
 
 
 @pytest.mark.parametrize(("damaged", "label"), [(0, "passed"), (1, "not as expected")])
@@ -22,7 +25,7 @@ def test_the_demo_fails_where_a_step_ends_otherwise_than_it_expects(
         arguments.append(sys.argv[1:])
         return Summary(path="x", kind="y", damaged=num_damaged)
 
-    def steps(request: DemoRequest, folder: Path, progress: object) -> list[Step]:
+    def steps(data: Path, folder: Path, threads: int, progress: object) -> list[Step]:
         good = Step(words=["info", f"{folder}/a"], run=lambda: described(0), expected="done")
         return [good, Step(words=["info", "b"], run=lambda: described(damaged), expected="done")]
 
@@ -45,3 +48,30 @@ def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
         demo(DemoRequest(data=tmp_path, out=tmp_path / "out"))
     with pytest.raises(UsageError, match="is the input folder"):
         demo(DemoRequest(out=SAMPLE))
+
+
+def test_without_the_sample_the_demo_simulates_its_recording_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    found: list[Path] = []
+
+    def simulated(request: SimulateRequest, progress: object) -> SimulateResult:
+        return simulate(replace(request, options=RecordingOptions(duration_s=0.5, fps=10, width=32, height=24)))
+
+    def steps(data: Path, folder: Path, threads: int, progress: object) -> list[Step]:
+        found.append(data.relative_to(folder))
+        return [Step(words=["info", "a"], run=lambda: Summary(path="x", kind="y"), expected="done")]
+
+    monkeypatch.setattr(module, "SAMPLE", tmp_path / "missing")
+    monkeypatch.setattr(module, "simulate", simulated)
+    monkeypatch.setattr(module, "_steps", steps)
+    monkeypatch.setattr(module, "_draw", lambda *_: None)
+    out = tmp_path / "out"
+    result = demo(DemoRequest(out=out))
+    assert (result.verdict.label, [reason.criterion for reason in result.verdict.reasons]) == (
+        "passed",
+        ["simulate", "info"],
+    )
+    run = json.loads((out / "recording" / "run.json").read_text())
+    assert run["arguments"] == ["simulate", "-o", str(out / "recording")], "what makes the same again"
+    assert found == [Path("recording")] and set(module.INPUTS) <= {p.name for p in (out / "recording").iterdir()}
