@@ -6,7 +6,7 @@ RUNS := $(VENV)/.runs
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: demo test lint types tests fmt bench docs native clean
+.PHONY: demo test lint types tests fmt bench docs native wheel clean
 
 demo: $(RUNS)
 	$(BIN)/splatctrl demo --force -o demo_output
@@ -33,6 +33,9 @@ docs: $(STAMP)
 
 native: $(STAMP)
 	$(PIP) install -q --no-build-isolation --no-deps -c constraints.txt -e .
+
+wheel:
+	$(PYTHON) -m tools.release
 
 clean:
 	rm -rf $(VENV) build demo_output

@@ -50,12 +50,13 @@ def test_an_older_capture_and_scene_replay_as_they_did(older: Path, tmp_path: Pa
     assert answer["num_states"] == 51
 
 
-def test_an_older_field_is_updated_with_an_older_scene(older: Path, tmp_path: Path) -> None:
-    told = splatctrl(
-        "sdf-bake", older / "scene", "--update", older / "field", "--at", "0.6", "--json", "-o", tmp_path / "f"
-    )
+def test_an_older_field_is_baked_anew_rather_than_updated(older: Path, tmp_path: Path) -> None:
+    words = ["sdf-bake", older / "scene", "--at", "0.6", "--json", "-o", tmp_path / "f"]
+    told = splatctrl(*words, "--update", older / "field")
+    assert (told.returncode, "of 0.1.0; bake it once without --update" in told.stderr) == (2, True)
+    told = splatctrl(*words)
     assert told.returncode == 0, told.stderr
-    assert json.loads(told.stdout)["shape"] == [11, 11, 11]
+    assert json.loads(told.stdout)["distance"] == "safe"
 
 
 def test_an_older_scene_is_scored_on_an_older_capture(older: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from junitparser import Error, Failure, JUnitXml, TestSuite
 
+from splatctrl_cli import __version__
 from splatctrl_cli.cli import check, demo
 from splatctrl_cli.cli.commands import COMMANDS
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, verdict_of
@@ -60,7 +61,7 @@ def test_a_verdict_is_a_suite_of_its_recording(log: Path, tmp_path: Path) -> Non
     assert failures == {name for name, outcome in criteria.items() if outcome == "failed"} != set()
     assert {case.classname for case in suite} == {f"{log}/check"}
     assert {p.name: p.value for p in suite.properties()} == {
-        "splatctrl": "0.1.0",
+        "splatctrl": __version__,
         "command": "check",
         "exit code": "1",
         "label": "failed",
