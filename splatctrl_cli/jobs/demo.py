@@ -153,7 +153,7 @@ def _refuse_unusable(data: Path, out: Path) -> None:
 
 
 def _simulation(data: Path, progress: Progress) -> Step:
-    """The step that makes the sample recording anew: the same options as sample_data/make.py, the same bytes."""
+    """The step that makes the sample recording anew: with the options of sample_data/make.py."""
     asked = SimulateRequest(out=data)
     return Step(words=["simulate", "-o", str(data)], run=lambda: simulate(asked, progress), expected="done")
 
