@@ -79,7 +79,7 @@ class End:
 def run_task(task: Task) -> End:
     """Run a task in this thread's runner, unless it has already ended, and say how it ended.
 
-    A runner that was killed is started once more.
+    A runner that was killed is started once more; one that `stop_runners` ended is not.
     """
     known = read_end(Path(task.end), task.key)
     if known is not None and known.exit_code is not None and known.stamp in ("", stamp_of(Path(task.out))):
@@ -97,6 +97,8 @@ def run_task(task: Task) -> End:
             line = ""
         if line:
             return End(**json.loads(line))
+        if runner not in _runners:  # ended by stop_runners: another would only delay the end of the batch
+            return End.without_one(task.key, "ended with its batch")
         runner.kill()
         runner.wait()
     return End.without_one(task.key, "its runner was killed twice")

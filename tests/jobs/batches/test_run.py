@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +14,8 @@ import pytest
 from splatctrl_cli.jobs.batches.batch import verdict_of_runs
 from splatctrl_cli.jobs.batches.ledger import Ledger
 from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED
-from tests.jobs.batches.desk import batch_of, node, states
+from splatctrl_cli.jobs.batches.task import End, Task, run_task, stop_runners
+from tests.jobs.batches.desk import ENTRY, batch_of, node, states
 
 
 def count(told: Path) -> int:
@@ -182,3 +184,16 @@ def test_a_runner_that_is_killed_is_replaced(tmp_path: Path) -> None:
     runs = batch_of(tmp_path, nodes, workers=1)
     assert states(runs) == {"a/job": ERROR, "b/job": DONE}
     assert runs["a/job"].cause == "its runner was killed twice"
+
+
+def test_a_runner_that_was_stopped_is_not_replaced(tmp_path: Path) -> None:
+    begun, ends = tmp_path / "begun", list[End]()
+    places = {name: str(tmp_path / name) for name in ("out", "result", "log", "end")}
+    task = Task(entry=ENTRY, words=("tell", str(begun), "sleep", "60"), key="k", **places)
+    thread = threading.Thread(target=lambda: ends.append(run_task(task)))
+    thread.start()
+    until(begun.exists)
+    stop_runners()
+    thread.join(30)
+    assert [end.cause for end in ends] == ["ended with its batch"]
+    assert count(begun) == 1
