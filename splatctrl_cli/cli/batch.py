@@ -76,7 +76,7 @@ class OfThisProgram:
         given = {"threads": self._threads, **options}
         actions = {name: _action(parser, command, name) for name in given if name not in OWN or _has(parser, name)}
         for name, action in actions.items():
-            made = _words_of(f"[{command}] {name}", action, given[name], folder)
+            made = _words_of(name, action, given[name], folder)
             places += made if not action.option_strings else []
             words += made if action.option_strings else []
         words += ["--json", *(["--", *places] if places else [])]
@@ -121,7 +121,7 @@ def _action(parser: Parser, command: str, name: str) -> argparse.Action:
     if name not in by_name:
         near = difflib.get_close_matches(name, by_name, n=1)
         remedy = f"did you mean {near[0]}?" if near else f"see splatctrl {command} --help-all"
-        raise UsageError(f"[jobs] {command}: has no option {name!r}", remedy=remedy)
+        raise UsageError(f"{command} has no option {name!r}", remedy=remedy)
     return by_name[name]
 
 

@@ -158,7 +158,11 @@ def _nodes_of(
                 values |= {RECORDING: [str(path) for path in recording.paths], NAME: recording.name}
                 options = _placed(_merged(job.options, chosen), values.__getitem__)
                 options |= {} if node.out is None else {"out": str(node.out), "force": True, "resume": True}
-                parsed = command_line.parsed(job.command, options, folder)
+                try:
+                    parsed = command_line.parsed(job.command, options, folder)
+                except UsageError as error:
+                    where = f"[jobs.{job.name}] of {recording.name}"
+                    raise UsageError(f"{where}: {error.message}", remedy=error.remedy) from None
                 node = replace(node, words=parsed.words, inputs=_outside(parsed.inputs, before))
                 made[job.name].append(node)
     nodes = [node for each in made.values() for node in each]

@@ -176,7 +176,10 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Iterable[str]) -> N
         other = by_name.setdefault(recording.name, recording)
         if other is not recording:
             both = f"{other.paths[0]} and {recording.paths[0]}"
-            raise UsageError(f"two recordings are called {recording.name!r}: {both}", remedy="give each a name")
+            raise UsageError(
+                f"two recordings are called {recording.name!r}: {both}",
+                remedy="give one a [[recordings]] of its own, with a name",
+            )
         for job in recording.overrides:
             if job not in jobs:
                 raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_near(job, list(jobs)))

@@ -91,12 +91,15 @@ def test_shards_hold_every_recording_once(tmp_path: Path) -> None:
         ("[jobs.check]\n", "got none of the first"),
         (RECORDINGS + "[job.check]\n", "unknown key 'job'; did you mean jobs?"),
         (RECORDINGS + "[jobs.chek]\n", "no job is called 'chek'; did you mean check?"),
-        (RECORDINGS + "[jobs.check]\nfail_on = 'error'\n", "has no option 'fail_on'; did you mean fail-on?"),
+        (
+            RECORDINGS + "[jobs.check]\nfail_on = 'error'\n",
+            "[jobs.check] of a: check has no option 'fail_on'; did you mean fail-on?",
+        ),
         (RECORDINGS + "[jobs.check]\nfail-on = 'all'\n", "invalid choice: 'all'"),
         (RECORDINGS + "[jobs.check]\nquick = true\n", "expected a number of images"),
         (RECORDINGS + "[jobs.check]\nout = 'x'\n", "a batch gives out itself; leave it out"),
         (RECORDINGS + "[jobs.ingest]\nset = { scene.window = 2 }\n", "has no option 'set'"),
-        (RECORDINGS + "[jobs.reconstruct]\nset = { scene.windw = 2 }\n", "did you mean"),
+        (RECORDINGS + "[jobs.map]\ncommand = 'reconstruct'\nset = { scene.windw = 2 }\n", "[jobs.map] of a: --set"),
         (
             RECORDINGS + "[jobs.check]\ntimeout = '2 weeks'\n",
             "timeout: expected a number, 0 or more or with one of s,",
