@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import xunitparserx
 from junitparser import JUnitXml
 
 from splatctrl_cli.cli.main import main
@@ -97,3 +98,6 @@ def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.Ca
     }
     assert found["good"]["good/ingest"].is_passed
     assert "missing.urdf" in found["good"]["good/scene"].result[0].text
+    assert found["good"]["good/ingest"].time > 0.0
+    joined, _ = xunitparserx.parse(str(junit))
+    assert joined.properties["batch"] == "two logs"

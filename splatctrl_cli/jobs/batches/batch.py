@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -134,15 +134,20 @@ def _reason(run: Run) -> Reason:
 
 def suites_of(result: BatchResult) -> list[Suite]:
     """What CI systems are told: a suite for each recording, with the cases of its nodes."""
-    suites = []
+    suites = list[Suite]()
     for recording in dict.fromkeys(run.recording for run in result.runs):
         runs = [run for run in result.runs if run.recording == recording]
         began = datetime.fromtimestamp(min(run.started for run in runs), UTC).isoformat(timespec="seconds")
-        cases = [case for run in runs for case in _cases_of(run, result.out)]
-        properties = {"splatctrl": __version__, "batch": result.suite}
+        cases = [case for run in runs for case in _timed(_cases_of(run, result.out), run.seconds)]
+        properties = {} if suites else {"splatctrl": __version__, "batch": result.suite}  # once: readers join suites
         seconds = sum(run.seconds for run in runs)
         suites.append(Suite(name=recording, cases=cases, properties=properties, started=began, seconds=seconds))
     return suites
+
+
+def _timed(cases: Sequence[Case], seconds: float) -> list[Case]:
+    """Cases of a node, of which the first has its time."""
+    return [replace(case, seconds=0.0 if number else seconds) for number, case in enumerate(cases)]
 
 
 def _cases_of(run: Run, out: Path) -> list[Case]:
