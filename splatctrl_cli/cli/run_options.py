@@ -15,7 +15,7 @@ def report_options(add: Options, parser: Parser) -> None:
     add_output(add, "HTML file to write", default="PATH.html, beside PATH")
     add(
         "--changes FILE.json",
-        "what changed against a baseline: a JSON list of objects, a row each (docs/report.md)",
+        "what changed: the output of compare --json, or a JSON list of objects, a row each (docs/report.md)",
         Path,
     )
     add("--all-scenes", "of a batch, every replay in 3-D, not only the failed, changed and worst")

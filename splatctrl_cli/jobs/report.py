@@ -1,8 +1,7 @@
 """A report from its request to its page: one run, or every job of a batch, in one file that opens from disk."""
 
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reports.batch_folder import AS_EXPECTED, BatchFolder, Node, is_batch, open_batch
+from splatctrl_cli.jobs.reports.changes import table_of_changes
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, open_run
 from splatctrl_cli.jobs.reports.sections import section_of
 from splatctrl_cli.jobs.reports.spaces import space_of_run
@@ -19,7 +19,6 @@ from splatctrl_cli.report.viewer import packed
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
 PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]
-ID = "id"  # of a job, in a row of changes
 LOG_LINES = 12  # of a job that ended in an error
 WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
 
@@ -28,7 +27,8 @@ WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
 class WriteReportRequest:
     """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
 
-    changes: a JSON list of objects, a row each, of what differs from a baseline; an `id` names a job of the batch.
+    changes: what `compare` prints with --json, or a JSON list of objects, a row each, of what differs; an `id` names
+    a job of the batch.
     roots: folders in which the scenes and robots of the runs' command lines are looked for. all_scenes: of a batch,
     every scene in 3-D and not only the failed, changed and worst.
     """
@@ -60,7 +60,7 @@ def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> Wr
     """Write the page. Raises InputError for a folder that is no run and no batch, that is not whole, or that a newer
     version wrote.
     """
-    changes = _changes(request.changes)
+    changes = table_of_changes(request.changes)
     if is_batch(request.path):
         page = _of_batch(request, open_batch(request.path), changes, progress)
     else:
@@ -167,13 +167,16 @@ def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
     if not unexpected:
         return f"all {count} jobs as expected"
     node = unexpected[0].node
-    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {node.id}: {node.sentence or node.cause}"
+    said = node.sentence or node.cause or node.state
+    return f"{len(unexpected)} of {len(jobs)} jobs not as expected; first {node.id}: {said}"
 
 
 def _job(batch: BatchFolder, node: Node, is_changed: bool) -> _Job:
+    if not node.out or node.outcome is None:  # it only prints, or left nothing
+        return _Job(node=node, run=None, why="", is_changed=is_changed)
     try:
         place = batch.inside(node.out)
-        run = open_run(place) if place.is_dir() or node.command == REPLAY else None
+        run = open_run(place) if (place / "run.json").is_file() or node.command == REPLAY else None
         run = None if run is None else replace(run, words=tuple(map(str, node.words)))
         return _Job(node=node, run=run, why="", is_changed=is_changed)
     except InputError as error:
@@ -216,15 +219,15 @@ def _section(
 
 
 def _matrix(jobs: Sequence[_Job], linked: set[str]) -> Table:
-    """A row for each recording, those with the worst jobs first, and a column for each job."""
-    nodes = {(job.node.recording, job.node.job): job.node for job in jobs}
+    """A row for each recording, those with the worst jobs first, and a column for each job and variant."""
+    nodes = {(job.node.recording, job.node.column): job.node for job in jobs}
     recordings = dict.fromkeys(job.node.recording for job in jobs)
-    names = sorted(dict.fromkeys(job.node.job for job in jobs))
+    names = sorted({job.node.column for job in jobs})
     rows = [
         Row(cells=[recording, *(_cell(nodes.get((recording, name)), linked) for name in names)])
         for recording in recordings
     ]
-    return Table(title="Recordings", header=("recording", *names), rows=rows)
+    return Table(title="Recordings", header=("recording", *(name.replace("+", " +") for name in names)), rows=rows)
 
 
 def _cell(node: Node | None, linked: set[str]) -> Cell:
@@ -261,22 +264,3 @@ def _log(batch: BatchFolder, node: Node) -> Table:
     except (OSError, InputError):
         lines = ["no log"]
     return Table(title="Log", text="\n".join(lines[-LOG_LINES:]))
-
-
-def _changes(path: Path | None) -> Table:
-    """The rows of a JSON list of objects; columns in the order in which they come up."""
-    if path is None:
-        return Table()
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
-        raise InputError(f"{path}: expected a JSON list of objects", remedy='like [{"id": "a/audit", "now": 1}]')
-    header = list(dict.fromkeys(str(name) for row in rows for name in row))
-    made = [Row(cells=[_linked(name, row.get(name)) for name in header]) for row in rows]
-    return Table(title="What changed", header=header, rows=made)
-
-
-def _linked(name: str, value: object) -> object:
-    return Cell(text=str(value), link=str(value)) if name == ID and value else value

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.compare import CompareRequest, compare
 from splatctrl_cli.jobs.report import MOST_SCENES, WriteReportRequest, write_report
 from splatctrl_cli.jobs.reports.run_folder import open_run
 from splatctrl_cli.jobs.reports.spaces import space_of
@@ -161,6 +163,7 @@ def batch(run: Runs, tmp_path: Path) -> Path:
         (place / "audit.log").write_text(f"a line of {number}\n")
         node = {"id": f"rec{number}/audit", "recording": f"rec{number}", "job": "audit", "command": "replay"}
         node |= {"out": f"rec{number}/audit", "log": f"rec{number}/audit.log", "expect": "failed", "new": "later"}
+        node |= {"result": f"rec{number}/audit.json"}
         if number == 3:
             nodes.append(node | {"state": "error", "cause": "timed out after 600 s"})
             continue
@@ -221,7 +224,50 @@ def test_a_job_that_leads_out_of_its_batch_is_not_read(batch: Path) -> None:
     assert "expected a path in the batch" in reported(batch)
 
 
-@pytest.mark.parametrize("text", ["{}", "[1]", "no"])
+def test_what_compare_prints_is_taken_for_the_changes(batch: Path, tmp_path: Path) -> None:
+    before = tmp_path / "before"
+    shutil.copytree(batch, before)
+    patch_json(batch / "rec7/audit/run.json", lambda run: run | {"metrics": run["metrics"] | {"min_clearance": -0.9}})
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [_as_expected(node) for node in f["nodes"]]})
+    found = compare(CompareRequest(runs=(before, batch))).as_dict()
+    (tmp_path / "changes.json").write_text(json.dumps(found))
+    page = reported(batch, changes=tmp_path / "changes.json")
+    table = page[page.index("What changed") : page.index("Not as expected")]
+    assert re.findall(r'href="#([^"]+)"', table) == ["rec2/audit", "rec7/audit"]
+    assert "min_clearance" in table and "state " in table
+
+
+def _as_expected(node: dict[str, Any]) -> dict[str, Any]:
+    return node | {"state": "done"} if node["state"] == "failed" else node
+
+
+def test_variants_have_a_column_each_and_what_only_prints_has_no_folder_to_miss(batch: Path) -> None:
+    more = [
+        {
+            "id": f"rec0/drive+rate={rate}",
+            "recording": "rec0",
+            "job": "drive",
+            "state": "skipped",
+            "cause": "needs it",
+        }
+        for rate in (1, 2)
+    ]
+    check = {
+        "id": "rec0/check",
+        "recording": "rec0",
+        "job": "check",
+        "command": "check",
+        "state": "failed",
+        "out": "",
+    }
+    check |= {"outcome": "passed", "label": "passed", "expect": "failed"}
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *more, check]})
+    page = reported(batch)
+    assert re.findall(r"<th[^>]*>(drive[^<]*)<", page) == ["drive +rate=1", "drive +rate=2"]
+    assert "expected a path in the batch" not in page
+
+
+@pytest.mark.parametrize("text", ["{}", '{"verdicts": [1], "figures": []}', "[1]", "no"])
 def test_changes_of_another_form_are_refused(run: Runs, tmp_path: Path, text: str) -> None:
     (tmp_path / "changes.json").write_text(text)
     with pytest.raises(InputError, match="changes"):

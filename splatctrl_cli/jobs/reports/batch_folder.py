@@ -40,6 +40,11 @@ class Node:
     version: str | None = None
     cause: str | None = None
 
+    @property
+    def column(self) -> str:
+        """The job and its variant."""
+        return self.id.removeprefix(f"{self.recording}/")
+
 
 @dataclass(frozen=True, kw_only=True)
 class BatchFolder:
