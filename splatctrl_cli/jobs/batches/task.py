@@ -27,6 +27,7 @@ from splatctrl_cli.files.output_lock import remove
 Entry = Callable[[list[str]], int]
 
 POLL = 0.02  # [s] between looks at a child's memory
+STOP = 2.0  # [s] for a runner to see that its stdin ended, before it is killed
 GRACE = 10.0  # [s] from asking a child to end to ending it
 PAGE = os.sysconf("SC_PAGE_SIZE")
 PR_SET_PDEATHSIG = 1  # of prctl(2): what a child gets when its parent dies
@@ -111,7 +112,11 @@ def stop_runners() -> None:
         assert runner.stdin is not None and runner.stdout is not None
         with contextlib.suppress(OSError):
             runner.stdin.close()
-        runner.wait()
+        try:
+            runner.wait(STOP)
+        except subprocess.TimeoutExpired:  # it still imports the commands, and runs nothing
+            runner.kill()
+            runner.wait()
         runner.stdout.close()
 
 
