@@ -49,6 +49,8 @@ def kill_workers(client: "distributed.Client", over: threading.Event, killed: li
     chosen = random.Random(0)
     while not over.wait(0.7):
         workers = [worker["pid"] for worker in client.run(lambda: {"pid": os.getpid()}).values()]
+        if not workers:  # none has come back yet
+            continue
         killed.append(chosen.choice(workers))
         os.kill(killed[-1], signal.SIGKILL)
         time.sleep(0.1)
