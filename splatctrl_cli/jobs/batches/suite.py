@@ -16,6 +16,10 @@ Table = Mapping[str, Any]
 
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 SECONDS = {"s": 1, "m": 60, "min": 60, "h": 3600}
+EXPECTED = (  # labels and outcomes of verdicts, and of a command without one
+    *("passed", "failed", "not evaluable", "done", "safe", "margin broken", "contact", "limits broken"),
+    *("controller failed", "goal not reached", "gate failed", "golden run differs"),
+)
 _NAME = re.compile(r"[\w][\w.+-]*")
 _ENDINGS = (".mcap", ".bag", ".db3", ".toml", ".capture")
 
@@ -116,12 +120,16 @@ def _job(name: str, table: Table, commands: Sequence[str], base: Job | None = No
     matrix = table.get("matrix", {})
     if not isinstance(matrix, Mapping) or not all(isinstance(v, list) and v for v in matrix.values()):
         raise UsageError(f"{where} matrix: expected OPTION = [VALUE, ...] each, got {shown(matrix)}")
+    expect = _text(where, table, "expect", base.expect if base else "passed")
+    if expect not in EXPECTED and not re.fullmatch(r"exit \d+", expect):
+        remedy = _near(expect, (*EXPECTED, "exit N"))
+        raise UsageError(f"{where} expect: no verdict is called {expect!r}", remedy=remedy)
     limits = base.limits if base else Limits()
     return Job(
         name=name,
         command=command,
         matrix=matrix,
-        expect=_text(where, table, "expect", base.expect if base else "passed"),
+        expect=expect,
         limits=Limits(
             timeout=_amount(where, table, "timeout", SECONDS, limits.timeout),
             memory=int(_amount(where, table, "memory", UNITS, limits.memory)),

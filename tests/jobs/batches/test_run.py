@@ -86,6 +86,13 @@ def test_an_expected_outcome_is_the_good_one(tmp_path: Path, expect: str, words:
     assert states(runs) == {"a/job": state}
 
 
+def test_an_expected_error_stands_too(tmp_path: Path) -> None:
+    nodes = [node(tmp_path, "a/job", "tell", str(tmp_path / "told"), "exit", "4", expect="exit 4")]
+    nodes = [replace(nodes[0], words=nodes[0].words[:4])]  # writes nothing
+    assert states(batch_of(tmp_path, nodes)) == states(batch_of(tmp_path, nodes)) == {"a/job": DONE}
+    assert count(tmp_path / "told") == 1
+
+
 @pytest.mark.parametrize(
     ("words", "limits", "cause"),
     [

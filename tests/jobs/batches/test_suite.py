@@ -104,6 +104,7 @@ def test_shards_hold_every_recording_once(tmp_path: Path) -> None:
             RECORDINGS + "[jobs.check]\ntimeout = '2 weeks'\n",
             "timeout: expected a number, 0 or more or with one of s,",
         ),
+        (RECORDINGS + "[jobs.check]\nexpect = 'saf'\n", "expect: no verdict is called 'saf'; did you mean safe?"),
         (RECORDINGS + "[jobs.check]\nmemory = -1\n", "memory: expected a number, 0 or more"),
         (RECORDINGS + "[jobs.check]\nmatrix = { fail-on = 'error' }\n", "matrix: expected OPTION = [VALUE, ...]"),
         (RECORDINGS + "[jobs.check]\nurdf = '{arm}'\n", "{arm} is no job; known here: recording, name, check"),
