@@ -19,8 +19,9 @@ if TYPE_CHECKING:  # the same names, for type checkers
     import distributed
     import matplotlib as mpl
     import trimesh
+    from scipy import io as scipy_io
 else:
     mpl, trimesh = _LoadedLate("matplotlib"), _LoadedLate("trimesh")
-    distributed = _LoadedLate("distributed")
+    distributed, scipy_io = _LoadedLate("distributed"), _LoadedLate("scipy.io")
 
-__all__ = ["distributed", "mpl", "trimesh"]
+__all__ = ["distributed", "mpl", "scipy_io", "trimesh"]

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.io import loadmat
 
 from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.libraries import scipy_io
 from splatctrl_cli.records import MILLIMETRES, Bool, Float64
 
 MaskRule = Literal["given", "object", "depth"]
@@ -270,7 +270,7 @@ def _variable(path: Path, name: str) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file", remedy="give the folder ObsMask of DTU's SampleSet")
     try:
-        return loadmat(path, variable_names=[name])[name]
+        return scipy_io.loadmat(path, variable_names=[name])[name]
     except KeyError:
         raise InputError(f"{path}: expected a variable {name}, got none") from None
     except Exception as error:  # scipy raises many kinds for a file that is not a .mat
