@@ -79,6 +79,7 @@ def settings(num_splats: int) -> OptimiserSettings:
         min_opacity=c.min_opacity,
         min_radius=c.min_radius,
         max_radius=c.max_radius,
+        radius_depth=0.0,
     )
 
 

@@ -39,6 +39,10 @@ CLOCK_MIXED = 60.0  # [s] a step beyond which states of two clocks were joined
 CLOCK_DRIFT = 0.005  # [s] of one clock against another, over the log
 CLOCK_NEIGHBOURS = 5  # states over which a step must persist: one message logged late is none
 
+# Map: the scale of a recording
+SCALE_DEPTH = 0.8  # [m] of a table at arm's length, in the median: the map's lengths suit it as they are
+SCALE_NEAREST = 0.5  # of the depth of the nearest tenth: nearer is noise, or what the camera carries
+
 # Map: losses, seeding, eviction and refining (III-B, III-C)
 DEAD_LOGIT = -6.9  # of a free slot: opacity 0.001, below what the rasteriser blends
 OPAQUE_ENOUGH = 0.5  # accumulated opacity from which a pixel has a depth of its own
@@ -53,6 +57,7 @@ EVICT_EVERY = 5  # time steps: it takes as long as a few iterations; what has no
 EVICT_NEAREST = 8  # splats that are asked whether they stand for a voxel
 EVICT_ASKED = 8  # splats that are looked at for each missing slot, those that show least
 EVICT_NEARER = 0.3  # [m] by which a surface must be nearer to the robot's path than one given up for it
+NEAREST_REACH = 0.01  # [m] about a pixel, times the scale, in which no depth may be farther than what floats
 SPLIT_PARTS = 2  # Gaussians that a split one becomes (the baseline 3dgs)
 
 # Map: occupancy, and which pixels are the robot's
@@ -176,6 +181,7 @@ CLOCKS_APART = 0.05  # [s] beyond the estimate's own uncertainty: at 0.5 m/s an 
 BLIND = 0.09  # of the moving spheres: without a fault in a tenth of the runs more come to space never seen
 SOME_UNSEEN = 1 / 3  # of the points about the arm: below, a few spheres in the shadow of a seen thing do not count
 UNSEEN = 0.47  # of the points about the arm: three cameras leave 0.02 to 0.3; at 0.48 a lone one hid a thing
+COARSE_VOXEL = 0.025  # [m] of a map beside a robot: its gaps and splats grow with it, the margin does not
 MISPLACED = 0.005  # [m] of the robot's own surface, in the median: 0.1 mm on a calibrated rig
 SPHERE_CELL = 0.02  # [m] to which the places of spheres are rounded
 FEWEST_STRETCHES = 2  # a single one allows a confidence of one half

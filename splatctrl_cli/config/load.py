@@ -1,5 +1,6 @@
 """The whole configuration: defaults, then a TOML file, then single assignments."""
 
+import copy
 import dataclasses
 import difflib
 import math
@@ -9,7 +10,7 @@ import typing
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from splatctrl_cli.config.map import FieldConfig, GaussianConfig, HumanConfig, OccupancyConfig, SceneConfig
 from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
@@ -35,6 +36,13 @@ class Config:
         gain, period = self.planner.follow_gain, self.control.period
         expected = f"at most 1 / control.period = {1 / period:g} 1/s"
         check(gain * period <= 1 + 1e-9, "planner.follow_gain", expected, gain)
+
+    def derived(self, **sections: Section) -> Self:
+        """A copy with sections that follow from a recording (`Section.derived`), which are not checked."""
+        made = copy.copy(self)
+        for name, section in sections.items():
+            object.__setattr__(made, name, section)
+        return made
 
     def as_dict(self) -> dict[str, Any]:
         """Nested plain values, as written to ``run.json``."""

@@ -17,6 +17,28 @@ class SceneConfig(Section, section="scene"):
     initial_opacity: Annotated[float, Within(0.001, 0.99, "", "opacity of a new splat (III-C)")] = 0.5
     min_radius: Annotated[float, Within(1e-5, 1, "m", "least radius; finer than a depth camera resolves")] = 0.002
     max_radius: Annotated[float, Within(1e-4, 1, "m", "r_max, one voxel; the paper gives none")] = 0.02
+    scale: Annotated[
+        float,
+        Within(
+            1e-3,
+            1e6,
+            "",
+            "of the map's lengths at their defaults; 1: the paper's table at arm's length; 0: from the recording's"
+            " depth, 1 with a robot",
+            or_zero=True,
+        ),
+    ] = 0.0
+    radius_depth: Annotated[
+        float,
+        Within(
+            1e-3,
+            1e9,
+            "m",
+            "depth at which a splat may be max_radius large, in proportion elsewhere; 0: everywhere (with scale 0,"
+            " the recording's median)",
+            or_zero=True,
+        ),
+    ] = 0.0
     lambda_dssim: Annotated[float, Within(0, 1, "", "share of D-SSIM in the colour loss (eq. 4)")] = 0.2
     lambda_color: Annotated[float, Within(0, 1000, "", "weight of the colour loss")] = 1.0
     lambda_depth: Annotated[float, Within(0, 1000, "", "weight of the depth loss")] = 1.0
@@ -84,6 +106,7 @@ class SceneConfig(Section, section="scene"):
     lr_color: Annotated[float, Within(0, 1, "", "learning rate of colours, which go from 0 to 1")] = 1e-2
     lr_logit_opacity: Annotated[float, Within(0, 10, "", "learning rate of opacity logits")] = 5e-2
     refine_geometry: Annotated[float, Within(0, 1000, "", "factor on rates of centre and radius in refining")] = 5.0
+    refine_depth: Annotated[float, Within(0, 1000, "", "factor on lambda_depth at the end of refining")] = 2.0
     final_rate: Annotated[float, Within(1e-6, 1, "", "share of the learning rates left at the end of refining")] = 0.1
     noise: Annotated[float, Within(0, 1e9, "", "lambda_noise of 3DGS-MCMC; a step is at most half a radius")] = 5e5
     window: Annotated[int, Within(0, 1000, "", "keyframes kept beside the newest frames; 1000 take 3 GB")] = 12

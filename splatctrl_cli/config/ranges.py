@@ -1,8 +1,9 @@
 """What a key of the configuration may hold, declared once beside its default; checks and docs follow from it."""
 
+import copy
 import typing
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from splatctrl_cli.errors import UsageError
 
@@ -68,6 +69,13 @@ class Section:
         """Raises TypeError for a key that says nothing of what it may hold."""
         hints = typing.get_type_hints(cls, include_extras=True)
         cls.section, cls.declared = section, {key: _declared(hints[key]) for key in cls.__annotations__}
+
+    def derived(self, **values: float) -> Self:
+        """A copy with values that follow from a recording, in whatever unit that is: they are not checked."""
+        made = copy.copy(self)
+        for key, value in values.items():
+            object.__setattr__(made, key, value)
+        return made
 
     def __post_init__(self) -> None:
         for key, declared in self.declared.items():

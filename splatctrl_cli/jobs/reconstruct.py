@@ -65,12 +65,13 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
         made = Reconstructed(
             metrics=fitted.metrics(),
             rows=fitted.rows,
-            config=request.config,
+            config=fitted.config,
             loss=request.source.loss,
             is_seeded=request.points is not None,
         )
         verdict = reconstruct_verdict(made, request.require)
-        written = written_run(partial, request, inputs, made.metrics, verdict, stopwatch)
+        resolved = replace(request, config=fitted.config)
+        written = written_run(partial, resolved, inputs, made.metrics, verdict, stopwatch)
     removed = {name: sum(row.removed[name] for row in fitted.rows) for name in fitted.rows[-1].removed}
     return replace(written, removed=removed)
 

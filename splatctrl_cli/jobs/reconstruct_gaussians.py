@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest, no_frame, training_cameras
 from splatctrl_cli.records import RecordSource, RgbdFrame
 from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow, GaussianFitter
+from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
 from splatctrl_cli.scene.time_steps import depth_box
 from splatctrl_cli.scene_files.scene_folder import FORMAT
 from splatctrl_cli.splat_files.gaussian_ply import write_gaussian_ply
@@ -43,7 +44,10 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
         rows: list[GaussianAuditRow] = []
         with stopwatch.stage("read"):
             frames = _frames(source)
-            workspace = depth_box(frames, config.occupancy.max_range) if request.box is None else request.box
+            depth = RecordedDepth.of(frames)
+            config = config if depth is None else fitted_to(config, depth)
+            limit, scale = config.occupancy.max_range, config.scene.scale or 1.0
+            workspace = depth_box(frames, limit, scale) if request.box is None else request.box
         with stopwatch.stage("fit"):
             fitter = GaussianFitter(config, workspace, frames, seed=request.seed, threads=request.threads)
             progress.log(f"{len(fitter.arrays)} Gaussians seeded, extent of the scene {fitter.extent:.3f} m")
@@ -74,7 +78,7 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
             is_damaged=bool(source.loss.damaged),
             counts=counts,
         )
-        return written_run(partial, request, source.digests(), metrics, verdict, stopwatch)
+        return written_run(partial, replace(request, config=config), source.digests(), metrics, verdict, stopwatch)
 
 
 def _refuse_what_needs_time(request: ReconstructRequest) -> None:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
-from splatctrl_cli.jobs.progress import Progress, Wait
+from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -23,6 +23,7 @@ from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
+from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 from splatctrl_cli.scene_files.scene_folder import FORMAT
@@ -110,6 +111,7 @@ class Reconstruction:
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
         self._early: TimeStep | None = None  # the first that said nothing of the workspace
+        self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
         self.disagreement: dict[str, float] = {}  # [m] of each pair of cameras that see enough of the same
         self._saved_at, self._save_time = -float("inf"), 0.0
         if checkpoint is not None:
@@ -162,6 +164,7 @@ class Reconstruction:
             self._early = self._early or step
             return None
         if self.fitter is None:
+            self._fit_to(RecordedDepth.of(step.frames), console)
             self.fitter = self._new_fitter(self._workspace(step))
             if self.cloud is not None:
                 self.fitter.plant(self.cloud)
@@ -254,6 +257,8 @@ class Reconstruction:
         return {
             "cameras": self.cameras,
             "has_clock": self.source.has_clock,
+            "scale": self.config.scene.scale or 1.0,
+            "voxel": self.config.occupancy.voxel,
             "stamp_ns": last.stamp_ns,
             "training_stamps_ns": [] if self.source.has_clock else self.stamps,
             "time_steps": self.fitter.num_steps,
@@ -318,6 +323,7 @@ class Reconstruction:
             "num_read": self.num_read,
             "is_refined": self.is_refined,
             "disagreement": self.disagreement,
+            "depth": None if self.depth is None else asdict(self.depth),
             "first_frames": self.first_frames,
             "stamps": [] if self.source.has_clock else self.stamps,
         }
@@ -334,6 +340,8 @@ class Reconstruction:
         self.stamps = checkpoint.progress["stamps"]
         self.disagreement = checkpoint.progress["disagreement"]
         self.first_frames = checkpoint.progress["first_frames"]
+        depth = checkpoint.progress["depth"]
+        self._fit_to(None if depth is None else RecordedDepth(**depth))
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)
 
@@ -350,8 +358,22 @@ class Reconstruction:
         elif self._first_state_ns is None:
             self._first_state_ns = record.stamp_ns
 
+    def _fit_to(self, depth: RecordedDepth | None, console: Progress = SILENT) -> None:
+        """Choose the lengths of the map by the depth of the first frames; with a robot, whose reach is a table's, and
+        without any depth they stay as they are.
+        """
+        if depth is None or (self.config.scene.scale == 0 and self.robot is not None):
+            return
+        self.depth, self.config = depth, fitted_to(self.config, depth)
+        scene, occupancy = self.config.scene, self.config.occupancy
+        voxel, least, most = occupancy.voxel, occupancy.min_range, occupancy.max_range
+        console.log(
+            f"depth is {depth.median:.3g} m in the median, scale {scene.scale:.3g}: voxels of {voxel:.3g} m, splats"
+            f" up to {scene.max_radius:.3g} m, depth from {least:.3g} to {most:.3g} m"
+        )
+
     def _new_fitter(self, workspace: Box) -> SceneFitter:
-        scene = self.config.scene if self.source.has_clock else replace(self.config.scene, fill=1.0)
+        scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)
         human = self.config.human
         return SceneFitter(
             scene, self.config.occupancy, workspace, human=human, seed=self.request.seed, threads=self.request.threads
@@ -369,7 +391,7 @@ class Reconstruction:
             return Box(lower=base - reach, upper=base + reach)
         if self.cloud is not None:
             return cloud_box(self.cloud)
-        return depth_box(first.frames, self.config.occupancy.max_range)
+        return depth_box(first.frames, self.config.occupancy.max_range, self.config.scene.scale or 1.0)
 
     def _posture(self, step: TimeStep) -> RobotPosture | None:
         if self.robot is None or step.position is None:

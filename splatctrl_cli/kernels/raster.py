@@ -138,6 +138,7 @@ class OptimiserSettings:
     min_opacity: float
     min_radius: float
     max_radius: float
+    radius_depth: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,6 +166,7 @@ def optimiser_step(
         [
             settings.lr_center, settings.lr_log_radius, settings.lr_color, settings.lr_logit_opacity,
             settings.regulariser, settings.noise, settings.min_opacity, settings.min_radius, settings.max_radius,
+            settings.radius_depth,
         ]
     )  # fmt: skip
     native.optimiser_step(

@@ -1,6 +1,7 @@
 """The descent of the loss of eq. 4: renders the splats of a buffer and moves their parameters."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,13 +37,17 @@ class Descent:
         self._loss = ImageLoss(num_threads)
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
 
-    def run(self, views: Sequence[View], settings: OptimiserSettings) -> dict[int, LossTerms]:
-        """An iteration on each view; the loss of each, by identity, at the last iteration that looked at it."""
+    def run(self, views: Sequence[View], settings: OptimiserSettings, depth: float = 1.0) -> dict[int, LossTerms]:
+        """An iteration on each view, with `depth` times the weight of the depth loss; the loss of each, by identity,
+        at the last iteration that looked at it.
+        """
+        weights = self._weights()
+        weights = replace(weights, depth=depth * weights.depth)
         terms = {}
         for view in views:
             planes = self.planes(view)
             plane_gradients = np.empty_like(planes)
-            terms[id(view)] = self._loss.evaluate(planes, view.target, self._weights(), plane_gradients)
+            terms[id(view)] = self._loss.evaluate(planes, view.target, weights, plane_gradients)
             self._raster.backward(planes, plane_gradients, self._gradients)
             step_seed = (self._seed << 32) + self.num_iterations
             optimiser_step(
@@ -84,6 +89,7 @@ class Descent:
             min_opacity=c.min_opacity,
             min_radius=c.min_radius,
             max_radius=c.max_radius,
+            radius_depth=c.radius_depth,
         )
 
     def misfits(self, views: Sequence[View]) -> tuple[list[Misfit], Float64]:

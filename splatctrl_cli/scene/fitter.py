@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
-from splatctrl_cli.config.fixed import EVICT_EVERY, NOT_COVERED, REFINE_BLOCKS, SEED_MUCH_MORE
+from splatctrl_cli.config.fixed import EVICT_EVERY, NEAREST_REACH, NOT_COVERED, REFINE_BLOCKS, SEED_MUCH_MORE
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet
@@ -150,7 +150,9 @@ class SceneFitter:
         rate = self.config.final_rate ** (block / (REFINE_BLOCKS - 1))
         count = num_iterations * (block + 1) // REFINE_BLOCKS - num_iterations * block // REFINE_BLOCKS
         settings = self.descent.settings(rate, rate * self.config.refine_geometry)
-        self.descent.run(self.window.schedule(count, rng), settings)
+        self.descent.run(
+            self.window.schedule(count, rng), settings, self.config.refine_depth ** (block / (REFINE_BLOCKS - 1))
+        )
         # What one view sees through stays here: its removal costs 0.6 dB where poses are off by millimetres.
         removed = self._remove(nowhere, nowhere, counts_time=False)
         filled = self.refined.filled
@@ -186,7 +188,8 @@ class SceneFitter:
         """A frame as the optimiser takes it."""
         min_range = self.occupancy.config.min_range
         mappable = inside_workspace(frame, world_points(frame), self.workspace, min_range)
-        return make_view(frame, mappable, self.mounted.get(frame.camera))
+        reach = NEAREST_REACH * (self.config.scale or 1.0)
+        return make_view(frame, mappable, self.mounted.get(frame.camera), reach=reach)
 
     def _find_mounted(self, frames: Sequence[RgbdFrame]) -> None:
         """Tell apart what a camera carries, once it has been in enough places."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.config.fixed import NEAREST_REACH
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.kernels.raster import TargetView
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
@@ -17,20 +18,23 @@ from splatctrl_cli.scene.render import camera_array
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame as the optimiser takes it, with the pixels (H, W) that the map has to explain."""
+    """A frame as the optimiser takes it, with the pixels (H, W) that the map has to explain; `reach` [m] is that of
+    `nearest`.
+    """
 
     frame: RgbdFrame
     camera: Float64
     target: TargetView
     mappable: Bool
+    reach: float
 
     @cached_property
     def nearest(self) -> Float32:
         """`nearest_depth` of the frame."""
-        return nearest_depth(self.frame)
+        return nearest_depth(self.frame, self.reach)
 
 
-def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None) -> View:
+def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, reach: float = NEAREST_REACH) -> View:
     """A view of `frame`; `mappable` (H, W) are its pixels with a depth inside the workspace.
 
     Pixels without depth count in the colour loss; pixels that are not valid, whose depth lies outside the workspace,
@@ -48,7 +52,7 @@ def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None) -> 
         counted=counted.astype(np.uint8),
     )
     camera = camera_array(frame.intrinsics, frame.T_world_camera)
-    return View(frame=frame, camera=camera, target=target, mappable=mappable)
+    return View(frame=frame, camera=camera, target=target, mappable=mappable, reach=reach)
 
 
 def halved(view: View) -> View:
@@ -66,7 +70,7 @@ def halved(view: View) -> View:
         depth=np.where(np.isfinite(nearest), nearest, np.float32(0.0)),
         counted=_quads(target.counted).min(axis=(-3, -1)).astype(np.uint8),
     )
-    return View(frame=view.frame, camera=camera, target=halved_target, mappable=view.mappable)
+    return View(frame=view.frame, camera=camera, target=halved_target, mappable=view.mappable, reach=view.reach)
 
 
 def _quads(image: NDArray[np.generic]) -> Float32:

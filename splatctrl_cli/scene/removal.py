@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
+from splatctrl_cli.config.fixed import NEAREST_REACH
 from splatctrl_cli.geometry import invert_transform, project, transform_points
 from splatctrl_cli.records import Bool, Box, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import SplatBuffer
@@ -12,14 +13,14 @@ from splatctrl_cli.scene.occupancy import OccupancyMap
 REASONS = ("broken", "workspace", "opacity", "free", "seen_through", "uncertain", "trail", "robot", "weak", "evicted")
 
 
-def nearest_depth(frame: RgbdFrame) -> Float32:
-    """The least valid depth (H, W) [m] within 1 cm of each pixel, as far as that reaches at the frame's median depth;
-    infinite where there is none.
+def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH) -> Float32:
+    """The least valid depth (H, W) [m] within `reach` [m] of each pixel, as far as that goes at the frame's median
+    depth; infinite where there is none.
     """
     valid = frame.depth[frame.depth > 0]
     if not len(valid):
         return np.full(frame.depth.shape, np.inf, np.float32)
-    half = max(1, round(0.01 * frame.intrinsics.fx / float(np.median(valid))))
+    half = max(1, round(reach * frame.intrinsics.fx / float(np.median(valid))))
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     return np.asarray(cv2.erode(depth, np.ones((2 * half + 1, 2 * half + 1), np.uint8)), np.float32)
 

@@ -33,6 +33,12 @@ def less_of(stage: Stage, change: Callable[[dict[str, list[dict[str, object]]]],
     return path
 
 
+def coarse_voxels(stage: Stage) -> None:
+    """The scene of a reconstruction that did not know of the robot, of things at 1.2 m."""
+    metrics = {"cameras": ["cam0"], "has_clock": True, "stamp_ns": stage.map_stamps[-1], "voxel": 0.03}
+    stage.run = {"metrics": metrics}
+
+
 def near_margin(stage: Stage) -> None:
     stage.balls = [FAR, stage.ball_at_the_end(0.01)]
 
@@ -225,6 +231,7 @@ ALONE: dict[str, Broken] = {
     "lead-in": (late_maps, (), "judged time", "not evaluable", "--start-time first-map"),
     "one map": (one_map_at_the_end, (), "judged time", "not evaluable", "the first 1.00 s (10 states) come before"),
     "latency": (lambda _: None, ("--latency", "0.9"), "judged time", "not evaluable", "come before the first map"),
+    "coarse map": (coarse_voxels, (), "map resolution", "not evaluable", "voxels of 30.0 mm, allowed 25.0 mm"),
     "starved map": (without_a_splat, (), "clearance", "not evaluable", "raise --max-splats"),
 }
 """By name: what breaks it, arguments, and the criterion, label and words of the verdict."""

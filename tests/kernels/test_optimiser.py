@@ -28,6 +28,7 @@ def settings(noise: float = 0.0, regulariser: float = 0.0) -> OptimiserSettings:
         min_opacity=0.1,
         min_radius=1e-4,
         max_radius=1.0,
+        radius_depth=0.0,
     )
 
 

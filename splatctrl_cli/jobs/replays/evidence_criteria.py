@@ -4,7 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from splatctrl_cli.config.fixed import BLIND, CLOCKS_APART, MISPLACED, SAME_MOMENT_NS, SOME_UNSEEN, UNSEEN
+from splatctrl_cli.config.fixed import (
+    BLIND,
+    CLOCKS_APART,
+    COARSE_VOXEL,
+    MISPLACED,
+    SAME_MOMENT_NS,
+    SOME_UNSEEN,
+    UNSEEN,
+)
 from splatctrl_cli.control.events import EventKind
 from splatctrl_cli.evaluate.conformal import ConformalBound
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, held, lacking
@@ -343,10 +351,25 @@ def calibration(judged: Judged) -> Iterator[Reason]:
     )
 
 
+def map_resolution(judged: Judged) -> Iterator[Reason]:
+    """The map's voxels are at most 25 mm: what no splat stands for may be as large as one."""
+    voxel = judged.inputs.scene.figures().get("voxel")
+    if voxel is None or voxel <= COARSE_VOXEL:
+        return
+    yield lacking(
+        sentence=f"the map has voxels of {mm(voxel)}, allowed {mm(COARSE_VOXEL)} beside a robot",
+        value=float(voxel),
+        threshold=COARSE_VOXEL,
+        unit="m",
+        remedy="reconstruct with --urdf, or with --set scene.scale=1",
+    )
+
+
 OF_EVIDENCE: tuple[Criterion[Judged], ...] = (
     Criterion(name="map error", find=map_error, broken=UNKNOWN),
     Criterion(name="evidence", find=belonging, broken=f"{UNKNOWN}; a changed file is refused (exit 4)"),
     Criterion(name="calibration", find=calibration, broken=UNKNOWN),
+    Criterion(name="map resolution", find=map_resolution, broken=UNKNOWN),
     Criterion(name="judged time", find=judged_time, broken=f"{UNKNOWN}; `--start-time first-map` judges the rest"),
     Criterion(name="known space", find=known_space, broken=UNKNOWN),
     Criterion(name="evidence age", find=evidence_age, broken=UNKNOWN),

@@ -124,10 +124,10 @@ void bind_optimiser(nb::module_& m) {
         expect(n == static_cast<std::size_t>(raster.num_splats()) && gradients.size() == 10 * n &&
                    parameters.size() == 8 * n && first_moment.size() == 8 * n && second_moment.size() == 8 * n,
                "expected gradients (N, 10), parameters and moments (N, 8), num_steps (N,)");
-        expect(settings.size() == 9, "settings: expected 9 numbers");
+        expect(settings.size() == 10, "settings: expected 10 numbers");
         const double* s = settings.data();
         const auto f = [s](int k) { return static_cast<float>(s[k]); };
-        const OptimiserSettings values{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7), f(8), seed};
+        const OptimiserSettings values{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7), f(8), f(9), seed};
         const SplatState state{parameters.data(), first_moment.data(), second_moment.data(), num_steps.data(),
                                static_cast<int>(n)};
         const nb::gil_scoped_release release;

@@ -32,6 +32,13 @@ float normal(std::uint64_t seed, std::uint64_t index) {
   return static_cast<float>(std::sqrt(-2.0 * std::log(u)) * std::cos(6.283185307179586 * v));
 }
 
+// The largest radius [m] at a centre: a fixed one, or what covers a fixed number of pixels there.
+float largest_radius(const Camera& camera, const float* center, const OptimiserSettings& settings) {
+  if (settings.radius_depth <= 0.0f) return settings.max_radius;
+  const float depth = to_camera(camera, center).z;
+  return std::max(settings.max_radius * depth / settings.radius_depth, settings.min_radius);
+}
+
 void step_splat(const SplatState& state, int i, const Camera& camera, const SplatGradient& gradient,
                 const OptimiserSettings& settings) {
   float* p = state.parameters + static_cast<std::size_t>(kNumParameters) * i;
@@ -53,7 +60,7 @@ void step_splat(const SplatState& state, int i, const Camera& camera, const Spla
     v[k] = kBeta2 * v[k] + (1.0f - kBeta2) * g[k] * g[k];
     p[k] -= rates[k] * (m[k] * correct1) / (std::sqrt(v[k] * correct2) + kEpsilon);
   }
-  p[3] = std::clamp(p[3], std::log(settings.min_radius), std::log(settings.max_radius));
+  p[3] = std::clamp(p[3], std::log(settings.min_radius), std::log(largest_radius(camera, p, settings)));
   for (int c = 0; c < 3; ++c) p[4 + c] = std::clamp(p[4 + c], 0.0f, 1.0f);
   p[7] = std::clamp(p[7], -kLargestLogit, kLargestLogit);
   if (settings.noise <= 0.0f) return;

@@ -16,6 +16,7 @@ struct OptimiserSettings {
   float noise;              // lambda_noise
   float min_opacity;        // centre of the noise gate
   float min_radius, max_radius;  // [m]
+  float radius_depth;       // [m] at which a splat may be max_radius large, and in proportion elsewhere; 0: everywhere
   std::uint64_t seed;       // of this step's noise
 };
 
