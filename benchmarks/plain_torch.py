@@ -4,6 +4,7 @@ The same equations, tiles of 16 pixels and constants as the compiled kernels. Ti
 a row of tiles and the row is blended at once, which is how one writes it without a kernel of one's own.
 """
 
+import numpy as np
 import torch
 
 from benchmarks.scenes import FitProblem
@@ -24,7 +25,7 @@ class TorchIteration:
         groups = [{"params": [p], "lr": lr} for p, lr in zip(self.parameters, rates, strict=True)]
         self.optimiser = torch.optim.Adam(groups, eps=1e-15)
         self.camera = problem.camera.tolist()
-        self.color = torch.from_numpy(problem.target.color)
+        self.color = torch.from_numpy(problem.target.color / np.float32(255.0))
         self.depth = torch.from_numpy(problem.target.depth)
         self.weights, self.settings = weights, settings
         line = torch.exp(-((torch.arange(11.0) - 5) ** 2) / (2 * 1.5**2))

@@ -51,7 +51,7 @@ def wall_problem(num_splats: int) -> FitProblem:
         ]
     ).astype(np.float32)
     target = TargetView(
-        color=rng.uniform(0.0, 1.0, (3, VGA.height, VGA.width)).astype(np.float32),
+        color=rng.integers(0, 256, (3, VGA.height, VGA.width), np.uint8),
         depth=np.full((VGA.height, VGA.width), WALL, np.float32),
         counted=np.ones((VGA.height, VGA.width), np.uint8),
     )

@@ -98,11 +98,11 @@ class LossWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class TargetView:
-    """What a camera saw: color (3, H, W) float32 in [0, 1]; depth (H, W) float32 [m], 0 = none; counted (H, W) uint8,
-    0 = a pixel that the map need not explain.
+    """What a camera saw: color (3, H, W) uint8; depth (H, W) float32 [m], 0 = none; counted (H, W) uint8, 0 = a pixel
+    that the map need not explain.
     """
 
-    color: Float32
+    color: NDArray[np.uint8]
     depth: Float32
     counted: NDArray[np.uint8]
 

@@ -102,7 +102,7 @@ class Descent:
         for view in views:
             planes = self.planes(view)
             color = planes[:3] + (1.0 - planes[4]) * background
-            error = np.abs(color - view.target.color).mean(axis=0)
+            error = np.abs(color - view.target.color / np.float32(255.0)).mean(axis=0)
             misfits.append(Misfit(frame=view.frame, error=np.where(view.mappable, error, np.float32(0.0))))
             ones = np.zeros_like(planes)
             ones[0] = view.target.counted

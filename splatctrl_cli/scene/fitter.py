@@ -7,10 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import HumanConfig, OccupancyConfig, SceneConfig, check_voxel
-from splatctrl_cli.config.fixed import EVICT_EVERY, NEAREST_REACH, NOT_COVERED, REFINE_BLOCKS, SEED_MUCH_MORE
+from splatctrl_cli.config.fixed import (
+    EVICT_EVERY,
+    NEAREST_REACH,
+    NOT_COVERED,
+    REFINE_BLOCKS,
+    SEED_ASKED_VIEWS,
+    SEED_MUCH_MORE,
+)
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.raster import LossTerms
-from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet
+from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.audit_row import AuditRow, Refined
 from splatctrl_cli.scene.buffer import Filled, SplatBuffer
 from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_contact
@@ -34,6 +41,8 @@ from splatctrl_cli.scene.seeding import (
     gap_seeds,
     inside_workspace,
     seeds_at,
+    thinned,
+    thinning,
     world_points,
 )
 from splatctrl_cli.scene.self_mask import (
@@ -255,11 +264,13 @@ class SceneFitter:
     def _seed(self, views: Sequence[View], masks: Sequence[SelfMask]) -> Filled:
         """Fill dead slots at the pixels of M_add, as densely as uses `fill` of the budget on the first full view."""
         found: dict[Label, list[Candidates]] = {Label.OBJECT: [], Label.ROBOT: []}
-        for view, mask in zip(views, masks, strict=True):
-            is_added = add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config)
+        added = [add_mask(view.frame, self.descent.rendering(view), view.mappable, self.config) for view in views]
+        every = thinning(added)
+        for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
+            others = [views[(index + k) % len(views)] for k in spread(range(len(views)), SEED_ASKED_VIEWS)]
             for label, sources in found.items():
-                source = candidates(view.frame, is_added & of_label(mask, label))
-                sources.append(source.select(self._is_grounded(source.points, views)))
+                source = candidates(view.frame, thinned(added[index] & of_label(mask, label), every))
+                sources.append(source.select(self._is_grounded(source.points, others)))
         everything = [source for sources in found.values() for source in sources]
         num_candidates = sum(len(source) for source in everything)
         if not num_candidates:
@@ -273,6 +284,8 @@ class SceneFitter:
             if not any(len(source) for source in sources):
                 continue
             seeds = seeds_at(sources, self.buffer.centers[self._standing_for(label)], self.density, self.config)
+            if len(views) > SEED_ASKED_VIEWS:
+                seeds = seeds.select(self._is_grounded(seeds.centers, views))
             filled += self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve, label=label)
         return filled
 

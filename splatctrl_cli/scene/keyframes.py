@@ -45,9 +45,8 @@ def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, 
         mappable, counted = mappable & frame.valid, counted & frame.valid
     if mounted is not None:
         mappable, counted = mappable & ~mounted, counted & ~mounted
-    color = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0).astype(np.float32) / np.float32(255.0))
     target = TargetView(
-        color=color,
+        color=np.ascontiguousarray(np.moveaxis(frame.color, 2, 0)),
         depth=np.where(mappable, frame.depth, np.float32(0.0)).astype(np.float32),
         counted=counted.astype(np.uint8),
     )
@@ -66,7 +65,7 @@ def halved(view: View) -> View:
     camera[:6] = [k.fx / 2, k.fy / 2, (k.cx - 0.5) / 2, (k.cy - 0.5) / 2, width, height]
     nearest = _quads(np.where(target.depth > 0, target.depth, np.float32(np.inf))).min(axis=(-3, -1))
     halved_target = TargetView(
-        color=np.ascontiguousarray(_quads(target.color).mean(axis=(-3, -1))),
+        color=np.ascontiguousarray(np.rint(_quads(target.color).mean(axis=(-3, -1))).astype(np.uint8)),
         depth=np.where(np.isfinite(nearest), nearest, np.float32(0.0)),
         counted=_quads(target.counted).min(axis=(-3, -1)).astype(np.uint8),
     )

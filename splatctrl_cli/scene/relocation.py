@@ -12,7 +12,7 @@ from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import SEED_OVERSAMPLING
 from splatctrl_cli.records import Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
-from splatctrl_cli.scene.seeding import NO_SEEDS, world_points
+from splatctrl_cli.scene.seeding import NO_SEEDS, thinned, thinning, world_points
 
 
 def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
@@ -61,8 +61,9 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
     each other than their diameters, so that several views do not seed the same spot.
     """
     points, colors, sizes, weights = [], [], [], []
+    every = thinning(misfit.error > 0 for misfit in misfits)
     for misfit in misfits:
-        frame, mask = misfit.frame, misfit.error > 0
+        frame, mask = misfit.frame, thinned(misfit.error > 0, every)
         focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
         points.append(world_points(frame)[mask].astype(np.float32))
         colors.append(frame.color[mask].astype(np.float32) / 255.0)

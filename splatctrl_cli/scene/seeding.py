@@ -1,6 +1,7 @@
 """Where new splats come from: the first frames, and pixels that the map does not explain (M_add, eq. 5)."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
-from splatctrl_cli.config.fixed import SEED_CROWDED, SEED_LEVELS
+from splatctrl_cli.config.fixed import SEED_CROWDED, SEED_LEVELS, SEED_MOST_PIXELS
 from splatctrl_cli.geometry import back_project, back_project_pixels, transform_points
 from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
@@ -60,6 +61,20 @@ class Candidates(Columns):
     points: Float32
     colors: Float32
     pixels: Float32
+
+
+def thinning(masks: Iterable[Bool]) -> int:
+    """Of how many pixels of masks (H, W) one has to do, so that no more are left than are looked at together."""
+    return max(1, math.ceil(sum(int(mask.sum()) for mask in masks) / SEED_MOST_PIXELS))
+
+
+def thinned(mask: Bool, every: int) -> Bool:
+    """The first of every so many pixels of a mask (H, W), row after row."""
+    if every == 1:
+        return mask
+    kept = np.zeros(mask.size, bool)
+    kept[np.flatnonzero(mask)[::every]] = True
+    return kept.reshape(mask.shape)
 
 
 def candidates(frame: RgbdFrame, mask: Bool) -> Candidates:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -114,10 +115,18 @@ def object_mask(frame: RgbdFrame) -> SelfMask:
     """Of a frame that nobody knows the robot's place in: all its depth is of objects."""
     return SelfMask(
         kinds=(frame.depth > 0).view(np.uint8),
-        robot_depth=np.zeros(frame.depth.shape, np.float32),
+        robot_depth=_nothing_rendered(frame.depth.shape),
         residuals={},
         num_inside={},
     )
+
+
+@lru_cache
+def _nothing_rendered(shape: tuple[int, int]) -> Float32:
+    """One image for all masks without a robot: hundreds of views have one each."""
+    image = np.zeros(shape, np.float32)
+    image.flags.writeable = False
+    return image
 
 
 def of_label(mask: SelfMask, label: Label) -> Bool:

@@ -57,7 +57,7 @@ def time_steps(
     tolerance_ns: int = 20_000_000,
     observe: Callable[[Record], None] = lambda record: None,
 ) -> Iterator[TimeStep]:
-    """Group the frames of `cameras`: with a clock by stamp, else up to 128 views at a time.
+    """Group the frames of `cameras`: with a clock by stamp, else up to FRAMES_PER_STEP views at a time.
 
     observe: is shown every record on its way, of whatever camera, so that one pass serves both.
     """

@@ -18,7 +18,7 @@ def images(height: int = 29, width: int = 43, seed: int = 0) -> tuple[Float32, T
     depth = rng.uniform(0.4, 1.5, (height, width)).astype(np.float32)
     depth[rng.uniform(size=depth.shape) < 0.3] = 0.0
     counted = (rng.uniform(size=depth.shape) < 0.9).astype(np.uint8)
-    color = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+    color = rng.integers(0, 256, (3, height, width), np.uint8)
     return planes, TargetView(color=color, depth=depth, counted=counted)
 
 
@@ -35,7 +35,7 @@ def expected(planes: Float32, view: TargetView, weights: LossWeights) -> tuple[f
     leaf = torch.tensor(planes.astype(np.float64), requires_grad=True)
     value = reference.loss(
         leaf,
-        torch.tensor(view.color.astype(np.float64)),
+        torch.tensor(view.color.astype(np.float64) / 255.0),
         torch.tensor(view.depth.astype(np.float64)),
         torch.tensor(view.counted > 0),
         dssim=weights.dssim,
@@ -81,7 +81,7 @@ def test_one_object_compares_images_of_different_sizes() -> None:
 
 def test_identical_images_have_no_colour_loss() -> None:
     planes, view = images()
-    planes[:3] = view.color
+    planes[:3] = view.color / np.float32(255.0)
     terms, gradient = evaluated(planes, view, WEIGHTS)
     assert (terms.l1, terms.squared) == (0.0, 0.0)
     assert terms.dssim == pytest.approx(0.0, abs=1e-6)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import SEED_ASKED_VIEWS
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Label, PointCloud, SplatSet
+from splatctrl_cli.records import Label, PointCloud, SplatSet, spread
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, carried
@@ -263,3 +264,15 @@ def test_what_the_optimiser_moves_off_the_robot_in_the_first_time_step_goes(monk
     assert row.removed["robot"] > 0
     centers = target.splats().centers
     assert not ((np.hypot(centers[:, 0], centers[:, 1]) < 0.09) & (np.abs(centers[:, 2] - 0.03) < 1e-6)).any()
+
+
+def test_what_only_a_view_that_was_not_asked_sees_through_is_not_seeded() -> None:
+    """One of 20 views shows a block; those that are asked have no depth there, the rest see the floor."""
+    views = [frame(0, x=0.0) for _ in range(20)]
+    views[0] = frame(0, block=0.2)
+    is_block = frame(0, block=0.2).depth < frame(0).depth - 0.1
+    for index in spread(range(20), SEED_ASKED_VIEWS)[1:]:
+        views[index].depth[is_block] = 0.0
+    row = SceneFitter(replace(CONFIG, first_iterations=0), OCCUPANCY, WORKSPACE).step(views)
+    assert row.alive > 100
+    assert row.removed["seen_through"] == 0

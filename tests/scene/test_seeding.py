@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float32, SplatSet
@@ -15,6 +16,8 @@ from splatctrl_cli.scene.seeding import (
     gap_seeds,
     inside_workspace,
     seeds_at,
+    thinned,
+    thinning,
     world_points,
 )
 from tests.scene.wall import WORKSPACE, frame
@@ -192,3 +195,15 @@ def test_the_two_halves_of_the_rows_are_looked_at_in_turn() -> None:
         assert len(rows) > 20
         assert (rows % 3 == 0).all()
         assert ((rows // 3) % 2 == half).all()
+
+
+def test_more_pixels_than_are_looked_at_together_are_thinned_in_each_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    masks = [np.ones((60, 80), bool), np.zeros((60, 80), bool), np.eye(60, 80) > 0]
+    assert thinning(masks) == 1
+    assert thinned(masks[0], 1) is masks[0]
+    monkeypatch.setattr("splatctrl_cli.scene.seeding.SEED_MOST_PIXELS", 1000)
+    every = thinning(masks)
+    kept = [int(thinned(mask, every).sum()) for mask in masks]
+    assert every == 5
+    assert kept == [960, 0, 12]
+    assert not (thinned(masks[2], every) & ~masks[2]).any()

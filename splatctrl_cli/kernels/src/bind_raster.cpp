@@ -91,8 +91,8 @@ void bind_loss(nb::module_& m) {
       .def(nb::init<>())
       .def(
           "evaluate",
-          [](ImageLoss& self, const ConstFloats& planes, const ConstFloats& color, const ConstFloats& depth,
-             const Array<const std::uint8_t>& counted, int width, int height, const Array<const double>& weights,
+          [](ImageLoss& self, const ConstFloats& planes, const Array<const std::uint8_t>& color,
+             const ConstFloats& depth, const Array<const std::uint8_t>& counted, int width, int height, const Array<const double>& weights,
              bool normalised, const Floats& plane_gradients, int num_threads) {
             const auto size = static_cast<std::size_t>(width) * height;
             expect(planes.size() == 5 * size && color.size() == 3 * size && depth.size() == size &&

@@ -58,16 +58,18 @@ void store_pixels(float* row, int x, int width, Float8 value) {
   if (x < width) std::copy(part, part + (width - x), row + x);
 }
 
-Int8 load_mask(const std::uint8_t* row, int x, int width) {
+Int8 load_bytes(const std::uint8_t* row, int x, int width) {
   typedef std::uint8_t Byte8 __attribute__((vector_size(8)));
   Byte8 bytes{};
   std::memcpy(&bytes, row + x, std::min(8, width - x));
-  return __builtin_convertvector(bytes, Int8) != 0;
+  return __builtin_convertvector(bytes, Int8);
 }
 
 // What is compared, one image against another.
 struct Images {
-  const float *planes, *color, *depth;
+  const float* planes;
+  const std::uint8_t* color;
+  const float* depth;
   const std::uint8_t* counted;
   int width, height;
   std::size_t size() const { return static_cast<std::size_t>(width) * height; }
@@ -81,8 +83,9 @@ struct Pair {
 
 inline Pair load_pair(const Images& images, int channel, float background, int y, int x) {
   const std::size_t row = images.row(y);
-  const Int8 counts = load_mask(images.counted + row, x, images.width);
-  const Float8 target = load_pixels(images.color + channel * images.size() + row, x, images.width);
+  const Int8 counts = load_bytes(images.counted + row, x, images.width) != 0;
+  const Int8 levels = load_bytes(images.color + channel * images.size() + row, x, images.width);
+  const Float8 target = __builtin_convertvector(levels, Float8) / 255.0f;
   const Float8 opacity = load_pixels(images.planes + 4 * images.size() + row, x, images.width);
   const Float8 rendered = load_pixels(images.planes + channel * images.size() + row, x, images.width);
   const Float8 difference = keep8(counts, rendered + (1.0f - opacity) * background - target);
@@ -233,7 +236,7 @@ struct Band {
       for (int x = 0; x < images.width; x += 8) {
         const Float8 sum = load8(scratch.pair(0, pair_row(y)) + x);
         const Float8 difference = load8(scratch.pair(1, pair_row(y)) + x);
-        const Int8 counts = load_mask(images.counted + images.row(y), x, images.width);
+        const Int8 counts = load_bytes(images.counted + images.row(y), x, images.width) != 0;
         const Float8 ssim = window_sum(maps[0] + x, scratch.stride) +
                             2.0f * (sum * window_sum(maps[1] + x, scratch.stride) +
                                     difference * window_sum(maps[2] + x, scratch.stride));
@@ -284,7 +287,7 @@ struct Band {
 ImageLoss::ImageLoss() = default;
 ImageLoss::~ImageLoss() = default;
 
-LossTerms ImageLoss::evaluate(const float* planes, const float* color, const float* depth,
+LossTerms ImageLoss::evaluate(const float* planes, const std::uint8_t* color, const float* depth,
                               const std::uint8_t* counted, int width, int height, const LossWeights& weights,
                               float* plane_gradients, int num_threads) {
   const Images images{planes, color, depth, counted, width, height};

@@ -34,11 +34,11 @@ class ImageLoss {
   ImageLoss& operator=(const ImageLoss&) = delete;
   ~ImageLoss();
 
-  // planes (5, H, W) as the rasteriser writes them; color (3, H, W) in [0, 1]; depth (H, W) [m], 0 = none; counted
+  // planes (5, H, W) as the rasteriser writes them; color (3, H, W) 0 to 255; depth (H, W) [m], 0 = none; counted
   // (H, W), 0 = this pixel is none of the map's business: it is given its target's colour, and no colour gradient.
   // Writes plane_gradients (5, H, W). Means are over counted pixels.
-  LossTerms evaluate(const float* planes, const float* color, const float* depth, const std::uint8_t* counted,
-                     int width, int height, const LossWeights& weights, float* plane_gradients, int num_threads);
+  LossTerms evaluate(const float* planes, const std::uint8_t* color, const float* depth,
+                     const std::uint8_t* counted, int width, int height, const LossWeights& weights, float* plane_gradients, int num_threads);
 
  private:
   std::vector<std::unique_ptr<LossScratch>> scratch_;  // one per thread
