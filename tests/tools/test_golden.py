@@ -2,12 +2,15 @@
 
 import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.test_docs import commands_on
-from tools.golden.__main__ import ordered, read_cases
+from tools.golden.__main__ import Case, ordered, read_cases, run_case
 from tools.golden.digest import of_json, stamps, written
 
 ROOT = Path(__file__).parent.parent.parent
@@ -26,6 +29,22 @@ def test_a_case_runs_after_all_that_it_needs() -> None:
     order = ordered(cases, ["readme-replay", "capture-unpack"])
     assert order == ["readme-ingest", "readme-reconstruct", "readme-replay", "capture-pack", "capture-unpack"]
     assert set(ordered(cases, [])) == set(cases)
+
+
+def test_no_command_of_a_case_uses_avx512(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = []
+    chosen = "import os; from numpy.lib.introspect import opt_func_info as loops; print(os.environ['OPENCV_IPP'], *{"
+    chosen += "used for kinds in loops().values() for kind in kinds.values() for used in kind['current'].split()})"
+    started = subprocess.run
+
+    def answered(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        said.append(set(started([sys.executable, "-c", chosen], **options).stdout.split()))
+        return subprocess.CompletedProcess(command, 0, "{}", "")
+
+    monkeypatch.setattr(subprocess, "run", answered)
+    run_case("any", Case(run="info log.mcap", before="info log.mcap"), tmp_path, {})
+    assert len(said) == 2
+    assert all("avx2" in used and not used & {"X86_V4", "AVX512_ICL", "AVX512_SPR"} for used in said), said
 
 
 def test_times_and_places_do_not_change_a_digest() -> None:
