@@ -69,6 +69,18 @@ def test_a_log_that_ends_before_the_scene_is_known_cannot_be_evaluated(
     assert not (desk.folder / "out").exists() and not (desk.folder / "out.partial").exists()
 
 
+@pytest.mark.parametrize("start", [(), ("--start-time", "first-map"), ("--start-time", "0.5")])
+def test_states_and_a_scene_on_clocks_that_do_not_overlap_are_said_as_such(
+    desk: Desk, capsys: pytest.CaptureFixture[str], start: tuple[str, ...]
+) -> None:
+    epoch = 1_700_000_000 * SECOND
+    scene = write_scene(desk.folder / "scene", (epoch, splats_of(BALL)), (epoch + SECOND, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene), "-q", *start) == 5
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "joint states from 0.00 to 1.00 s and a scene from 1700000000.00 to 1700000001.00 s are on" in line
+    assert "clocks that do not overlap; record both by one clock" in line
+
+
 def test_a_baked_field_says_nearly_the_same_and_certifies_less(desk: Desk, arm: RobotModel) -> None:
     box = Box(lower=np.array([-0.4, -1.0, 0.0]), upper=np.array([1.0, 1.0, 1.2]))
     (desk.folder / "field").mkdir()

@@ -19,6 +19,7 @@ from splatctrl_cli.jobs.replays.goal import goal_waypoints, twist_figures, twist
 from splatctrl_cli.jobs.replays.inputs import check_inside
 from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.outside import commander_of, outside_run
+from splatctrl_cli.jobs.replays.provenance import times_apart
 from splatctrl_cli.jobs.replays.request import FIRST_MAP, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone, separations
@@ -213,8 +214,17 @@ def _replay(
 
 
 def _requested_ns(request: ReplayRequest, inputs: ReplayInputs) -> int:
-    """The stamp from which on the request wants the log replayed. Raises InputError for one after its end."""
+    """The stamp from which on the request wants the log replayed. Raises InputError for one after its end,
+    NotEvaluableError where all of the log is before the scene.
+    """
     scene, stamps = inputs.scene, inputs.states.stamp_ns
+    if scene.first_ns is not None and scene.first_ns > stamps[-1]:
+        apart = times_apart(stamps, (scene.first_ns, max((scene.first_ns, *scene.stamps_ns))))
+        raise NotEvaluableError(
+            f"{inputs.source.name}: all {len(stamps)} joint states are earlier than the first known scene"
+            + ("" if apart is None else f": {apart.sentence}"),
+            remedy="reconstruct with more snapshots, or replay against --field" if apart is None else apart.remedy,
+        )
     if request.start_time is None:
         return int(stamps[0])
     if request.start_time == FIRST_MAP:
@@ -233,13 +243,7 @@ def _first_judged(request: ReplayRequest, inputs: ReplayInputs) -> int:
     """The first requested state for which a scene is known."""
     scene, stamps = inputs.scene, inputs.states.stamp_ns
     earliest = _requested_ns(request, inputs)
-    first = int(np.searchsorted(stamps, earliest if scene.first_ns is None else max(earliest, scene.first_ns)))
-    if first == len(stamps):
-        raise NotEvaluableError(
-            f"{inputs.source.name}: all {len(stamps)} joint states are earlier than the first known scene",
-            remedy="reconstruct with more snapshots, or replay against --field",
-        )
-    return first
+    return int(np.searchsorted(stamps, earliest if scene.first_ns is None else max(earliest, scene.first_ns)))
 
 
 def _span(inputs: ReplayInputs) -> tuple[int, int]:

@@ -7,10 +7,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import RECORDINGS_APART_NS, SAME_CLEARANCE, SAME_MOTION_STATES
+from splatctrl_cli.config.fixed import CLOCK_MIXED, RECORDINGS_APART_NS, SAME_CLEARANCE, SAME_MOTION_STATES
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
 from splatctrl_cli.logs.state_columns import StateColumns
-from splatctrl_cli.records import RecordSource
+from splatctrl_cli.records import RecordSource, Stamps
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.splats_and_occupancy import agreement_with_grid
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
@@ -56,14 +56,10 @@ def scene_mismatches(
             remedy="reconstruct again",
         )
     if scene.has_clock and len(states):
-        stamps = [snapshot.stamp_ns for snapshot in scene.snapshots] or [scene.stamp_ns]
-        first, last = int(states.stamp_ns[0]), int(states.stamp_ns[-1])
-        if last < stamps[0] - RECORDINGS_APART_NS or first > max(stamps[-1], scene.stamp_ns) + RECORDINGS_APART_NS:
-            yield Mismatch(
-                sentence=f"joint states from {first} to {last} ns and a scene from {stamps[0]} to "
-                f"{scene.stamp_ns} ns are of different times",
-                remedy="record both by one clock, or reconstruct this log",
-            )
+        stamps = [*(snapshot.stamp_ns for snapshot in scene.snapshots), scene.stamp_ns]
+        found = times_apart(states.stamp_ns, (min(stamps), max(stamps)))
+        if found is not None:
+            yield found
     yield from _map_mismatches(scene)
     joints = run.get("metrics", {}).get("robot_joints")
     if joints is not None and tuple(joints) != tuple(model.joint_names):
@@ -71,6 +67,23 @@ def scene_mismatches(
             sentence=f"{scene.path} was told apart from another robot, with joints {', '.join(joints)}",
             remedy="reconstruct with this --urdf",
         )
+
+
+def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
+    """How states at stamps (T,) [ns], T > 0, and a scene from one stamp to another share no time; None where they do,
+    or nearly.
+    """
+    first, last = int(states_ns[0]), int(states_ns[-1])
+    apart_ns = max(scene_ns[0] - last, first - scene_ns[1])
+    if apart_ns <= RECORDINGS_APART_NS:
+        return None
+    ours, theirs = (f"from {start * 1e-9:.2f} to {end * 1e-9:.2f} s" for start, end in ((first, last), scene_ns))
+    is_other_clock = apart_ns > CLOCK_MIXED * 1e9
+    return Mismatch(
+        sentence=f"joint states {ours} and a scene {theirs} are "
+        + ("on clocks that do not overlap" if is_other_clock else "of different times"),
+        remedy="record both by one clock, or reconstruct this log",
+    )
 
 
 def _map_mismatches(scene: SceneFolder) -> Iterator[Mismatch]:
