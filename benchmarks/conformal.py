@@ -29,7 +29,7 @@ from splatctrl_cli.config.fixed import FEWEST_STRETCHES
 from splatctrl_cli.evaluate.conformal import autocorrelation_time, conformal_rank, stretch_scores, stretches
 from splatctrl_cli.jobs.progress import SILENT
 from splatctrl_cli.jobs.replays.evidence import Misses, misses_of
-from splatctrl_cli.jobs.replays.inputs import read_states
+from splatctrl_cli.jobs.replays.inputs import open_log, read_states
 from splatctrl_cli.jobs.replays.lockstep import from_log
 from splatctrl_cli.jobs.replays.request import ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.state_pass import ReplayRecord
@@ -148,7 +148,7 @@ def trial_of(seed: int) -> Trial | None:
         request = ReplayRequest(
             log=folder / "log.mcap", urdf=urdf, spheres=spheres, out=folder, config=config, options=options, threads=1
         )
-        states = read_states(request, model)
+        states = read_states(open_log(request)[1], model)
         scene = from_log(request, model, folder, SILENT)
         inputs = ReplayInputs(
             source=states.source, states=states.states, model=model, scene=scene, truth=None, digests={}

@@ -12,7 +12,7 @@ from splatctrl_cli.checks.check_images import (
     sample_findings,
     strided_lens,
 )
-from splatctrl_cli.checks.check_states import robot_states
+from splatctrl_cli.checks.check_states import RobotStates, robot_states
 from splatctrl_cli.checks.check_times import TimesWatch, time_findings
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, error, needs, note, warning
@@ -118,11 +118,12 @@ def check_folder(
     for camera in cameras.values():
         findings += _camera_findings(camera, has_clock=source.has_clock)
     findings += sample_findings([camera.images for camera in cameras.values()])
-    logged, states = watch.states.columns(), None
-    states_lack = "" if len(logged) else "no joint states; give them apart (docs/replay.md, Logs)"
+    logged = watch.states.columns()
+    lack = "" if len(logged) else "no joint states; give them apart (docs/replay.md, Logs)"
+    of_states = RobotStates(model=model, lack=lack)
     if len(logged) and source.has_clock:
-        states, states_lack, of_states = robot_states(model, source.joint_names, logged)
-        findings += of_states
+        of_states = robot_states(model, source.joint_names, logged)
+        findings += of_states.findings
     stamps = [stamp for camera in cameras.values() for stamp in camera.stamps]
     evidence = Evidence(
         path=path,
@@ -136,11 +137,11 @@ def check_folder(
         frames=[frame for name, camera in cameras.items() for frame in camera.frames(name)],
         depth_units={name: camera.images.scale for name, camera in cameras.items()},
         motion=watch.motion,
-        states=states,
-        states_lack=states_lack,
+        states=of_states.states,
+        states_lack=of_states.lack,
         cut="" if watch.is_whole else f"only the first {num_images} frames of a camera were read",
     )
-    return judged(evidence, findings, model)
+    return judged(evidence, findings, of_states.model)
 
 
 def _refused(path: Path, kind: str, wrong: InputError) -> CheckReport:

@@ -61,7 +61,7 @@ def check_log(
     lacks = _lacks(log, found, options)
     findings += [error("missing", log.path.name, *_parted(lack)) for lack in lacks]
     checked = [checked_camera(t, c, watch.images, found.tf, options) for t, c in rig if c is not None]
-    states, states_lack, of_states = log_states(found, options, model)
+    of_states = log_states(found, options, model)
     first, last = _span(found)
     evidence = Evidence(
         path=log.path,
@@ -75,11 +75,11 @@ def check_log(
         frames=[frame for camera in checked for frame in camera.frames],
         depth_units={c.camera.name: watch.images[c.topics.depth].unit for c in checked if c.frames},
         motion=image_motion(watch, checked),
-        states=states,
-        states_lack=states_lack,
+        states=of_states.states,
+        states_lack=of_states.lack,
         cut="" if watch.is_whole else f"only the first {num_images} images of a topic were read",
     )
-    return judged(evidence, [*findings, *of_states], model)
+    return judged(evidence, [*findings, *of_states.findings], of_states.model)
 
 
 def _chosen(log: RawLog, found: Survey, options: SourceOptions) -> tuple[CameraTopics, ...]:

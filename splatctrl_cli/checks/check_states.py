@@ -2,7 +2,7 @@
 end-effector poses against its kinematics."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -257,10 +257,20 @@ def _travel(poses: Float64) -> float:
     return max(spread.max_position, spread.max_rotation)
 
 
-def log_states(
-    found: Survey, options: SourceOptions, model: RobotModel | None
-) -> tuple[StateColumns | None, str, list[Finding]]:
-    """The joint states (in the model's order where there is one), why there are none, and what is wrong with them."""
+@dataclass(frozen=True, kw_only=True)
+class RobotStates:
+    """Joint states, in the order of `model` where there is one (None: `lack` says why there are none), and what is
+    wrong with them; the model is as the states move it.
+    """
+
+    model: RobotModel | None
+    states: StateColumns | None = None
+    lack: str = ""
+    findings: Sequence[Finding] = ()
+
+
+def log_states(found: Survey, options: SourceOptions, model: RobotModel | None) -> RobotStates:
+    """The joint states of a log, and what is wrong with them."""
     findings: list[Finding] = []
     for topic in found.of_type(*STATE_TYPES):
         if options.joint_topic in (None, topic.topic.name):
@@ -271,29 +281,34 @@ def log_states(
     try:
         names, states = joint_records(found, options, loss, wanted)
     except InputError as wrong:
-        return None, str(wrong), [*findings, error("joints", "joint states", wrong.message, wrong.remedy)]
+        findings.append(error("joints", "joint states", wrong.message, wrong.remedy))
+        return RobotStates(model=model, lack=str(wrong), findings=findings)
     findings += [note("joints", "joint states", text) for text in loss.notes]
     if not len(states):
         lack = "no joint states; record /joint_states, or give the states apart (docs/replay.md, Logs)"
-        return None, lack, findings
-    of_model, lack, of_robot = robot_states(model, names, states)
+        return RobotStates(model=model, lack=lack, findings=findings)
+    of_robot = robot_states(model, names, states)
     is_said = any(f.code == "joints-degrees" for f in findings)
-    return of_model, lack, [*findings, *(f for f in of_robot if not (is_said and f.code == "joints-degrees"))]
+    more = [f for f in of_robot.findings if not (is_said and f.code == "joints-degrees")]
+    return replace(of_robot, findings=[*findings, *more])
 
 
-def robot_states(
-    model: RobotModel | None, names: Sequence[str], states: StateColumns
-) -> tuple[StateColumns | None, str, list[Finding]]:
+def robot_states(model: RobotModel | None, names: Sequence[str], states: StateColumns) -> RobotStates:
     """States of joints `names` as `log_states` gives them."""
     if model is None:
-        return states, "", []
+        return RobotStates(model=None, states=states)
+    model = model.moved_by(names)
     absent = [name for name in model.joint_names if name not in names]
     if absent:
         text = f"the robot's joints {', '.join(absent)} are in no joint state"
         remedy = "give this robot's URDF, or hold them still with --lock"
-        return None, f"{text}; {remedy}", [error("joints", "joint states", text, remedy)]
+        found = [error("joints", "joint states", text, remedy)]
+        return RobotStates(model=model, lack=f"{text}; {remedy}", findings=found)
     states = states.of_joints(np.asarray(model.joint_order(names), dtype=np.int64))
-    return states, "", robot_findings(model, states, "joint states")
+    of_fingers = [note("joints", "joint states", model.held_words)] if model.held else []
+    return RobotStates(
+        model=model, states=states, findings=[*of_fingers, *robot_findings(model, states, "joint states")]
+    )
 
 
 def stream_findings(where: str, stream: JointStream) -> list[Finding]:

@@ -130,7 +130,9 @@ def _beside_held_out(grid: DistanceGrid, source: BakeSource, log: Path, request:
             newest[record.camera] = record, state
     if not newest:
         raise NotEvaluableError(f"{log}: no frame of {', '.join(cameras)} up to the time of the scene")
-    robot = None if request.urdf is None else RobotModel.from_urdf(request.urdf, request.spheres)
+    robot = None
+    if request.urdf is not None:
+        robot = RobotModel.from_urdf(request.urdf, request.spheres).moved_by(recording.joint_names)
     counted = []
     for frame, at in newest.values():
         spheres = None

@@ -84,7 +84,7 @@ def _replay_parts(run: RunFolder, states: States, roots: tuple[Path, ...]) -> It
         yield from _known_parts([(start + round(1e9 * time_s), snapshot) for time_s, snapshot in known])
     elif (place := run.place_of(grid, roots)) is not None:
         yield _field_part(place / "field.npz" if place.is_dir() else place, start)
-    robot = robot_of(run, roots)
+    robot = robot_of(run, states, roots)
     for link, body in robot_bodies(robot).items():
         yield start, 1, _mesh(start, link, body.vertices, body.faces)
     for state, stamp in enumerate(states.stamps_ns.tolist()):

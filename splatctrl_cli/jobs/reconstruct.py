@@ -141,6 +141,7 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         return None
     model = RobotModel.from_urdf(request.urdf, request.spheres)
     if request.source.joint_names:
+        model = model.moved_by(request.source.joint_names)
         model.joint_order(request.source.joint_names)
     for doubt in model.doubts:
         progress.log(f"warning: {doubt}")

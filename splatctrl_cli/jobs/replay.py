@@ -23,7 +23,8 @@ from splatctrl_cli.jobs.replays.inputs import (
     clock_of,
     coverage_words,
     doubts_of,
-    read_robot,
+    measured_robot,
+    open_log,
     read_states,
 )
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene, reads_whole_log
@@ -143,9 +144,10 @@ def _read(
     request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
 ) -> tuple[ReplayInputs, LoggedStates, Evidence | None]:
     """What the replay needs; `motion` is shown all frames of the log now, or as a lockstep takes them in."""
-    model = read_robot(request, request.config.control)
+    robot, opened = open_log(request)
+    model = measured_robot(request, robot, request.config.control)
     truth = None if request.truth is None else load_truth(request.truth)
-    logged = read_states(request, model)
+    logged = read_states(opened, model)
     if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
         raise InputError(other.sentence, remedy=other.remedy)
     declared = declarations_of(request.declare, model)

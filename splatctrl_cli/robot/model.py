@@ -30,7 +30,8 @@ class RobotModel:
     `frame_pose` knows; urdf: the file it came from; left_out: links of the sphere file that the URDF does not have;
     bare_links: links with a body in the URDF and no sphere; coverage: how the spheres cover the collision surface,
     None where it was not measured, and then coverage_unknown says why; sphere_deficit (S,) [m]: how far outside the
-    spheres a surface point of the sphere's rigid body may be, NaN where that is not known.
+    spheres a surface point of the sphere's rigid body may be, NaN where that is not known; held: fingers that a log
+    does not move, and where they are taken to be.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class RobotModel:
         *,
         are_links_renamed: bool,
         packages: Sequence[Path] = (),
+        held: Mapping[str, float] | None = None,
     ) -> None:
         self._model = model
         self._data = model.createData()
@@ -59,6 +61,7 @@ class RobotModel:
         self.sphere_deficit: Float64 = np.full(len(spheres.radii), np.nan)
         self._surface: RobotSurface | None = None
         self._packages = packages
+        self.held = dict(held or {})
         self._chosen_pairs: Index | None = None
         self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
         rows = [joint.idx_q for joint in model.joints][1:]
@@ -106,6 +109,27 @@ class RobotModel:
         is_renamed = are_links_renamed(asked, file)
         return cls(file, model, sphere_set, T, left_out, are_links_renamed=is_renamed, packages=packages)
 
+    def moved_by(self, names: Sequence[str]) -> "RobotModel":
+        """The same robot for a log of these joints: fingers that it does not move are locked in the middle of their
+        limits, and what mimics them with them. Their names and values are in `held`.
+        """
+        fingers = [name for name in self.urdf.fingers(names) if name in self.joint_names]
+        if not fingers:
+            return self
+        middle = dict(zip(self.joint_names, self.middle, strict=True))
+        led = {joint.name for joint in self.urdf.joints if joint.mimic is not None and joint.mimic[0] in fingers}
+        held = self.urdf.with_followers({name: float(middle[name]) for name in fingers if name not in led})
+        return RobotModel(
+            self.urdf,
+            _without(self._model, held, self.urdf.path),
+            self.sphere_set,
+            self.T_world_base,
+            self.left_out,
+            are_links_renamed=self.are_links_renamed,
+            packages=self._packages,
+            held=held,
+        )
+
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":
         """The same robot with its spheres' coverage measured; `unknown` says why there is no report."""
         deficit = np.full(len(self.sphere_set.radii), np.nan)
@@ -144,7 +168,15 @@ class RobotModel:
             )
         if self.are_links_renamed:
             sentences.append(RENAMED)
+        if self.held:
+            sentences.append(self.held_words)
         return tuple(sentences)
+
+    @property
+    def held_words(self) -> str:
+        """Where the fingers are that a log does not move."""
+        values = ", ".join(f"{name} = {value:g}" for name, value in self.held.items())
+        return f"fingers that the log does not move are locked in their middle: {values}; --lock holds them elsewhere"
 
     @property
     def num_joints(self) -> int:

@@ -1,6 +1,7 @@
 """What a URDF says apart from its kinematics: links, joints and collision shapes. Untrusted XML is read safely."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,44 @@ class UrdfFile:
                 leader = by_child[leader].parent
             bodies[link] = (leader, T)
         return bodies
+
+    @property
+    def grippers(self) -> tuple[str, ...]:
+        """Joints that a gripper's fingers have and an arm has not: one of several prismatic joints on one rigid body,
+        and one that mimics another or is mimicked, without a joint of another kind beyond it.
+        """
+        movable = [joint for joint in self.joints if joint.kind != "fixed"]
+        leader = {link: led for link, (led, _) in self.rigid_bodies().items()}
+        sliding = Counter(leader[joint.parent] for joint in movable if joint.kind == "prismatic")
+        copied = {joint.mimic[0] for joint in movable if joint.mimic is not None}
+        found = {
+            joint.name
+            for joint in movable
+            if joint.mimic is not None
+            or joint.name in copied
+            or (joint.kind == "prismatic" and sliding[leader[joint.parent]] > 1)
+        }
+        carries_others = {name for joint in movable if joint.name not in found for name in self._before(joint)}
+        return tuple(joint.name for joint in movable if joint.name in found - carries_others)
+
+    def fingers(self, moved: Collection[str]) -> tuple[str, ...]:
+        """Of `grippers` those that stand still while the `moved` joints move: on an arm that these move, and neither
+        one of them, nor before or in step with one.
+        """
+        by_name = {joint.name: joint for joint in self.joints}
+        busy = set(moved).union(*(self._before(by_name[name]) for name in moved if name in by_name))
+        steps = [{joint.name, joint.mimic[0]} for joint in self.joints if joint.mimic is not None]
+        busy = busy.union(*(pair for pair in steps if pair & set(moved)))
+        return tuple(
+            name for name in self.grippers if name not in busy and set(self._before(by_name[name])) & set(moved)
+        )
+
+    def _before(self, joint: Joint) -> Iterator[str]:
+        """The joints between a joint and the root, nearest first."""
+        by_child = {joint.child: joint for joint in self.joints}
+        while joint.parent in by_child:
+            joint = by_child[joint.parent]
+            yield joint.name
 
     def with_followers(self, locked: Mapping[str, float]) -> dict[str, float]:
         """`locked` joints at their values, and with each the joints that mimic it, where they are not named."""

@@ -45,7 +45,7 @@ def table(sample_data: Path) -> Table:
     folder = sample_data / "tabletop"
     model = RobotModel.from_urdf(folder / "robot.urdf", folder / "robot_spheres.yaml")
     log = open_raw_log(folder / "log.mcap")
-    states, _, _ = log_states(survey(log), SourceOptions(), model)
+    states = log_states(survey(log), SourceOptions(), model).states
     assert states is not None
     frames = check_log(log, SourceOptions()).frames
     stamps = sorted({frame.stamp_ns for frame in frames})[::2]

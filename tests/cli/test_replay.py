@@ -177,6 +177,27 @@ def test_logs_that_do_not_fit_are_refused(desk: Desk, capsys: pytest.CaptureFixt
     assert desk.replay("--scene", scene, "-q") == 3
 
 
+def test_fingers_that_the_log_does_not_move_are_locked_with_a_note(
+    desk: Desk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fingers = "".join(
+        f'<link name="{side}"/><joint name="{side}" type="prismatic"><parent link="hand"/><child link="{side}"/>'
+        '<axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="1" effort="1"/></joint>'
+        for side in ("left", "right")
+    )
+    urdf = desk.folder / "with_hand.urdf"
+    urdf.write_text(Path(desk.robot[1]).read_text().replace("</robot>", f"{fingers}</robot>"))
+    desk.robot[1] = str(urdf)
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
+    assert desk.replay("--scene", str(scene)) == 0
+    warned = [line for line in capsys.readouterr().err.splitlines() if "fingers" in line]
+    assert warned == [
+        "warning: fingers that the log does not move are locked in their middle: left = 0.02, right = 0.02; --lock "
+        "holds them elsewhere"
+    ]
+    assert not {"q_left", "q_right"} & set(desk.rows()[0])
+
+
 GOAL = np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 1.6])
 WALL = tuple(((x, 0.0, z), 0.04) for x in np.arange(0.3, 0.85, 0.05) for z in np.arange(0.05, 0.5, 0.05))
 

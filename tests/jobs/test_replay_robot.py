@@ -14,7 +14,7 @@ from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.replays import files, state_pass, state_store
-from splatctrl_cli.jobs.replays.inputs import doubts_of, read_robot
+from splatctrl_cli.jobs.replays.inputs import doubts_of, measured_robot
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
@@ -182,7 +182,8 @@ def test_a_replay_finds_the_meshes_of_the_self_mask_where_its_packages_are(tmp_p
     file = written(tmp_path, spheres_yaml(spheres, ()), "spheres.yaml")
     for packages, missing in (((), ("base",)), ((tmp_path / "elsewhere",), ())):
         request = ReplayRequest(log=tmp_path, out=tmp_path, urdf=urdf, spheres=file, packages=packages)
-        assert read_robot(request, ControlConfig()).surface.by_spheres == missing
+        model = RobotModel.from_urdf(urdf, file, packages=packages)
+        assert measured_robot(request, model, ControlConfig()).surface.by_spheres == missing
 
 
 FILES = ("steps.csv", "events.json", "summary.json", "states.json")

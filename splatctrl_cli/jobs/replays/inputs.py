@@ -22,12 +22,13 @@ from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Box, Float64, RecordSource
 from splatctrl_cli.robot.coverage import LinkCoverage, coverage_deficit
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import never_apart, without_disabled
 from splatctrl_cli.robot.srdf import read_srdf
-from splatctrl_cli.states.state_source import open_states
+from splatctrl_cli.states.state_source import StateSource, open_states
 
 MAX_NOTES = 10  # printed
 ANGLE = Scale(unit="rad")
@@ -45,15 +46,29 @@ FR3_LIMITS = (
 )
 
 
-def read_robot(request: ReplayRequest, config: ControlConfig) -> RobotModel:
-    """The model of the arguments, its spheres measured against the URDF's collision geometry where that can be read.
+def open_log(request: ReplayRequest) -> tuple[RobotModel, FrameSource | StateSource]:
+    """The robot of the arguments and the log that moves it, fingers locked that it does not move.
 
-    Raises InputError where `config.coverage` is "margin" and no distance bounds what is uncovered.
+    Raises InputError for a log without joint states.
     """
     T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
     model = RobotModel.from_urdf(
         request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked, packages=request.packages
     )
+    source = open_states(request.log, request.options, model.joint_names)
+    if not source.joint_names:
+        raise InputError(
+            f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
+        )
+    return model.moved_by(source.joint_names), source
+
+
+def measured_robot(request: ReplayRequest, model: RobotModel, config: ControlConfig) -> RobotModel:
+    """The robot without the pairs that its SRDF names, and its spheres measured against the URDF's collision geometry
+    where that can be read.
+
+    Raises InputError where `config.coverage` is "margin" and no distance bounds what is uncovered.
+    """
     if request.srdf is not None:
         disabled, _ = read_srdf(request.srdf, model.urdf)
         model = model.with_self_pairs(without_disabled(model, disabled))
@@ -186,16 +201,11 @@ class LoggedStates:
         return [f"log: {line}" for line in (*notes[:MAX_NOTES], *more, *found)]
 
 
-def read_states(request: ReplayRequest, model: RobotModel) -> LoggedStates:
+def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedStates:
     """The states of the robot's joints in a log, whose frames are not read yet: `clock_of` is known after them.
 
-    Raises InputError where there are no states, or none that can be the robot's.
+    Raises InputError where they cannot be the robot's.
     """
-    source = open_states(request.log, request.options, model.joint_names)
-    if not source.joint_names:
-        raise InputError(
-            f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
-        )
     states = source.states.of_joints(model.joint_order(source.joint_names))
     check_states(states, model.joint_names)
     check_angles(model, states, source.name)

@@ -88,14 +88,16 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
     states = run.states
     if states is None:
         raise InputError(f"{run.path}: no steps.csv", remedy="replay again")
-    robot = robot_of(run, roots)
+    robot = robot_of(run, states, roots)
     deciding = _deciding(run, states, robot)
     space = replace(_scene_of(run, states, roots, deciding), deciding=deciding)
     return replace(space, motion=_motion(run, states, robot))
 
 
-def robot_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> RobotModel:
-    """The robot of a replay, as its command line named it. Raises InputError where its files are not found."""
+def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
+    """The robot of a replay with these states, as its command line named it. Raises InputError where its files are
+    not found.
+    """
     files = {name: run.option(f"--{name}") for name in ("urdf", "spheres")}
     if files["urdf"] is None:
         raise InputError(f"{run.path}: its command line has no --urdf", remedy="replay with the command line")
@@ -105,7 +107,8 @@ def robot_of(run: RunFolder, roots: tuple[Path, ...] = ()) -> RobotModel:
     packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))
     pose = None if base is None else tuple(float(part) for part in base.split(","))
     digests = tuple(sha256(path) for path in found.values())
-    return _robot(found["urdf"], found.get("spheres"), pose, locks, packages, digests)
+    robot = _robot(found["urdf"], found.get("spheres"), pose, locks, packages, digests)
+    return robot.moved_by(tuple(states.joints))
 
 
 @lru_cache(maxsize=4)
