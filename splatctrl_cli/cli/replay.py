@@ -1,12 +1,13 @@
 """``splatctrl replay``: the clearance of logged motion, what a controller says of it, or what it does instead."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from splatctrl_cli.cli.common import Console, long_table, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import load_config
+from splatctrl_cli.control.preconditions import StaticViolation
 from splatctrl_cli.control.printed_program import with_preset
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.compare import MOTION, PLAN, figures_of
@@ -59,16 +60,27 @@ def _lines(result: ReplayResult, *, is_long: bool, with_steps: bool) -> Iterator
         ]
         lines += ["", "Beside people, from the same moment:", *table(("", *replay.separations), rows)]
     lines += _comparison_lines(replay.comparison)
-    if replay.static_violations:
-        rows = [(violation.sphere, f"{violation.clearance:.4f}") for violation in replay.static_violations]
-        lines += ["", "Spheres that no joint moves, within the margin:", *table(("sphere", "clearance"), rows)]
     yield from lines
     yield from result.notes
+    yield from _mount_lines(replay.static_violations)
     if not is_long:
         yield f"wrote {result.out}; -v prints every figure"
     if with_steps:
         yield ""
         yield from _step_lines(replay)
+
+
+def _mount_lines(violations: Sequence[StaticViolation]) -> list[str]:
+    """How near the spheres that no joint moves stand to the scene, in one line however many they are."""
+    if not violations:
+        return []
+    nearest = min(violations, key=lambda violation: violation.clearance)
+    links = ", ".join(dict.fromkeys(violation.sphere.partition("[")[0] for violation in violations))
+    num = f"{len(violations)} sphere{'s' if len(violations) > 1 else ''}"
+    return [
+        f"mount: {num} of {links} that no joint moves within the margin of the scene, down to "
+        f"{1e3 * nearest.clearance:.1f} mm ({nearest.sphere}); events.json has each"
+    ]
 
 
 def _step_lines(replay: Replay) -> Iterator[str]:

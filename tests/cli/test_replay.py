@@ -162,6 +162,17 @@ def test_a_start_in_collision_names_the_sphere(
     assert "got sphere hand[" in capsys.readouterr().err
 
 
+def test_a_base_that_stands_in_the_scene_is_one_line(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(desk.folder / "scene", (0, splats_of(BALL, ((-0.2, 0.0, 0.05), 0.12))))
+    assert desk.replay("--scene", str(scene), "-q") == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "no joint moves" in line]
+    listed = json.loads((desk.folder / "out" / "events.json").read_text())["static_violations"]
+    nearest = min(listed, key=lambda one: one["clearance"])
+    assert len(listed) > 1 and nearest["clearance"] < 0
+    assert line.startswith(f"mount: {len(listed)} spheres of link0 that no joint moves within the margin")
+    assert f"down to {1e3 * nearest['clearance']:.1f} mm ({nearest['sphere']})" in line
+
+
 def test_logs_that_do_not_fit_are_refused(desk: Desk, capsys: pytest.CaptureFixture[str]) -> None:
     scene = str(write_scene(desk.folder / "scene", (0, splats_of(BALL))))
     desk.source = FakeSource(states=[], joint_names=())
