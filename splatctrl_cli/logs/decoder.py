@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from splatctrl_cli.containers.foxglove import DEFINITIONS, as_ros, read_foxglove
 from splatctrl_cli.containers.raw_log import RawMessage, Topic
+from splatctrl_cli.logs.realsense import has_unit
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -59,7 +60,8 @@ class MessageDecoder:
             if store is None:
                 return read_foxglove(topic.schema, topic.encoding, topic.definition, message.data)
             read = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
-            decoded = read(message.data, topic.schema or topic.type_name)
+            data = message.data[:-4] if has_unit(message) else message.data
+            decoded = read(data, topic.schema or topic.type_name)
             return as_ros(topic.schema, decoded) if topic.schema else decoded
         except Exception as error:  # generated code over foreign bytes: there is no list of what it raises
             raise UndecodableMessageError(

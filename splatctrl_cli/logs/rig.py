@@ -202,7 +202,10 @@ class _Builder:
     def _depth_scale(self) -> float | None:
         if self._options.depth_scale is not None:
             return self._options.depth_scale
-        return self._survey.realsense.depth_unit(self._topics.depth)
+        try:
+            return self._survey.realsense.depth_unit(self._topics.depth)
+        except InputError as error:
+            raise InputError(f"{self._where}: {error.message}", remedy=error.remedy) from None
 
     def _calibration(self, info: str, image_topic: str) -> Calibration:
         calibration = self._survey.topics[info].calibration if info else None

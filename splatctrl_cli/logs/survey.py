@@ -125,6 +125,7 @@ def _take(result: Survey, entry: TopicSurvey, decoder: MessageDecoder, message: 
         entry.stamps_ns.append(-1)  # every image has its place, also one that does not decode
         entry.stamps_ns[-1] = message.log_time_ns if result.by_log_time else header_stamp_ns(message)
         entry.clock.see(entry.stamps_ns[-1], message.log_time_ns)
+        result.realsense.add_image(message)
         if entry.first_image is None:
             entry.first_image = read_image(decoder.decode(message), kind)
     elif kind == CAMERA_INFO and entry.calibration is None:

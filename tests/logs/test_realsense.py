@@ -1,5 +1,8 @@
 """Bags of the RealSense SDK: depth unit and extrinsics from their topics, depth registered to colour."""
 
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +11,9 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.containers.log_formats import open_raw_log
+from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import invert_transform, quat_from_rotation, transform_from
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -71,8 +76,11 @@ def transform(matrix: np.ndarray[Any, Any]) -> Any:
     )
 
 
-def make_bag(path: Path, *, with_extrinsics: bool = True) -> Path:
-    """A wall at DEPTH_M with a pole before it, seen by a depth sensor 5 cm left of the colour sensor."""
+def make_bag(path: Path, *, with_extrinsics: bool = True, units: tuple[float, ...] = ()) -> Path:
+    """A wall at DEPTH_M with a pole before it, seen by a depth sensor 5 cm left of the colour sensor.
+
+    units: what the depth images say of themselves, as newer SDKs write it.
+    """
     counts = np.full((HEIGHT, WIDTH), round(DEPTH_M / UNIT), "<u2")
     counts[:, 30:34] = round(0.6 / UNIT)
     messages: list[tuple[int, str, Any]] = [
@@ -91,7 +99,21 @@ def make_bag(path: Path, *, with_extrinsics: bool = True) -> Path:
         messages.append((stamp, "/device_0/sensor_0/Infrared_1/image/data", image("mono8", grey, stamp)))
         rgb = np.full((HEIGHT, WIDTH, 3), 40 + index, np.uint8)
         messages.append((stamp, f"{COLOR}/image/data", image("rgb8", rgb, stamp)))
-    return write_bag(path, [encoded(max(time, 1), topic, m, STORE, ros=1) for time, topic, m in messages], STORE)
+    written = [encoded(max(time, 1), topic, m, STORE, ros=1) for time, topic, m in messages]
+    if units:
+        of_depth = iter(units)
+        written = [
+            message if message.topic.type_name != "sensor_msgs/msg/Image" else with_unit(message, of_depth)
+            for message in written
+        ]
+    return write_bag(path, written, STORE)
+
+
+def with_unit(message: RawMessage, units: Iterator[float]) -> RawMessage:
+    """As newer SDKs write it: the frame "1", and behind the message the unit of depth, 0 of other images."""
+    unit = next(units) if "Depth_0" in message.topic.name else 0.0
+    assert message.data[12:17] == b"\x01\x00\x00\x000"
+    return replace(message, data=message.data[:16] + b"1" + message.data[17:] + struct.pack("<f", unit))
 
 
 def test_depth_is_registered_by_the_extrinsics_and_counted_in_its_own_unit(tmp_path: Path) -> None:
@@ -125,6 +147,35 @@ def test_a_depth_scale_that_a_person_gives_comes_first(tmp_path: Path) -> None:
     options = SourceOptions(camera_poses=STILL.camera_poses, depth_scale=1e-3)
     frame = next(r for r in open_source(make_bag(tmp_path / "rs.bag"), options).records() if isinstance(r, RgbdFrame))
     assert frame.depth.max() == pytest.approx(2 * DEPTH_M)
+
+
+def test_images_of_newer_bags_say_their_depth_unit_which_comes_before_the_options(tmp_path: Path) -> None:
+    old = open_source(make_bag(tmp_path / "old.bag"), STILL)
+    path = make_bag(tmp_path / "new.bag", units=(2 * UNIT, 2 * UNIT))
+    new = open_source(path, STILL)
+    pairs = list(zip(old.records(), new.records(), strict=True))
+    assert len(pairs) == 2
+    for before, after in pairs:
+        assert isinstance(before, RgbdFrame) and isinstance(after, RgbdFrame)
+        assert np.array_equal(before.color, after.color)
+        assert after.depth.max() == pytest.approx(2 * before.depth.max())
+    assert new.loss.damaged == 0
+    checked = check_log(open_raw_log(path), STILL)
+    assert max(frame.depth.max() for frame in checked.frames) == pytest.approx(2 * DEPTH_M)
+
+
+def test_a_depth_unit_that_changes_in_one_bag_is_refused(tmp_path: Path) -> None:
+    path = make_bag(tmp_path / "rs.bag", units=(UNIT, 0.001))
+    with pytest.raises(InputError, match=r"the depth unit changes, from 0.0005 to 0.001 m; cut the bag there"):
+        open_source(path, STILL)
+    options = SourceOptions(camera_poses=STILL.camera_poses, depth_scale=UNIT)
+    assert len(list(open_source(path, options).records())) == 2
+
+
+@pytest.mark.parametrize("unit", [float("nan"), -0.001, 7.0])
+def test_a_depth_unit_that_is_none_is_damage(tmp_path: Path, unit: float) -> None:
+    found = survey(open_raw_log(make_bag(tmp_path / "rs.bag", units=(unit, unit))))
+    assert "expected metres per count" in found.damage.notes[0]
 
 
 def test_the_edges_of_a_real_recording_meet_only_this_way_round(real_data: Path) -> None:
