@@ -71,8 +71,9 @@ def read_dtu(
 
     def camera(number: int, size: tuple[int, int]) -> tuple[Intrinsics, Float64]:
         path = _camera_file(root, number)
-        K, T_world_camera = _read_camera(path)
-        return _fitted(K, size, path), T_world_camera
+        found = read_camera_file(path)
+        found.T_camera_world[:3, 3] /= MILLIMETRES
+        return fitted_intrinsics(found.K, size, path), invert_transform(found.T_camera_world)
 
     found = read_views(
         scan,
@@ -265,22 +266,34 @@ def _camera_file(root: Path, number: int) -> Path:
     raise InputError(f"{candidates[-1]}: missing", remedy="every image needs its camera file")
 
 
-def _read_camera(path: Path) -> tuple[Float64, Float64]:
-    """K (3, 3) as written and T_world_camera (4, 4) [m]."""
+@dataclass(frozen=True, kw_only=True)
+class CameraFile:
+    """K (3, 3) [px] and T_camera_world (4, 4) as written, in any length, and the least depth, 0 where none is."""
+
+    K: Float64
+    T_camera_world: Float64
+    nearest: float
+
+
+def read_camera_file(path: Path) -> CameraFile:
+    """A camera file of MVSNet: extrinsic, intrinsic, and a line that begins with the least depth."""
     words = path.read_text(encoding="utf-8", errors="replace").split()
     try:
         extrinsic = np.array(words[words.index("extrinsic") + 1 :][:16], dtype=np.float64).reshape(4, 4)
-        K = np.array(words[words.index("intrinsic") + 1 :][:9], dtype=np.float64).reshape(3, 3)
+        rest = words[words.index("intrinsic") + 1 :]
+        K, nearest = np.array(rest[:9], dtype=np.float64).reshape(3, 3), float(rest[9]) if rest[9:] else 0.0
     except ValueError:
-        raise InputError(f"{path}: expected 'extrinsic' (4x4) and 'intrinsic' (3x3), got another text") from None
+        raise InputError(
+            f"{path}: expected 'extrinsic' (4x4), 'intrinsic' (3x3) and a depth range, got another text",
+            remedy="copy the file again",
+        ) from None
     R = extrinsic[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise InputError(f"{path}: extrinsic: expected a rotation in its first three columns")
-    extrinsic[:3, 3] /= MILLIMETRES
-    return K, invert_transform(extrinsic)
+    return CameraFile(K=K, T_camera_world=extrinsic, nearest=nearest)
 
 
-def _fitted(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
+def fitted_intrinsics(K: Float64, size: tuple[int, int], path: Path) -> Intrinsics:
     """K for an image of `size` (width, height), whichever of the sizes in use the file's K was made for.
 
     Pixel (0, 0) has its centre at (0, 0) (lioryariv/idr, apchenstu/mvsnerf). In an image made smaller they are at

@@ -18,6 +18,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
 from splatctrl_cli.files.image_file import decode_file
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.pfm import read_pfm
 from splatctrl_cli.logs.messages import measured, metres, num_invalid
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -249,6 +250,11 @@ def _float_pixels(path: Path) -> NDArray[np.float32] | None:
         try:
             return np.asarray(npy_of(path.read_bytes()), dtype=np.float32)
         except DAMAGE:
+            return None
+    if path.suffix == ".pfm":
+        try:
+            return read_pfm(path)
+        except InputError:
             return None
     pixels = decode_file(path.read_bytes(), color=False)
     return None if pixels is None else pixels.astype(np.float32)

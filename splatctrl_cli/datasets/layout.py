@@ -20,7 +20,7 @@ from splatctrl_cli.datasets.folder_description import (
 )
 from splatctrl_cli.datasets.poses import read_matrix_file, read_numbers
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.image_file import decode_file
+from splatctrl_cli.files.image_file import decode_file, image_head
 from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
@@ -196,9 +196,12 @@ def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Floa
 def image_size(path: Path) -> tuple[int, int]:
     """Columns and rows of an image file. Raises InputError where it is none."""
     try:
-        pixels = decode_file(path.read_bytes(), color=False)
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}", remedy=_WHOLE) from None
+    if (head := image_head(data)) is not None:
+        return head.width, head.height
+    pixels = decode_file(data, color=False)
     if pixels is None:
         raise InputError(f"{path}: not an image that can be read", remedy=_WHOLE)
     return int(pixels.shape[1]), int(pixels.shape[0])

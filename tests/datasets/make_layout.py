@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.datasets.poses import OPENGL_FROM_OPTICAL
+from splatctrl_cli.files.pfm import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame
@@ -223,6 +224,27 @@ def make_arkit(folder: Path) -> Path:
     return folder
 
 
+def make_mvsnet(
+    folder: Path, unit: float = 1.0, tail: str = "0.5 0.01 192 2.5", images: str = "images", depth: str = "depths"
+) -> Path:
+    """Lengths in units of so many metres; depth of another name than its image, as networks write it."""
+    (folder / "cams").mkdir(parents=True)
+    (folder / depth).mkdir(exist_ok=True)
+    for index, T in enumerate(POSES):
+        write_pair(folder / images / f"{index:08d}.png", folder / "unused.png", index)
+        (folder / "unused.png").unlink()
+        counts = counts_of(index).astype(np.float32)
+        write_pfm(folder / depth / f"{index:08d}_init.pfm", counts * np.float32(1e-3 / unit))
+        write_pfm(folder / depth / f"{index:08d}_prob.pfm", np.ones_like(counts))
+        T_camera_world = invert_transform(T)
+        T_camera_world[:3, 3] /= unit
+        K3 = matrix_text(np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]]))
+        text = f"extrinsic\n{matrix_text(T_camera_world)}\nintrinsic\n{K3}\n{tail}\n"
+        (folder / f"cams/{index:08d}_cam.txt").write_text(text)
+    (folder / "pair.txt").write_text("3\n0\n2 1 9.5 2 3.5\n1\n2 0 9.5 2 9.5\n2\n2 1 9.5 0 3.5\n")
+    return folder
+
+
 GIVEN = SourceOptions(intrinsics={"camera": K})
 
 
@@ -248,5 +270,6 @@ EXAMPLES = {  # by the layout's name
     "Replica": Example(make=make_replica, unit=1 / 6553.5),
     "ARKitScenes": Example(make=make_arkit, stamps_ns=(305_367_000_000, 100_000_000)),
     "SUN3D": Example(make=make_sun3d, stamps_ns=(0, 33_000_000)),
+    "MVSNet scene": Example(make=make_mvsnet),
     "Open3D scene": Example(make=make_redwood),
 }
