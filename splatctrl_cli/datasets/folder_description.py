@@ -2,7 +2,7 @@
 
 import difflib
 import tomllib
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -94,6 +94,42 @@ class SplitTable:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ImagePart:
+    """An image that is a part of a file, used as the path of an image file is: its number there, (columns, rows), and
+    what gives it as an image file of that suffix, without bytes where it is damaged.
+    """
+
+    file: Path
+    number: int
+    size: tuple[int, int]
+    suffix: str
+    read_bytes: Callable[[], bytes]
+
+    @property
+    def name(self) -> str:
+        """The file's, with the image's number."""
+        return f"{self.file.name}#{self.number}"
+
+    def is_file(self) -> bool:
+        """Whether the file is there."""
+        return self.file.is_file()
+
+    def absolute(self) -> Path:
+        """The whole file."""
+        return self.file.absolute()
+
+    def relative_to(self, root: Path) -> Path:
+        """The whole file, from a folder."""
+        return self.file.relative_to(root)
+
+    def __str__(self) -> str:
+        return str(self.file.with_name(self.name))
+
+
+ImageFile = Path | ImagePart
+
+
+@dataclass(frozen=True, kw_only=True)
 class ListedView:
     """A view by its files, where a layout names them one by one instead of by globs.
 
@@ -103,8 +139,8 @@ class ListedView:
     """
 
     name: str
-    color: Path
-    depth: Path
+    color: ImageFile
+    depth: ImageFile
     matrix: Float64 | None
     human: Path | None = None
     stamp_ns: int | None = None
@@ -118,8 +154,8 @@ class Description:
     """A whole description; camera and frames may be left to a transforms.json, poses to --camera-pose.
 
     listed: the views of a layout, instead of frames; is_depth_resized: depth of another size shows the same view and
-    is brought to the size of colour by nearest pixels; unpaired: colour and depth files without partner; notes: what
-    a layout leaves open and was taken as usual.
+    is brought to the size of colour by nearest pixels; unpaired: colour and depth files without partner; num_damaged:
+    views that a damaged file lacks; notes: what a layout leaves open and was taken as usual.
     """
 
     path: Path
@@ -134,6 +170,7 @@ class Description:
     listed: tuple[ListedView, ...] = ()
     is_depth_resized: bool = False
     unpaired: tuple[int, int] = (0, 0)
+    num_damaged: int = 0
     notes: tuple[str, ...] = ()
 
     @property
@@ -211,7 +248,9 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
-    known = {f.name for f in fields(Description)} - {"path", "listed", "is_depth_resized", "unpaired", "notes"}
+    known = {f.name for f in fields(Description)} - {
+        *("path", "listed", "is_depth_resized", "unpaired", "num_damaged", "notes")
+    }
     _check_keys(content, known, str(path), "")
     try:
         folder = root or path.parent / Path(str(content.get("root", "."))).expanduser()

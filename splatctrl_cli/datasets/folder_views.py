@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.datasets.folder_description import CameraTable, Description, ListedView, PosesTable
+from splatctrl_cli.datasets.folder_description import CameraTable, Description, ImageFile, ListedView, PosesTable
 from splatctrl_cli.datasets.poses import (
     READERS,
     Trajectory,
@@ -33,8 +33,8 @@ class View:
     """
 
     name: str
-    color: Path
-    depth: Path
+    color: ImageFile
+    depth: ImageFile
     human: Path | None
     T_world_camera: Float64
     stamp_ns: int
@@ -72,6 +72,7 @@ def views_of(description: Description, options: SourceOptions, loss: LossReport)
     loss.without_pose += len(listed) - len(views)
     loss.unpaired_color += description.unpaired[0]
     loss.unpaired_depth += description.unpaired[1]
+    loss.damaged += description.num_damaged
     loss.notes.extend(description.notes)
     loss.notes.extend(still_note(name) for name in options.camera_poses if any(v.lens.name == name for v in views))
     if not views:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.datasets.folder_description import CameraTable, Description, read_description, read_rig
+from splatctrl_cli.datasets.folder_description import CameraTable, Description, ImageFile, read_description, read_rig
 from splatctrl_cli.datasets.folder_views import HOLDOUT, View, find_files, views_of
 from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
@@ -121,7 +121,7 @@ class ImageFolderSource:
         files = [path for paths in of_views for path in paths if path is not None]
         if description.poses is not None:
             files.extend(path for _, path in find_files(description.root, description.poses.file))
-        named = {str(path.relative_to(description.root)): path for path in files}
+        named = {str(path.relative_to(description.root)): path.absolute() for path in files}
         first = {description.path.name: description.path} if description.path.is_file() else {}
         return {name: sha256(path) for name, path in {**first, **dict(sorted(named.items()))}.items()}
 
@@ -228,7 +228,7 @@ class ImageFolderSource:
         return metres(np.where(counts == table.invalid, np.uint16(0), counts), view.depth_scale)
 
 
-def _is_float(encoding: str, path: Path) -> bool:
+def _is_float(encoding: str, path: ImageFile) -> bool:
     """Whether a depth file holds floats; a .npy does, whatever the others of its folder are (nerfstudio)."""
     return encoding == "float32" or path.suffix == ".npy"
 
@@ -245,13 +245,13 @@ def _check_names(path: Path, lenses: set[str], options: SourceOptions) -> None:
             raise InputError(f"{path}: no camera {name!r}", remedy=f"use one of: {', '.join(sorted(lenses))}")
 
 
-def _float_pixels(path: Path) -> NDArray[np.float32] | None:
+def _float_pixels(path: ImageFile) -> NDArray[np.float32] | None:
     if path.suffix == ".npy":
         try:
             return np.asarray(npy_of(path.read_bytes()), dtype=np.float32)
         except DAMAGE:
             return None
-    if path.suffix == ".pfm":
+    if path.suffix == ".pfm" and isinstance(path, Path):
         try:
             return read_pfm(path)
         except InputError:
@@ -260,7 +260,7 @@ def _float_pixels(path: Path) -> NDArray[np.float32] | None:
     return None if pixels is None else pixels.astype(np.float32)
 
 
-def _check_size(path: Path, pixels: NDArray[Any], camera: CameraTable) -> None:
+def _check_size(path: ImageFile, pixels: NDArray[Any], camera: CameraTable) -> None:
     if pixels.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"{path}: expected {camera.width}x{camera.height} as described, got {pixels.shape[1]}x{pixels.shape[0]}",

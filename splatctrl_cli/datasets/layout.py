@@ -13,6 +13,8 @@ from splatctrl_cli.datasets.folder_description import (
     CameraTable,
     DepthTable,
     Description,
+    ImageFile,
+    ImagePart,
     ListedView,
     PosesTable,
     StampsTable,
@@ -35,14 +37,16 @@ _IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm"})
 class Layout:
     """A layout, in the ``ENTRIES`` of its module: its name, whether a folder has it, and the folder as a description.
 
-    Of layouts that a folder has, that of the lowest `order` counts. `docs` are its rows in docs/input.md, cells
-    between bars, an empty line between rows: layout, what it is known by, poses, depth, intrinsics.
+    Of layouts that a folder has, that of the lowest `order` counts; a file that ends in `suffix` has it by itself.
+    `docs` are its rows in docs/input.md, cells between bars, an empty line between rows: layout, what it is known by,
+    poses, depth, intrinsics.
     """
 
     name: str
     order: int
     matches: Callable[[Path], bool]
     read: Callable[[Path, SourceOptions], Description]
+    suffix: str = ""
     docs: str = ""
 
 
@@ -132,11 +136,12 @@ def described(
     options: SourceOptions,
     *,
     poses: PosesTable,
-    lens: Callable[[Path], CameraTable] | None = None,
+    lens: Callable[[ImageFile], CameraTable] | None = None,
     depth_camera: CameraTable | None = None,
     depth: DepthTable | None = None,
     has_stamps: bool = False,
     is_depth_resized: bool = False,
+    num_damaged: int = 0,
     notes: tuple[str, ...] = (),
 ) -> Description:
     """The description of paired views, all of the lens that --intrinsics gives, else of `lens` (of the first image);
@@ -158,17 +163,18 @@ def described(
         listed=tuple(pairs.views),
         is_depth_resized=is_depth_resized,
         unpaired=pairs.unpaired,
+        num_damaged=num_damaged,
         notes=notes,
     )
 
 
-def given_lens(options: SourceOptions, image: Path) -> CameraTable | None:
+def given_lens(options: SourceOptions, image: ImageFile) -> CameraTable | None:
     """The lens that --intrinsics gives for camera ``camera``, of the size of `image`; None where it gives none."""
     values = options.intrinsics.get(CAMERA)
     return None if values is None else pinhole(values, image)
 
 
-def pinhole(values: Sequence[float], image: Path, distortion: Sequence[float] = ()) -> CameraTable:
+def pinhole(values: Sequence[float], image: ImageFile, distortion: Sequence[float] = ()) -> CameraTable:
     """A lens of fx, fy, cx, cy [px] and the size of an image file."""
     width, height = image_size(image)
     fx, fy, cx, cy = values
@@ -193,8 +199,10 @@ def own_depth_camera(color: CameraTable, depth: CameraTable, T_color_depth: Floa
     return replace(depth, depth_to_color=T_color_depth.tolist())
 
 
-def image_size(path: Path) -> tuple[int, int]:
+def image_size(path: ImageFile) -> tuple[int, int]:
     """Columns and rows of an image file. Raises InputError where it is none."""
+    if isinstance(path, ImagePart):
+        return path.size
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -75,7 +75,8 @@ def read(folder: Path, options: SourceOptions) -> Description:
     colors = _files(folder, f"{sequence}frame-*.color.*", ".color")
     depths = _files(folder, f"{sequence}frame-*.depth.*", ".depth")
     pairs = paired_by_name(folder, colors, depths, lambda name: read_pose(folder / f"{name}.pose.txt"))
-    cameras = _cameras(folder, pairs.views[0].color, pairs.views[0].depth, options)
+    first = pairs.views[0].name
+    cameras = _cameras(folder, colors[first], depths[first], options)
     return described(
         pairs.moved(lambda T: T @ cameras.T_pose_color),
         folder,

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ImageFile, PosesTable
 from splatctrl_cli.datasets.layout import (
     Layout,
     by_numbers,
@@ -74,7 +74,7 @@ def _by_number(folder: Path, pattern: str) -> dict[int, Path]:
     return {numbers[-1]: path for path in found if (numbers := by_numbers(path.stem)[0])}
 
 
-def _lens(folder: Path, trajectory: str, image: Path, options: SourceOptions) -> tuple[CameraTable, float]:
+def _lens(folder: Path, trajectory: str, image: ImageFile, options: SourceOptions) -> tuple[CameraTable, float]:
     """The lens, and metres per count."""
     given = given_lens(options, image)
     width, height = image_size(image)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ImageFile, PosesTable
 from splatctrl_cli.datasets.layout import (
     Layout,
     described,
@@ -46,7 +46,7 @@ class SensCalibration:
     where: str = ""
 
     def cameras(
-        self, color_image: Path, depth_image: Path, options: SourceOptions
+        self, color_image: ImageFile, depth_image: ImageFile, options: SourceOptions
     ) -> tuple[CameraTable, CameraTable | None]:
         """Colour and depth camera, of the sizes of two images; no depth camera where both are one.
 
@@ -113,7 +113,7 @@ def read_info(path: Path) -> SensCalibration:
         ) from None
 
 
-def _lens(K: Float64, image: Path, where: str) -> CameraTable:
+def _lens(K: Float64, image: ImageFile, where: str) -> CameraTable:
     lens = pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), image)
     if abs(2 * lens.cx - lens.width) > 0.25 * lens.width:
         raise InputError(

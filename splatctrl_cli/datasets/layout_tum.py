@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, PosesTable
+from splatctrl_cli.datasets.folder_description import CameraTable, DepthTable, Description, ImageFile, PosesTable
 from splatctrl_cli.datasets.layout import (
     Layout,
     described,
@@ -143,7 +143,7 @@ def _series(folder: Path) -> Series | None:
     return next((series for name, series in pairs if re.search(rf"(?<![a-z]){series.pattern}(?!\d)", name)), None)
 
 
-def _lens(folder: Path, series: Series | None, image: Path) -> CameraTable:
+def _lens(folder: Path, series: Series | None, image: ImageFile) -> CameraTable:
     calibration = folder / "calibration.txt"
     if calibration.is_file():
         values = read_numbers(calibration)

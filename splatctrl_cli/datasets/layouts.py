@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from splatctrl_cli.captures.capture_journal import check_not_partial
-from splatctrl_cli.containers.log_formats import SUFFIXES
+from splatctrl_cli.containers.log_formats import SUFFIXES, is_bag_folder
 from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.errors import InputError
@@ -16,9 +16,16 @@ _MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is not itself o
 LAYOUTS = entries_of(__package__, Layout)
 
 
-def layout_of(folder: Path) -> Layout | None:
-    """The layout of a folder, None where it has none of these."""
-    return next((layout for layout in LAYOUTS if layout.matches(folder)), None)
+def layout_of(path: Path) -> Layout | None:
+    """The layout of a folder or file, None where it has none of these."""
+    if path.is_file():
+        return next((layout for layout in LAYOUTS if layout.suffix == path.suffix.lower() != ""), None)
+    return next((layout for layout in LAYOUTS if layout.matches(path)), None)
+
+
+def has_views(path: Path) -> bool:
+    """Whether a path is read as a dataset: a folder that is no ROS 2 bag, or a file of its own layout."""
+    return layout_of(path) is not None if path.is_file() else path.is_dir() and not is_bag_folder(path)
 
 
 def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
@@ -43,7 +50,7 @@ def readable_in(folder: Path) -> str:
     found = []
     for name in names_in(folder)[:_MOST_LOOKED_AT]:
         path = folder / name
-        if path.is_file() and path.suffix in SUFFIXES:
+        if path.is_file() and (path.suffix in SUFFIXES or layout_of(path) is not None):
             found.append(path.name)
         elif path.is_dir() and (layout := layout_of(path)) is not None:
             found.append(f"{path.name} ({layout.name})")

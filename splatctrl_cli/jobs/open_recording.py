@@ -5,8 +5,8 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.config.fixed import POSE_JUMP
-from splatctrl_cli.containers.log_formats import is_bag_folder
 from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
+from splatctrl_cli.datasets.layouts import has_views
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
 from splatctrl_cli.logs.source_options import SourceOptions
@@ -89,7 +89,7 @@ def open_held_out(recording: RecordingRequest) -> tuple[RecordSource, ScoreProto
 
 def is_folder_of_views(path: Path) -> bool:
     """Whether a recording is images in a folder, by a TOML or in a dataset's layout; not a log, not a capture."""
-    return path.suffix == ".toml" or (path.is_dir() and not is_capture(path) and not is_bag_folder(path))
+    return path.suffix == ".toml" or (not is_capture(path) and has_views(path))
 
 
 def refuse_scan_options(recording: RecordingRequest) -> None:

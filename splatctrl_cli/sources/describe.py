@@ -38,6 +38,8 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
         return describe_log(open_raw_log(path), options)
     if path.suffix == ".toml":
         return _describe_images(path, open_image_folder(path, options), "image folder")
+    if (layout := layout_of(path)) is not None:
+        return _describe_images(path, open_layout(path, options), layout.name)
     return describe_file(path)
 
 

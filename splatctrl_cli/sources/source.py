@@ -5,10 +5,10 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.log_formats import SessionLog, is_bag_folder, open_raw_log
+from splatctrl_cli.containers.log_formats import SessionLog, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import open_image_folder
-from splatctrl_cli.datasets.layouts import open_layout
+from splatctrl_cli.datasets.layouts import has_views, open_layout
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
@@ -18,8 +18,8 @@ __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_s
 
 
 def open_source(path: Path, options: SourceOptions | None = None) -> FrameSource:
-    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder, or image folder's TOML
-    description.
+    """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder or file, or image folder's
+    TOML description.
 
     Raises InputError where there is nothing, or nothing that can be used.
     """
@@ -30,7 +30,7 @@ def open_source(path: Path, options: SourceOptions | None = None) -> FrameSource
         return open_image_folder(path, options)
     if is_capture(path):
         return CaptureSource(path, options)
-    if path.is_dir() and not is_bag_folder(path):
+    if has_views(path):
         return open_layout(path, options)
     return RosLogSource(open_raw_log(path), options)
 
@@ -52,7 +52,7 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
     for path in paths:
         if not path.exists():
             raise InputError(f"{path}: no such file or folder", remedy="check the path")
-        if path.suffix == ".toml" or is_capture(path) or (path.is_dir() and not is_bag_folder(path)):
+        if path.suffix == ".toml" or is_capture(path) or has_views(path):
             if len(paths) == 1:
                 return None
             raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")

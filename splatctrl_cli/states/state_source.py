@@ -6,9 +6,10 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.log_formats import is_bag_folder, open_raw_log
+from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.folder_description import has_table
+from splatctrl_cli.datasets.layouts import has_views
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.logs.ros_log import RosLogSource
@@ -75,7 +76,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
         return _of_table(path, (path, file), raw, LossReport())
     if is_capture(path):
         return CaptureSource(path, options, joints)
-    if path.suffix == ".toml" or (path.is_dir() and not is_bag_folder(path)):
+    if path.suffix == ".toml" or has_views(path):
         return open_source(path, options)
     return _of_log(path, open_raw_log(path), options, joints)
 
