@@ -1,8 +1,10 @@
-"""Libraries that take most of a second to load, each loaded when a name of it is first used."""
+"""Libraries that take most of a second to load, each loaded when a name of it is first used, and those of extras."""
 
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from splatctrl_cli.errors import UsageError
 
 
 class _LoadedLate(ModuleType):
@@ -24,4 +26,15 @@ else:
     mpl, trimesh = _LoadedLate("matplotlib"), _LoadedLate("trimesh")
     distributed, scipy_io = _LoadedLate("distributed"), _LoadedLate("scipy.io")
 
-__all__ = ["distributed", "mpl", "scipy_io", "trimesh"]
+
+def of_extra(module: str, extra: str, what: str) -> Any:
+    """A library that reads `what`. Raises UsageError with the remedy where the extra is not installed."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise UsageError(
+            f"{what} need the library {module}: {error}", remedy=f"pip install 'splatctrl-cli[{extra}]'"
+        ) from None
+
+
+__all__ = ["distributed", "mpl", "of_extra", "scipy_io", "trimesh"]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import lzf
 import numpy as np
 import pytest
 
@@ -65,7 +66,8 @@ def check(frames: list[RgbdFrame], unit: float = 1e-3, k: tuple[float, ...] = K)
         assert frame.depth[0, 0] == 0
         assert frame.T_world_camera == pytest.approx(POSES[index], abs=2e-7)  # some are float32
         i = frame.intrinsics
-        assert (i.fx, i.fy, i.cx, i.cy, i.width, i.height) == (*k, WIDTH, HEIGHT)
+        assert (i.fx, i.fy, i.cx, i.cy) == pytest.approx(k, rel=1e-6)  # some are fitted
+        assert (i.width, i.height) == (WIDTH, HEIGHT)
 
 
 def make_tum(folder: Path) -> Path:
@@ -270,6 +272,51 @@ def make_sens(folder: Path, *, form: str = ".png", is_packed: bool = True, num_c
     return folder
 
 
+def cloud_of(index: int) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Points (H, W, 3) of a frame in its camera, NaN where there are none."""
+    z = counts_of(index).astype(np.float32) * np.float32(1e-3)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    points = np.stack([(u - K[2]) / K[0] * z, (v - K[3]) / K[1] * z, z], axis=-1).astype(np.float32)
+    points[z == 0] = np.nan
+    return points
+
+
+def pcd_bytes(
+    points: np.ndarray[Any, np.dtype[np.float32]], color: Any, pose: Float64, form: str = "binary", *, kind: str = "F"
+) -> bytes:
+    """A cloud as PCL's PCDWriter has it: a label behind the colour, one field after the other where it is packed; as
+    text the colour is a whole number, whatever its type (pcd_io.cpp).
+    """
+    height, width = points.shape[:2]
+    packed = (color.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(axis=2, dtype=np.uint32).ravel()
+    columns = [*points.reshape(-1, 3).T, packed, np.arange(height * width, dtype=np.uint32)]
+    kind = "U" if form == "ascii" else kind
+    x, y, z, w = quat_from_rotation(pose[:3, :3])
+    viewpoint = " ".join(repr(float(value)) for value in (*pose[:3, 3], w, x, y, z))
+    head = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb label\nSIZE 4 4 4 4 4\n"
+        f"TYPE F F F {kind} U\nCOUNT 1 1 1 1 1\nWIDTH {width}\nHEIGHT {height}\nVIEWPOINT {viewpoint}\n"
+        f"POINTS {height * width}\nDATA {form}\n"
+    ).encode()
+    if form == "ascii":
+        rows = (" ".join(str(value) for value in row) for row in zip(*columns, strict=True))
+        return head + "\n".join(rows).encode() + b"\n"
+    if form == "binary":
+        return head + np.rec.fromarrays(columns).tobytes()
+    whole = b"".join(column.tobytes() for column in columns)
+    small = lzf.compress(whole)
+    return head + struct.pack("<II", len(small), len(whole)) + small
+
+
+def make_pcd(folder: Path, form: str = "binary", kind: str = "F") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, T in enumerate(POSES):
+        (folder / f"cloud_{index + 8}.pcd").write_bytes(
+            pcd_bytes(cloud_of(index), color_of(index), T, form, kind=kind)
+        )
+    return folder
+
+
 GIVEN = SourceOptions(intrinsics={"camera": K})
 
 
@@ -297,5 +344,6 @@ EXAMPLES = {  # by the layout's name
     "SUN3D": Example(make=make_sun3d, stamps_ns=(0, 33_000_000)),
     "MVSNet scene": Example(make=make_mvsnet),
     "ScanNet sensor file": Example(make=make_sens, stamps_ns=(1_000_000_000, 33_333_000)),
+    "PCD clouds": Example(make=make_pcd),
     "Open3D scene": Example(make=make_redwood),
 }

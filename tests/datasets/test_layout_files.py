@@ -8,11 +8,24 @@ import pytest
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import write_capture
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_logs, open_source
-from tests.datasets.make_layout import POSES, check, color_of, frames_of, make_sens
+from tests.datasets.make_layout import (
+    GIVEN,
+    HEIGHT,
+    POSES,
+    WIDTH,
+    check,
+    cloud_of,
+    color_of,
+    frames_of,
+    make_pcd,
+    make_sens,
+    pcd_bytes,
+)
 
 SENS = "scene0000_00.sens"
 
@@ -81,3 +94,101 @@ def test_two_sensor_files_in_a_folder_ask_for_one(tmp_path: Path) -> None:
     (folder / "b.sens").write_bytes((folder / SENS).read_bytes())
     with pytest.raises(InputError, match=r"2 files \*.sens; give one of them, such as .*b.sens"):
         open_source(folder)
+
+
+@pytest.mark.parametrize(("form", "kind"), [("ascii", "U"), ("binary", "U"), ("binary_compressed", "F")])
+def test_every_storage_of_a_cloud_gives_the_same_frames(tmp_path: Path, form: str, kind: str) -> None:
+    source = open_source(make_pcd(tmp_path, form, kind))
+    check([record for record in source.records() if isinstance(record, RgbdFrame)])
+    assert source.loss.invalid_depth == 0  # NaN is how a cloud says that nothing was there
+    assert source.loss.notes[0].startswith("intrinsics are those of the grid of cloud_8.pcd: fx 10.00, fy 11.00")
+    assert source.loss.notes[1] == "fields label are not used"
+
+
+def test_points_in_the_world_are_brought_into_the_camera_of_viewpoint(tmp_path: Path) -> None:
+    for index, T in enumerate(POSES):
+        points = transform_points(T, cloud_of(index)).astype(np.float32)
+        (tmp_path / f"{index}.pcd").write_bytes(pcd_bytes(points, color_of(index), T))
+    for index, frame in enumerate(frames_of(tmp_path)):
+        assert frame.T_world_camera == pytest.approx(POSES[index], abs=1e-6)
+        assert frame.depth == pytest.approx(np.nan_to_num(cloud_of(index)[..., 2]), abs=1e-5)
+        assert frame.intrinsics.fx == pytest.approx(10.0, rel=1e-4)
+
+
+def test_a_lone_cloud_without_viewpoint_is_its_own_world_and_that_is_said(tmp_path: Path) -> None:
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(cloud_of(0), color_of(0), np.eye(4)))
+    source = open_source(tmp_path / "a.pcd")
+    assert source.loss.notes[1].startswith("VIEWPOINT is the origin")
+    assert len(list(source.records())) == 1
+
+
+def test_clouds_without_viewpoints_ask_for_poses(tmp_path: Path) -> None:
+    for index in range(2):
+        (tmp_path / f"{index}.pcd").write_bytes(pcd_bytes(cloud_of(index), color_of(index), np.eye(4)))
+    with pytest.raises(InputError, match="no poses: VIEWPOINT is the origin in all 2 clouds; give --camera-pose"):
+        open_source(tmp_path)
+    still = SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)})
+    assert frames_of(tmp_path, still)[1].T_world_camera[:3, 3].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_names_that_are_seconds_are_stamps(tmp_path: Path) -> None:
+    for index in range(2):
+        name = f"1285627014.8331{index}0319.pcd"
+        (tmp_path / name).write_bytes(pcd_bytes(cloud_of(index), color_of(index), POSES[index]))
+    source = open_source(tmp_path)
+    assert source.has_clock
+    assert [r.stamp_ns for r in source.records() if isinstance(r, RgbdFrame)][1] == 1_285_627_014_833_110_319
+
+
+def test_a_cloud_that_is_not_organised_is_refused(tmp_path: Path) -> None:
+    row = cloud_of(0).reshape(1, -1, 3)
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(row, color_of(0).reshape(1, -1, 3), POSES[0]))
+    with pytest.raises(InputError, match=r"a.pcd: not organised: 48 points in one row; save clouds as"):
+        open_source(tmp_path)
+
+
+def test_a_grid_that_is_no_pinhole_camera_is_refused_with_its_residual(tmp_path: Path) -> None:
+    bent = cloud_of(0)
+    radius = np.linalg.norm(bent[..., :2] / bent[..., 2:], axis=2, keepdims=True)
+    bent[..., :2] *= 1 + 10 * radius**2
+    turned = cloud_of(0)[:, ::-1].copy()
+    for name, points in (("a", bent), ("b", turned)):
+        (tmp_path / f"{name}.pcd").write_bytes(pcd_bytes(points, color_of(0), POSES[0]))
+    with pytest.raises(InputError, match=r"a.pcd: the grid is not of a pinhole.*farther than 1.06 px"):
+        open_source(tmp_path / "a.pcd")
+    with pytest.raises(InputError, match=r"b.pcd: the grid is not of a pinhole camera"):
+        open_source(tmp_path / "b.pcd")
+
+
+def test_a_cloud_of_another_camera_than_the_first_and_wrong_intrinsics_are_refused(tmp_path: Path) -> None:
+    folder = make_pcd(tmp_path)
+    wide = cloud_of(1) * np.array([1.3, 1.3, 1.0], np.float32)
+    (folder / "cloud_9.pcd").write_bytes(pcd_bytes(wide, color_of(1), POSES[1]))
+    with pytest.raises(InputError, match=r"cloud_9.pcd: the grid is not that of cloud_8.pcd"):
+        frames_of(folder)
+    other = SourceOptions(intrinsics={"camera": (20.0, 11.0, 3.5, 2.5)})
+    with pytest.raises(InputError, match="the grid is not that of --intrinsics"):
+        open_source(folder, other)
+    assert open_source(folder, GIVEN).cameras == ("camera",)
+
+
+def test_a_cloud_without_colour_or_with_fewer_points_than_it_says_is_refused(tmp_path: Path) -> None:
+    whole = pcd_bytes(cloud_of(0), color_of(0), POSES[0])
+    cases = {
+        "no colour: expected a field rgb or rgba, got x y z mono label": whole.replace(b"z rgb", b"z mono"),
+        "not a PCD that can be read": whole[:-8],
+        f"9999 points of {WIDTH}x{HEIGHT}": whole.replace(b"POINTS 48", b"POINTS 9999"),
+        "expected a quaternion": whole.replace(b"VIEWPOINT", b"VIEWPOINT 0 0 0 0 0 0 0\n#"),
+    }
+    for words, data in cases.items():
+        (tmp_path / "a.pcd").write_bytes(data)
+        with pytest.raises(InputError, match=words):
+            open_source(tmp_path / "a.pcd")
+
+
+def test_a_packed_cloud_that_does_not_unpack_is_counted(tmp_path: Path) -> None:
+    folder = make_pcd(tmp_path, "binary_compressed")
+    data = bytearray((folder / "cloud_10.pcd").read_bytes())
+    (folder / "cloud_10.pcd").write_bytes(data[:-30])
+    source = open_source(folder)
+    assert (len(list(source.records())), source.loss.damaged) == (2, 1)
