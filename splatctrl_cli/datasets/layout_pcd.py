@@ -133,8 +133,7 @@ def read(path: Path, options: SourceOptions) -> Description:
         if len(files) > 1:
             raise InputError(
                 f"{path}: no poses: VIEWPOINT is the origin in all {len(files)} clouds",
-                remedy="give --camera-pose camera=identity for a camera that stands still, or describe the poses in a"
-                " .toml (docs/input.md)",
+                remedy="write poses as VIEWPOINT, or give --camera-pose camera=identity where it stands still",
             )
         notes.append("VIEWPOINT is the origin: the camera's own frame is the world")
     others = sorted({name for head in heads for name in head.fields} - {"x", "y", "z", "rgb", "rgba"})

@@ -125,7 +125,9 @@ def test_a_lone_cloud_without_viewpoint_is_its_own_world_and_that_is_said(tmp_pa
 def test_clouds_without_viewpoints_ask_for_poses(tmp_path: Path) -> None:
     for index in range(2):
         (tmp_path / f"{index}.pcd").write_bytes(pcd_bytes(cloud_of(index), color_of(index), np.eye(4)))
-    with pytest.raises(InputError, match="no poses: VIEWPOINT is the origin in all 2 clouds; give --camera-pose"):
+    with pytest.raises(
+        InputError, match="VIEWPOINT is the origin in all 2 clouds; write poses as VIEWPOINT, or give"
+    ):
         open_source(tmp_path)
     still = SourceOptions(camera_poses={"camera": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)})
     assert frames_of(tmp_path, still)[1].T_world_camera[:3, 3].tolist() == [1.0, 2.0, 3.0]
