@@ -2,7 +2,7 @@
 
 import difflib
 import tomllib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -197,10 +197,22 @@ def read_description(path: Path, root: Path | None = None) -> Description:
     return _read(_content(path), path, root)
 
 
-def read_table(kind: type[T], path: Path, name: str, *, beside: Collection[str] = ()) -> T:
-    """The table [name] of a TOML file that holds none but those `beside`. Raises InputError as `read_description`."""
+def read_table(
+    kind: type[T],
+    path: Path,
+    name: str,
+    *,
+    beside: Collection[str] = (),
+    fill: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
+) -> T:
+    """The table [name] of a TOML file that holds none but those `beside`; `fill` gives it keys that it leaves out.
+
+    Raises InputError as `read_description`.
+    """
     content = _content(path)
     _check_keys(content, {name, *beside}, str(path), "")
+    if fill is not None and isinstance(content.get(name), dict):
+        content[name] = fill(content[name])
     return _required(kind, content, name, path)
 
 
@@ -332,6 +344,7 @@ def _typed(value: Any, hint: Any, where: str) -> Any:
         str: isinstance(value, str),
         bool: isinstance(value, bool),
         float | None: is_number,
+        int | None: isinstance(value, int) and is_number,
     }.get(hint, isinstance(value, list))
     if not good:
         raise _refused(f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")

@@ -21,8 +21,9 @@ from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.records import LossReport, Record
 from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.states.lerobot import is_lerobot
 from splatctrl_cli.states.state_csv import is_libfranka, libfranka_track, read_csv
-from splatctrl_cli.states.state_table import described_track
+from splatctrl_cli.states.state_table import ARRAY_FILES, dataset_track, described_track
 
 _FOR_CAMERAS = (
     *("cameras", "camera_topics", "camera_poses", "camera_pose_topics"),
@@ -74,6 +75,15 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
         options.refuse(_NOT_FOR_TABLES, "a table of joint states", path)
         raw, file = described_track(path)
         return _of_table(path, (path, file), raw, LossReport())
+    if path.suffix.lower() in ARRAY_FILES:
+        raise InputError(
+            f"{path}: a file of arrays, of which none is known to be joint states",
+            remedy="describe them in a .toml and give that (docs/replay.md, Logs)",
+        )
+    if is_lerobot(path):
+        options.refuse(_NOT_FOR_TABLES, "a LeRobot dataset", path)
+        raw, file = dataset_track(path)
+        return _of_table(path, (file,), raw, LossReport(notes=["times are seconds from the episode's begin"]))
     if is_capture(path):
         return CaptureSource(path, options, joints)
     if path.suffix == ".toml" or has_views(path):

@@ -1,31 +1,42 @@
-"""Joint states in a CSV or NPZ file whose columns a TOML file describes (docs/replay.md, Logs)."""
+"""Joint states in a CSV, NPZ, HDF5 or Parquet file whose columns a TOML file describes (docs/replay.md, Logs)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.datasets.folder_description import read_table
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.array_columns import ArrayFile
 from splatctrl_cli.files.npz_columns import NpzFile
 from splatctrl_cli.files.spilled_rows import Rows, absent, scaled
+from splatctrl_cli.files.table_files import Hdf5File, ParquetFile
 from splatctrl_cli.logs.state_messages import pose_of_columns, pose_of_quat, rigid_or_none
 from splatctrl_cli.logs.state_track import RawTrack
+from splatctrl_cli.states import lerobot
 from splatctrl_cli.states.state_csv import CsvTable, poses_of, read_csv
 
 UNITS = {"rad": 1.0, "deg": float(np.pi / 180.0)}
 TIME_UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_FRAMES = ("base", "world")
 POSE_ORDERS = ("rows", "columns")
+ARRAY_FILES: Mapping[str, type[ArrayFile]] = {
+    ".npz": NpzFile,
+    **dict.fromkeys([".h5", ".hdf5"], Hdf5File),
+    ".parquet": ParquetFile,
+}
+PRESETS: Mapping[str, Callable[[Path, int | None], Mapping[str, Any]]] = {"lerobot": lerobot.preset}
 _SEE = "see docs/replay.md, Logs"
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatesTable:
-    """``[states]``: a file and its columns; in an NPZ file, arrays (T, K) give K columns each.
+    """``[states]``: a file and its columns; in a file of arrays, those (T, K) give K columns each.
 
-    epoch_ns: the Unix time of time 0; pose: x, y, z, qx, qy, qz, qw, or the 16 numbers of a matrix by pose_order.
+    epoch_ns: the Unix time of time 0; pose: x, y, z, qx, qy, qz, qw, or the 16 numbers of a matrix by pose_order;
+    preset: one of `PRESETS`, which fills in what is not given of the dataset `file`; episode: of such a dataset.
     """
 
     file: str
@@ -40,6 +51,8 @@ class StatesTable:
     epoch_ns: int = 0
     pose_frame: str = "base"
     pose_order: str = "rows"
+    preset: str = ""
+    episode: int | None = None
 
 
 def described_track(path: Path) -> tuple[RawTrack, Path]:
@@ -47,7 +60,7 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
 
     Raises InputError, naming the key or column.
     """
-    table = read_table(StatesTable, path, "states", beside=("twists",))
+    table = read_table(StatesTable, path, "states", beside=("twists",), fill=lambda given: with_preset(path, given))
     choices: Mapping[str, tuple[str, ...]] = {
         "unit": tuple(UNITS),
         "time_unit": tuple(TIME_UNITS_NS),
@@ -62,18 +75,48 @@ def described_track(path: Path) -> tuple[RawTrack, Path]:
             )
     if not table.joints or len(set(table.joints)) < len(table.joints):
         raise InputError(f"{path}: states.joints: expected names, each once, got {table.joints}", remedy=_SEE)
+    if table.preset and table.episode is not None:
+        return _of_episode(table, table.episode, path)
     return _track(table, columns_of(path, "states", table.file), path), path.parent / table.file
 
 
-def columns_of(path: Path, table: str, name: str) -> CsvTable | NpzFile:
-    """The columns of a CSV or NPZ file that a table of the TOML file `path` names. Raises InputError."""
+def dataset_track(folder: Path) -> tuple[RawTrack, Path]:
+    """The states of a LeRobot dataset's only episode, and the file that holds them. Raises InputError."""
+    found = dict(lerobot.preset(folder, None))
+    if "joints" not in found:
+        raise InputError(
+            f"{folder / lerobot.INFO}: {lerobot.POSITION} has no name for each joint",
+            remedy="give a .toml: [states] preset, file, joints (docs/replay.md, Logs)",
+        )
+    return _of_episode(StatesTable(**found), found["episode"], folder)
+
+
+def _of_episode(table: StatesTable, episode: int, path: Path) -> tuple[RawTrack, Path]:
+    file = Path(table.file)
+    return _track(table, ParquetFile(file, (lerobot.EPISODE, episode)), path), file
+
+
+def with_preset(path: Path, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The table [states] of a TOML file `path`, with what its preset fills in."""
+    name = given.get("preset", "")
+    if not name:
+        return given
+    if name not in PRESETS:
+        raise InputError(f"{path}: states.preset: expected one of {', '.join(PRESETS)}, got {name!r}", remedy=_SEE)
+    found = PRESETS[name](path.parent / str(given.get("file", ".")), given.get("episode"))
+    return {**found, **given, "file": found["file"]}
+
+
+def columns_of(path: Path, table: str, name: str) -> CsvTable | ArrayFile:
+    """The columns of a file that a table of the TOML file `path` names. Raises InputError."""
     file = path.parent / name
     if not file.is_file():
         raise InputError(f"{path}: {table}.file: {file}: no such file", remedy="give it relative to the .toml")
-    return NpzFile(file) if file.suffix == ".npz" else read_csv(file)
+    kind = ARRAY_FILES.get(file.suffix.lower())
+    return read_csv(file) if kind is None else kind(file)
 
 
-def _track(table: StatesTable, columns: CsvTable | NpzFile, path: Path) -> RawTrack:
+def _track(table: StatesTable, columns: CsvTable | ArrayFile, path: Path) -> RawTrack:
     factor, num = UNITS[table.unit], len(table.joints)
     wanted = {"position": table.position, "velocity": table.velocity}
     wanted |= {"commanded_velocity": table.commanded_velocity, "pose": table.pose}

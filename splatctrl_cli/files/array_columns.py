@@ -1,0 +1,114 @@
+"""Files of arrays (T, ...) as columns, read a block of rows at a time: what NPZ, HDF5 and Parquet have in common."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges
+from splatctrl_cli.records import Float64, Stamps
+
+FREE_BYTES = 1 << 30  # of an array, unpacked, and beside it:
+MOST_RATIO = 100  # times the file's size; joint states as recorded compress 2 to 20 times
+
+
+class ArrayFile(ABC):
+    """A file of columns: arrays (T, ...) by name, of which each row is flattened."""
+
+    names: Sequence[str]
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @abstractmethod
+    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
+        """Shape and type of an array, None where it is not there. Raises InputError for what cannot be read."""
+
+    @abstractmethod
+    def _blocks(self, name: str) -> Iterator[NDArray[Any]]:
+        """The rows of an array, about `BLOCK` at a time. Raises InputError for what cannot be read."""
+
+    def columns(self, names: Sequence[str]) -> Rows:
+        """(T, K) of the columns of arrays side by side. Raises InputError for arrays that are not there, hold no
+        numbers, or are of several lengths.
+        """
+        headers = [self._checked(name) for name in names]
+        lengths = [shape[0] for shape, _ in headers]
+        if len(set(lengths)) > 1:
+            said = ", ".join(f"{name} {length}" for name, length in zip(names, lengths, strict=True))
+            raise InputError(f"{self.path}: expected arrays of one length, got {said}", remedy="check the file")
+        parts = [self._flat(name, prod(shape[1:])) for name, (shape, _) in zip(names, headers, strict=True)]
+        file = RowFile((sum(prod(shape[1:]) for shape, _ in headers),))
+        for first, last in ranges(lengths[0]):
+            file.append(np.hstack([part.read(first, last) for part in parts]))
+        return Rows(file)
+
+    def _flat(self, name: str, width: int) -> RowFile:
+        """An array as (T, width); how many rows its blocks have is its own."""
+        file = RowFile((width,))
+        for block in self._blocks(name):
+            file.append(block.reshape(len(block), -1).astype(np.float64))
+        return file
+
+    def read(
+        self, time: str, unit_ns: int, groups: Mapping[str, Sequence[str]], epoch_ns: int
+    ) -> tuple[Stamps, dict[str, Rows]]:
+        """`stamps`, and of each group of names its `columns`."""
+        found = {key: self.columns(names) for key, names in groups.items()}
+        return self.stamps(time, unit_ns, epoch_ns), found
+
+    def numbers(self, names: Sequence[str]) -> Float64:
+        """`columns`, all rows at once."""
+        rows = self.columns(names)
+        return rows[: len(rows)]
+
+    def rows(self, name: str) -> Rows:
+        """An array (T, ...), each row in its shape; T may be 0. Raises InputError where it holds no numbers."""
+        shape, _ = self._checked(name, least=0)
+        file = RowFile(shape[1:])
+        for block in self._blocks(name):
+            file.append(block.astype(np.float64))
+        return Rows(file)
+
+    def stamps(self, name: str, unit_ns: int, epoch_ns: int, *, least: int = 1) -> Stamps:
+        """Stamps (T,) [ns] of an array of times in units of `unit_ns`, or of a type that says its unit."""
+        _, dtype = self._checked(name, least=least, kinds="iufM")
+        times = np.concatenate([np.zeros(0, dtype), *(block.reshape(-1) for block in self._blocks(name))])
+        if times.dtype.kind == "M":
+            times, unit_ns = times.astype("datetime64[ns]").astype(np.int64), 1
+        if times.dtype.kind in "iu":
+            return np.asarray(times.astype(np.int64) * unit_ns + epoch_ns)
+        if not np.isfinite(times).all():
+            raise InputError(f"{self.path}: {name}: expected times, got NaN or infinity", remedy="check the file")
+        whole = np.floor(times)
+        parts = np.round((times - whole) * unit_ns).astype(np.int64)
+        return np.asarray(whole.astype(np.int64) * unit_ns + parts + epoch_ns)
+
+    def _checked(self, name: str, *, least: int = 1, kinds: str = "iuf") -> tuple[tuple[int, ...], np.dtype[Any]]:
+        """Shape and type of an array of `least` rows or more, of types of these kinds."""
+        header = self._header(name)
+        if header is not None and header[1].kind in kinds and header[0]:
+            shape, dtype = header
+            size = prod(shape) * dtype.itemsize
+            if size > FREE_BYTES + MOST_RATIO * self.path.stat().st_size:  # no recording packs so small
+                raise InputError(
+                    f"{self.path}: {name}: {size} bytes unpacked, over {MOST_RATIO} times the size of the file",
+                    remedy="check the file",
+                )
+            if shape[0] >= least:
+                return header
+            raise InputError(f"{self.path}: {name}: expected rows, got none", remedy="record it again")
+        found = "none" if header is None else f"{header[1]} of shape {header[0]}"
+        raise InputError(
+            f"{self.path}: {name!r}: expected an array of numbers, got {found}",
+            remedy=f"arrays there: {', '.join(self.names)}",
+        )
+
+    def _unreadable(self, kind: str, error: Exception) -> InputError:
+        said = " ".join(str(error).split()) or type(error).__name__
+        return InputError(f"{self.path}: cannot be read as {kind}: {said}", remedy="check the file")
