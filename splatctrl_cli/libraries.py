@@ -1,6 +1,7 @@
 """Libraries that take most of a second to load, each loaded when a name of it is first used, and those of extras."""
 
 from importlib import import_module
+from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,11 @@ else:
     distributed, scipy_io = _LoadedLate("distributed"), _LoadedLate("scipy.io")
 
 
+def is_installed(module: str) -> bool:
+    """Whether a library of an extra is there; it is not loaded."""
+    return find_spec(module) is not None
+
+
 def of_extra(module: str, extra: str, what: str) -> Any:
     """A library that reads `what`. Raises UsageError with the remedy where the extra is not installed."""
     try:
@@ -37,4 +43,4 @@ def of_extra(module: str, extra: str, what: str) -> Any:
         ) from None
 
 
-__all__ = ["distributed", "mpl", "of_extra", "scipy_io", "trimesh"]
+__all__ = ["distributed", "is_installed", "mpl", "of_extra", "scipy_io", "trimesh"]

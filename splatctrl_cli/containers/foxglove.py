@@ -19,6 +19,7 @@ from splatctrl_cli.containers.raw_log import Topic
 
 _STANDS_FOR = {
     "CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "CompressedVideo": "foxglove_msgs/msg/CompressedVideo",  # ROS has none; the same fields as a CompressedImage
     "RawImage": "sensor_msgs/msg/Image",
     "CameraCalibration": "sensor_msgs/msg/CameraInfo",
     "FrameTransform": "tf2_msgs/msg/TFMessage",
@@ -31,6 +32,7 @@ _STAMPED = "builtin_interfaces/Time timestamp\nstring frame_id\n"
 _SIZED = f"{_STAMPED}uint32 width\nuint32 height\n"
 DEFINITIONS = {  # for bags without any; foxglove/schemas, ros_foxglove_msgs/ros2
     "foxglove_msgs/msg/CompressedImage": f"{_STAMPED}uint8[] data\nstring format\n",
+    "foxglove_msgs/msg/CompressedVideo": f"{_STAMPED}uint8[] data\nstring format\n",
     "foxglove_msgs/msg/RawImage": f"{_SIZED}string encoding\nuint32 step\nuint8[] data\n",
     "foxglove_msgs/msg/CameraCalibration": (
         f"{_SIZED}string distortion_model\nfloat64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n"
@@ -170,6 +172,7 @@ def _joint_states(message: Any) -> Any:
 
 _READERS: dict[str, Callable[[Any], Any]] = {
     "CompressedImage": _compressed_image,
+    "CompressedVideo": _compressed_image,
     "RawImage": _raw_image,
     "CameraCalibration": _calibration,
     "FrameTransform": lambda message: SimpleNamespace(transforms=[_transform(message)]),

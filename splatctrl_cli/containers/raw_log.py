@@ -47,14 +47,16 @@ class Damage:
 
     count: int = 0
     notes: list[str] = field(default_factory=list)
+    _num_unsaid: int = 0
 
-    def add(self, note: str) -> None:
-        """Count one damaged part and say which; of more than MAX_NOTES, the last note says how many more."""
-        self.count += 1
-        if self.count <= MAX_NOTES:
+    def add(self, note: str, num: int = 1) -> None:
+        """Count damaged parts and say which; behind MAX_NOTES notes, a last one says how many more."""
+        self.count += num
+        if len(self.notes) < MAX_NOTES:
             self.notes.append(note)
         else:
-            self.notes[MAX_NOTES:] = [f"and {self.count - MAX_NOTES} more"]
+            self._num_unsaid += num
+            self.notes[MAX_NOTES:] = [f"and {self._num_unsaid} more"]
 
 
 class RawLog(Protocol):

@@ -44,7 +44,7 @@ class ArrayFile(ABC):
             raise InputError(f"{self.path}: expected arrays of one length, got {said}", remedy="check the file")
         parts = [self._flat(name, prod(shape[1:])) for name, (shape, _) in zip(names, headers, strict=True)]
         file = RowFile((sum(prod(shape[1:]) for shape, _ in headers),))
-        for first, last in ranges(lengths[0]):
+        for first, last in ranges(max(lengths, default=0)):
             file.append(np.hstack([part.read(first, last) for part in parts]))
         return Rows(file)
 

@@ -9,11 +9,13 @@ import numpy as np
 from splatctrl_cli.containers.log_formats import told_formats
 from splatctrl_cli.containers.raw_log import RawLog, Topic
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, is_ros
+from splatctrl_cli.libraries import is_installed
+from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, VIDEO, is_ros
 from splatctrl_cli.logs.messages import ImageMessage
 from splatctrl_cli.logs.realsense import device_of
 from splatctrl_cli.logs.source_options import CameraTopics
 from splatctrl_cli.logs.survey import Calibration, Survey, TopicSurvey
+from splatctrl_cli.logs.video import EXTRA, KEY_FRAME, LIBRARY, OFTENER, is_video
 
 _TRANSPORTS = {"compressed", "compressedDepth"}
 _REGISTERED_WORDS = ("aligned_depth", "registered", "depth_to_color", "depth_to_rgb")
@@ -69,6 +71,7 @@ def _camera(
         ),
     )
     name = "/".join(namespace)
+    info = info or (depth_info if _is_of_file(color) else "")
     return CameraTopics(
         name=name, color=color.topic.name, depth=depth.topic.name, info=info or "", depth_info=depth_info or ""
     )
@@ -105,11 +108,23 @@ def is_registered(survey: Survey, color: str, depth: str, info: str, depth_info:
     T_color_depth = survey.realsense.T_between(color, depth)
     if T_color_depth is not None and not np.allclose(T_color_depth, np.eye(4), atol=1e-6):
         return False
-    if color_image.frame_id != depth_image.frame_id and not _says_registered(depth):
+    if frame_of(survey, color, depth) != depth_image.frame_id and not _says_registered(depth):
         return False
     calibration = survey.topics[info].calibration if info else None
     depth_calibration = survey.topics[depth_info].calibration if depth_info else None
     return calibration is None or depth_calibration is None or _same_intrinsics(calibration, depth_calibration)
+
+
+def frame_of(survey: Survey, color: str, depth: str) -> str:
+    """The frame of a colour topic's images; a video file names none: that of its depth, which is aligned to it."""
+    image = survey.topics[depth if _is_of_file(survey.topics[color]) else color].first_image
+    assert image is not None
+    return image.frame_id
+
+
+def _is_of_file(topic: TopicSurvey) -> bool:
+    """Whether images are those of a video file beside a log."""
+    return topic.topic.encoding == VIDEO and topic.first_image is not None and not topic.first_image.frame_id
 
 
 def common_prefix(name: str, other: str) -> tuple[str, ...]:
@@ -176,12 +191,12 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
             f"{log.path}: no depth topic; colour topics there: {listed(colors)}",
             remedy="record 16UC1, mono16 or 32FC1 depth images",
         )
-    videos = sorted(t.topic.name for t in survey.topics.values() if t.count and _is_video(t.topic))
-    if depths and not colors and videos:
-        return InputError(
-            f"{log.path}: colour is video ({', '.join(videos)}), which is not read",
-            remedy="decode it to images first: `ros2 run image_transport republish` for ROS topics, else ffmpeg",
-        )
+    videos = sorted(t.topic.name for t in survey.topics.values() if t.count and is_video(t.topic))
+    if videos and not colors:
+        return _unread_video(f"{log.path}: colour is video ({', '.join(videos)})", has_depth=bool(depths))
+    lost = next((note for note in survey.damage.notes if KEY_FRAME in note), "")
+    if lost and not colors:
+        return InputError(f"{log.path}: no image of the video can be decoded ({lost})", remedy=OFTENER)
     broken = [t.topic.name for t in survey.of_type(IMAGE, COMPRESSED_IMAGE) if t.first_image is None]
     if broken:
         why = next((note for note in survey.damage.notes if "image" in note), "see `splatctrl info`")
@@ -195,11 +210,6 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
         )
     topics = [t.topic for t in survey.topics.values() if t.count]
     kinds = sorted({_kind(topic) for topic in topics})
-    if videos:
-        return InputError(
-            f"{log.path}: colour is video ({', '.join(videos)}), which is not read, and there is no depth topic",
-            remedy="record depth images, and decode the video to images first",
-        )
     formats = told_formats(log.path) or {topic.encoding for topic in topics}
     alien = sorted(formats - set(_ENCODINGS))
     if alien and len(alien) == len(formats):
@@ -213,9 +223,17 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
     )
 
 
-def _is_video(topic: Topic) -> bool:
-    """Foxglove's CompressedVideo, or ffmpeg_image_transport's packets."""
-    return (topic.schema or topic.type_name).endswith(("CompressedVideo", "FFMPEGPacket"))
+def _unread_video(what: str, *, has_depth: bool) -> InputError:
+    lacks = "" if has_depth else "; and there is no depth topic"
+    if not is_installed(LIBRARY):
+        return InputError(
+            f"{what}, for which the library {LIBRARY} is not installed{lacks}",
+            remedy=f"pip install 'splatctrl-cli[{EXTRA}]'",
+        )
+    return InputError(
+        f"{what}, which is neither H.264 nor H.265{lacks}",
+        remedy="decode it to images first: `ros2 run image_transport republish` for ROS topics, else ffmpeg",
+    )
 
 
 def listed(names: Sequence[str]) -> str:

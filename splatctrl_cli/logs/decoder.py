@@ -3,8 +3,11 @@
 import re
 import struct
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
@@ -16,6 +19,7 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 JOINT_STATE = "sensor_msgs/msg/JointState"
+VIDEO = "video"  # the encoding of images that were taken out of video, `pack_image`
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 _KNOWN = frozenset(  # what is read by its fields
@@ -26,6 +30,7 @@ _KNOWN = frozenset(  # what is read by its fields
         *("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Pose", "geometry_msgs/msg/Point"),
     }
 )
+_IMAGE_HEAD = struct.Struct("<4siIIII")
 _MOST_TEXT = 1 << 20  # characters of a definition
 _MOST_ITEMS = 1 << 16  # of a fixed array in a definition: code is generated for each item that is not a number
 _ARRAY = re.compile(r"\[\s*(\d+)\s*\]|,\s*(\d+)\s*>")  # `type[N]` of .msg, `sequence<type, N>` of .idl
@@ -37,7 +42,7 @@ class UndecodableMessageError(ValueError):
 
 def is_ros(topic: Topic) -> bool:
     """Whether the topic's messages are in a ROS encoding, or stand for a ROS message in another."""
-    return topic.encoding in {"cdr", "ros1"} or is_foxglove(topic)
+    return topic.encoding in {"cdr", "ros1", VIDEO} or is_foxglove(topic)
 
 
 def is_foxglove(topic: Topic) -> bool:
@@ -55,6 +60,8 @@ class MessageDecoder:
     def decode(self, message: RawMessage) -> Any:
         """The message as an object with its fields. Raises UndecodableMessageError."""
         topic = message.topic
+        if topic.encoding == VIDEO:
+            return _unpack_image(message.data)
         store = None if is_foxglove(topic) else self._store(topic)
         try:
             if store is None:
@@ -96,6 +103,28 @@ def header_stamp_ns(message: RawMessage) -> int:
     except struct.error:
         raise UndecodableMessageError(f"{message.topic.name}: a message of {len(message.data)} bytes") from None
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def pack_image(header: Any, pixels: NDArray[np.uint8]) -> bytes:
+    """An image (H, W, 3) RGB out of a video as a message; its stamp is where CDR has that of a header."""
+    frame, (height, width) = header.frame_id.strip("/").encode(), pixels.shape[:2]
+    head = _IMAGE_HEAD.pack(b"\0\1\0\0", header.stamp.sec, header.stamp.nanosec, height, width, len(frame))
+    return bytes(head + frame + pixels.tobytes())
+
+
+def _unpack_image(data: bytes) -> Any:
+    """Such a message as a sensor_msgs/Image."""
+    _, seconds, nanoseconds, height, width, length = _IMAGE_HEAD.unpack_from(data)
+    start, stamp = _IMAGE_HEAD.size + length, SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id=data[_IMAGE_HEAD.size : start].decode()),
+        height=height,
+        width=width,
+        encoding="rgb8",
+        is_bigendian=0,
+        step=3 * width,
+        data=np.frombuffer(data, np.uint8, offset=start),
+    )
 
 
 def stamp_ns(header: Any) -> int:

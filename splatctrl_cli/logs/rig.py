@@ -9,7 +9,7 @@ import numpy as np
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.logs.cameras import find_cameras, find_info, is_registered, listed, no_camera
+from splatctrl_cli.logs.cameras import find_cameras, find_info, frame_of, is_registered, listed, no_camera
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 from splatctrl_cli.logs.pose_topics import join_pose_topics, pose_topics
 from splatctrl_cli.logs.registration import DISTORTION_MODELS, SAME_MODELS, DepthToColor, Undistortion
@@ -189,9 +189,7 @@ class _Builder:
 
     @property
     def _frame_id(self) -> str:
-        image = self._survey.topics[self._topics.color].first_image
-        assert image is not None
-        return image.frame_id
+        return frame_of(self._survey, self._topics.color, self._topics.depth)
 
     @property
     def _is_registered(self) -> bool:

@@ -28,6 +28,7 @@ from splatctrl_cli.logs.messages import ImageMessage, read_image
 from splatctrl_cli.logs.realsense import OPTION, TRANSFORM, RealSense
 from splatctrl_cli.logs.state_messages import STANDARD_TYPES, STATE_TYPES, RawJoints, read_states
 from splatctrl_cli.logs.tf_tree import TfTree
+from splatctrl_cli.logs.video import VideoLog
 from splatctrl_cli.records import Float64
 
 LARGE = 1 << 30  # bytes from which on an MCAP is described by its index
@@ -183,18 +184,20 @@ def _add_transforms(tree: TfTree, message: Any, log_time_ns: int | None, *, stat
 def survey_to_describe(log: RawLog) -> tuple[Survey, tuple[str, ...]]:
     """A survey of the whole log; of a large MCAP one by its index, and notes that say so."""
     size = sum(file.stat().st_size for file in log.files)
-    if size < LARGE or not isinstance(log, McapLog):
+    inner, video = (log.inner, log) if isinstance(log, VideoLog) else (log, None)
+    if size < LARGE or not isinstance(inner, McapLog):
         return survey(log), ()
-    index = log.index()
-    found = _sampled(log, index)
+    index = inner.index()
+    found = _sampled(inner, index, video)
     how = f"{size} bytes: described by index and first messages; neither checksums nor the rest were read"
     return found, (*index.notes, how)
 
 
-def _sampled(log: McapLog, index: LogIndex) -> Survey:
+def _sampled(log: McapLog, index: LogIndex, video: VideoLog | None) -> Survey:
     found, decoder = Survey(), MessageDecoder()
     chunks = _first_chunks(index)
     messages = log.messages_of(chunks, found.damage) if chunks else islice(log.messages(Damage()), 2000)
+    messages = messages if video is None else video.decoded(messages, Damage())  # others lie between these chunks
     for message in messages:
         add_message(found, decoder, message)
     for topic in log.topics():

@@ -8,7 +8,7 @@ from typing import Any
 from splatctrl_cli.captures.capture_header import is_capture, read_capture_header
 from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.containers.log_formats import CONTAINERS, SUFFIXES, is_bag_folder, open_raw_log
+from splatctrl_cli.containers.log_formats import CONTAINERS, SUFFIXES, is_bag_folder
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
 from splatctrl_cli.datasets.layouts import layout_of, open_layout, readable_in
@@ -20,6 +20,8 @@ from splatctrl_cli.logs.rig import camera_topics, missing
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.logs.survey import Survey, TopicSurvey, survey_to_describe
+from splatctrl_cli.logs.video_file import SUFFIXES as VIDEOS
+from splatctrl_cli.logs.video_file import open_log
 from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
 from splatctrl_cli.sources.describe_file import describe_file
@@ -34,8 +36,8 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
         return _describe_folder(path, options)
     with path.open("rb") as stream:
         start = stream.read(16)
-    if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in SUFFIXES:
-        return describe_log(open_raw_log(path), options)
+    if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in (*SUFFIXES, *VIDEOS):
+        return describe_log(open_log(path), options)
     if path.suffix == ".toml":
         return _describe_images(path, open_image_folder(path, options), "image folder")
     if (layout := layout_of(path)) is not None:
@@ -118,7 +120,7 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
         return _describe_capture(path)
     check_not_partial(path)
     if is_bag_folder(path):
-        return describe_log(open_raw_log(path), options)
+        return describe_log(open_log(path), options)
     if (layout := layout_of(path)) is not None:
         return _describe_images(path, open_layout(path, options), layout.name)
     names = {name for name in _KNOWN_FILES if (path / name).is_file()}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.log_formats import SessionLog, open_raw_log
+from splatctrl_cli.containers.log_formats import SessionLog
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.datasets.layouts import has_views, open_layout
@@ -13,6 +13,7 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource
+from splatctrl_cli.logs.video_file import open_log
 
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
 
@@ -32,7 +33,7 @@ def open_source(path: Path, options: SourceOptions | None = None) -> FrameSource
         return CaptureSource(path, options)
     if has_views(path):
         return open_layout(path, options)
-    return RosLogSource(open_raw_log(path), options)
+    return RosLogSource(open_log(path), options)
 
 
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:
@@ -56,5 +57,5 @@ def open_logs(paths: Sequence[Path]) -> RawLog | None:
             if len(paths) == 1:
                 return None
             raise InputError(f"{path}: expected a log beside others, got none", remedy="give it alone")
-    logs = tuple(open_raw_log(path) for path in paths)
+    logs = tuple(open_log(path) for path in paths)
     return logs[0] if len(logs) == 1 else SessionLog(logs)

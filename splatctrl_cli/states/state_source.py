@@ -6,7 +6,6 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.folder_description import has_table
 from splatctrl_cli.datasets.layouts import has_views
@@ -19,6 +18,7 @@ from splatctrl_cli.logs.state_topics import joint_records, with_prefix
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.logs.survey import survey
+from splatctrl_cli.logs.video_file import open_log
 from splatctrl_cli.records import LossReport, Record
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.lerobot import is_lerobot
@@ -88,7 +88,7 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
         return CaptureSource(path, options, joints)
     if path.suffix == ".toml" or has_views(path):
         return open_source(path, options)
-    return _of_log(path, open_raw_log(path), options, joints)
+    return _of_log(path, open_log(path), options, joints)
 
 
 def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> RosLogSource | StateSource:

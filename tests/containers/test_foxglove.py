@@ -22,7 +22,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from splatctrl_cli.containers.foxglove import DEFINITIONS
 from splatctrl_cli.containers.protobuf import MessageTypes
 from splatctrl_cli.containers.raw_log import RawMessage, Topic
-from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.sources.describe import describe
@@ -132,18 +131,15 @@ def convert(
     path: Path,
     encoding: str,
     spoil: Callable[[str, bytes], bytes] = lambda name, data: data,
-    *,
-    as_video: bool = False,
 ) -> Path:
-    """The images, calibrations and transforms of a ROS 2 log in Foxglove's schemas; as_video: colour by that name."""
+    """The images, calibrations and transforms of a ROS 2 log in Foxglove's schemas."""
     write: Callable[[str, Any], bytes] = encoded if encoding == "protobuf" else as_json
     definition = descriptor_set().decode("latin-1") if encoding == "protobuf" else "{}"
     decoder = MessageDecoder()
 
     def told(message: RawMessage) -> RawMessage:
         name, fields = foxglove_of(message.topic.type_name, decoder.decode(message))
-        schema = name.replace("CompressedImage", "CompressedVideo") if as_video else name
-        topic = Topic(name=message.topic.name, type_name=schema, encoding=encoding, definition=definition)
+        topic = Topic(name=message.topic.name, type_name=name, encoding=encoding, definition=definition)
         return replace(message, topic=topic, data=spoil(name, write(name, fields)))
 
     return rewritten(log, path, told)
@@ -227,15 +223,6 @@ def test_foxglove_msgs_in_a_bag_give_the_records_of_the_same_ros_log(
     assert source.loss.damaged == 0
     rows = {str(row[0]): row[1] for row in describe(bag).grids[0].rows}
     assert rows["/cam0/depth/image_raw"] == "foxglove_msgs/msg/RawImage"
-
-
-def test_video_is_named_with_what_to_do(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "log.mcap", LogRecipe(has_joints=False))
-    path = convert(log, tmp_path / "video.mcap", "protobuf", as_video=True)
-    with pytest.raises(
-        InputError, match=r"colour is video \(/cam0/.*\), which is not read; decode it to images first"
-    ):
-        open_source(path)
 
 
 def test_a_transform_that_comes_once_holds_always(tmp_path: Path) -> None:
