@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.jobs.batches.suite import Job, Limits, Recording, Suite, Table, job_for
+from splatctrl_cli.jobs.batches.suite import Job, Limits, Recording, Suite, Table, jobs_for
 
 RECORDING, NAME = "recording", "name"  # what {…} in an option may stand for, beside the jobs
 ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
@@ -79,31 +79,31 @@ def nodes_of(suite: Suite, out: Path, command_line: CommandLine, shard: tuple[in
     index, count = shard
     nodes: list[Node] = []
     for recording in sorted(suite.recordings, key=lambda each: each.name)[index - 1 :: count]:
-        jobs = [job for each in suite.jobs if (job := job_for(each, recording, COMMANDS)) is not None]
-        kept = {job.name: _with_roles(job, jobs) for job in jobs}
+        jobs = jobs_for(recording, suite.jobs, COMMANDS)
+        kept = {job.name: _with_roles(job, jobs, recording) for job in jobs}
         nodes += _nodes_of(recording, _in_order(kept, recording), suite.folder, out, command_line)
     return nodes
 
 
-def _with_roles(job: Job, jobs: Sequence[Job]) -> Job:
+def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
     """With the options that follow from the other jobs, where the suite does not give them."""
     given = {*job.options, *job.matrix}
     given |= {"field"} & given and {"scene"}  # a field stands for its scene
     roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
     if job.command in {"reconstruct", "score"} and "dtu" in given:
         roles = {option: role for option, role in roles.items() if option == "scene"}
-    return replace(
-        job, options={**{option: _filled(job, role, jobs) for option, role in roles.items()}, **job.options}
-    )
+    filled = {option: _filled(job, role, jobs, recording) for option, role in roles.items()}
+    return replace(job, options={**filled, **job.options})
 
 
-def _filled(job: Job, role: str, jobs: Sequence[Job]) -> str:
+def _filled(job: Job, role: str, jobs: Sequence[Job], recording: Recording) -> str:
+    where = f"[jobs.{job.name}] of {recording.name}"
     makers = [other.name for other in jobs if other.command == role and other.name != job.name]
     if len(makers) > 1:
         example = " or ".join(f"'{{{name}}}'" for name in makers)
-        raise UsageError(f"[jobs.{job.name}]: {len(makers)} jobs of {role} come before it", remedy=f"say {example}")
+        raise UsageError(f"{where}: {len(makers)} jobs of {role} come before it", remedy=f"say {example}")
     if not makers and role == SCENE:
-        raise UsageError(f"[jobs.{job.name}]: expected a job of {SCENE} before it", remedy="or give scene = PATH")
+        raise UsageError(f"{where}: expected a job of {SCENE} before it", remedy="or give scene = PATH")
     return f"{{{makers[0] if makers else RECORDING}}}"
 
 

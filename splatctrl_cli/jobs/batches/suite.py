@@ -2,9 +2,11 @@
 
 import difflib
 import glob
+import os
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -50,10 +52,13 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """One recording: its files (several are read as one session), and what a job has otherwise for it."""
+    """One recording: its files (several are read as one session), the jobs that it goes through, empty for all, and
+    what a job has otherwise for it.
+    """
 
     name: str
     paths: tuple[Path, ...]
+    only: tuple[str, ...] = ()
     overrides: Mapping[str, Table] = field(default_factory=dict)
 
 
@@ -83,20 +88,22 @@ def read_suite(path: Path, commands: Sequence[str]) -> Suite:
     folder = path.absolute().parent
     name = _text(path.name, document, "name", path.stem)
     jobs = tuple(_job(key, table, commands) for key, table in _tables(path.name, document, "jobs").items())
-    recordings = [one for table in _list(path.name, document, "recordings") for one in _recordings(folder, table)]
+    tables = _list(path.name, document, "recordings")
+    recordings = _named([one for table in tables for one in _recordings(folder, table)])
     if not jobs or not recordings:
         raise UsageError(f"{path.name}: expected [[recordings]] and [jobs.NAME], got none of {_lacking(jobs)}")
-    _check_recordings(recordings, {job.name for job in jobs})
+    _check_recordings(recordings, [job.name for job in jobs])
     out = folder / _text(path.name, document, "out", f"{path.stem}.out")
     return Suite(name=name, folder=folder, out=out, recordings=tuple(recordings), jobs=jobs)
 
 
-def job_for(job: Job, recording: Recording, commands: Sequence[str]) -> Job | None:
-    """The job as a recording has it, None where it skips it. Raises UsageError for what the override says."""
-    override = recording.overrides.get(job.name, {})
-    if override.get("skip") is True:
-        return None
-    own = _job(job.name, {key: value for key, value in override.items() if key != "skip"}, commands, job)
+def jobs_for(recording: Recording, jobs: Sequence[Job], commands: Sequence[str]) -> list[Job]:
+    """The jobs of a recording, as it has them. Raises UsageError for what an override says."""
+    return [_job_for(job, recording, commands) for job in jobs if job.name in recording.only or not recording.only]
+
+
+def _job_for(job: Job, recording: Recording, commands: Sequence[str]) -> Job:
+    own = _job(job.name, recording.overrides.get(job.name, {}), commands, job)
     return replace(own, options={**job.options, **own.options}, matrix={**job.matrix, **own.matrix})
 
 
@@ -146,18 +153,20 @@ _LIMITS = tuple(each.name for each in fields(Limits))
 def _recordings(folder: Path, table: Table) -> list[Recording]:
     """Those of one [[recordings]]: one for each file that is found, or one of a session."""
     where = "[[recordings]]"
-    _check_keys(where, table, ("name", "paths", "session", "jobs"))
-    overrides = _tables(where, table, "jobs")
+    if not isinstance(table, Mapping):
+        raise UsageError(f"{where}: expected a table, got {shown(table)}", remedy="give it paths = [...]")
+    _check_keys(where, table, ("name", "paths", "session", "only", "jobs"))
+    only = tuple(_worded(where, "only", name) for name in _list(where, table, "only"))
     if ("paths" in table) == ("session" in table):
         raise UsageError(f"{where}: expected paths or session, and not both")
     key = "paths" if "paths" in table else "session"
     paths = list(dict.fromkeys(path for each in _list(where, table, key) for path in _found(folder, where, each)))
     name = _text(where, table, "name", "")
-    if key == "session":
-        return [Recording(name=name or _name_of(paths[0]), paths=tuple(paths), overrides=overrides)]
-    if name and len(paths) > 1:
+    if name and key == "paths" and len(paths) > 1:
         raise UsageError(f"{where} name = {name!r}: {len(paths)} recordings match", remedy="leave the name out")
-    return [Recording(name=name or _name_of(path), paths=(path,), overrides=overrides) for path in paths]
+    each = [tuple(paths)] if key == "session" else [(path,) for path in paths]
+    jobs = _tables(where, table, "jobs")
+    return [Recording(name=name, paths=files, only=only, overrides=jobs) for files in each]
 
 
 def _found(folder: Path, where: str, pattern: object) -> list[Path]:
@@ -168,16 +177,40 @@ def _found(folder: Path, where: str, pattern: object) -> list[Path]:
     return [folder / place for place in places]
 
 
-def _name_of(path: Path) -> str:
-    """Of the file, without its ending; of a file called like thousands of others with its folder's."""
-    name = path.name
-    for ending in _ENDINGS:
-        name = name.removesuffix(ending)
-    name = f"{path.parent.name}-{name}" if name in {"log", "capture", "recording", "data"} else name
+def _named(recordings: Sequence[Recording]) -> list[Recording]:
+    """With a name where the suite has none: of the file, after those of its folders that tell it from others of the
+    name; with its ending where only that does.
+    """
+    files = [Path(os.path.normpath(each.paths[0])) for each in recordings]
+    beside = Counter(map(_without_ending, set(files)))
+    places = [path if beside[_without_ending(path)] > 1 else _without_ending(path) for path in files]
+    names = [each.name or _name_of(place) for each, place in zip(recordings, places, strict=True)]
+    for above in range(max((len(place.parts) - 1 for place in places), default=0)):
+        alike: dict[str, list[int]] = {}
+        for k, name in enumerate(names):
+            alike.setdefault(name.lower(), []).append(k)
+        for group in alike.values():
+            folders = {k: "".join(parent.name for parent in [*places[k].parents][above : above + 1]) for k in group}
+            for k in group if len(set(folders.values())) > 1 else ():
+                names[k] = names[k] if recordings[k].name else _plain(f"{folders[k]}-{names[k]}".lstrip("-"))
+    return [replace(each, name=name) for each, name in zip(recordings, names, strict=True)]
+
+
+def _without_ending(path: Path) -> Path:
+    return path.with_suffix("") if path.suffix in _ENDINGS else path
+
+
+def _name_of(place: Path) -> str:
+    """Of a file; of one called like thousands of others with its folder's."""
+    is_common = place.name in {"log", "capture", "recording", "data"}
+    return _plain(f"{place.parent.name}-{place.name}" if is_common else place.name)
+
+
+def _plain(name: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name)
 
 
-def _check_recordings(recordings: Sequence[Recording], jobs: Iterable[str]) -> None:
+def _check_recordings(recordings: Sequence[Recording], jobs: Sequence[str]) -> None:
     by_name: dict[str, Recording] = {}
     for recording in recordings:
         _checked_name("[[recordings]] name", recording.name)
@@ -188,9 +221,12 @@ def _check_recordings(recordings: Sequence[Recording], jobs: Iterable[str]) -> N
                 f"two recordings are called {recording.name!r}: {both}",
                 remedy="give one a [[recordings]] of its own, with a name",
             )
-        for job in recording.overrides:
+        for job in recording.only:
             if job not in jobs:
-                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_near(job, list(jobs)))
+                raise UsageError(f"[[recordings]] only: no job is called {job!r}", remedy=_near(job, jobs))
+        for job in recording.overrides:
+            if job not in (recording.only or jobs):
+                raise UsageError(f"[recordings.jobs.{job}]: no job has this name", remedy=_near(job, jobs))
 
 
 def _check_keys(where: str, table: Table, known: Sequence[str]) -> None:

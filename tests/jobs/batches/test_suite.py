@@ -66,7 +66,7 @@ def test_a_matrix_makes_variants_that_go_on_in_what_needs_them(tmp_path: Path) -
 def test_a_recording_may_have_a_job_otherwise_or_not_at_all(tmp_path: Path) -> None:
     own = (
         "[[recordings]]\npaths = ['a.mcap']\n[recordings.jobs.check]\nfail-on = 'warning'\nexpect = 'exit 1'\n"
-        "[[recordings]]\nname = 'both'\nsession = ['*.mcap']\njobs.ingest.skip = true\n"
+        "[[recordings]]\nname = 'both'\nsession = ['*.mcap']\nonly = ['check']\n"
     )
     found = {
         n.name: n for n in nodes(tmp_path, own + "[jobs.check]\ntimeout = '2 min'\nmemory = '1 GiB'\n[jobs.ingest]\n")
@@ -76,6 +76,22 @@ def test_a_recording_may_have_a_job_otherwise_or_not_at_all(tmp_path: Path) -> N
     assert found["both/check"].words[-2:] == (str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"))
     assert found["both/check"].expect == "passed"
     assert found["a/check"].limits == Limits(timeout=120.0, memory=2**30)
+
+
+def test_recordings_of_one_file_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    for place in (
+        "a/2025/log.mcap",
+        "b/2025/log.mcap",
+        "b/2025/arm.bag",
+        "c/arm.mcap",
+        "c/wrist.mcap",
+        "c/wrist.bag",
+    ):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).touch()
+    text = "[[recordings]]\npaths = ['**/*.mcap', '**/*.bag']\n[[recordings]]\nname = 'arm'\npaths = ['a.mcap']\n"
+    found = [node.recording for node in nodes(tmp_path, text + "[jobs.check]\n".replace("'a.mcap'", "'c/arm.mcap'"))]
+    assert found == ["2025-arm", "a", "a-2025-log", "arm", "b", "b-2025-log", "c-arm", "wrist.bag", "wrist.mcap"]
 
 
 def test_shards_hold_every_recording_once(tmp_path: Path) -> None:
@@ -124,9 +140,16 @@ def test_shards_hold_every_recording_once(tmp_path: Path) -> None:
         ("[[recordings]]\nname = '../x'\npaths = ['a.mcap']\n[jobs.check]\n", "'../x' is no name of a folder"),
         (RECORDINGS * 2 + "[jobs.check]\n", "two recordings are called 'a'"),
         (
-            RECORDINGS + "jobs.chek.skip = true\n[jobs.check]\n",
+            RECORDINGS + "jobs.chek.quick = 3\n[jobs.check]\n",
             "[recordings.jobs.chek]: no job has this name; did you",
         ),
+        (
+            RECORDINGS + "only = ['info']\njobs.check.quick = 3\n[jobs.check]\n[jobs.info]\n",
+            "[recordings.jobs.check]: no job has this name",
+        ),
+        (RECORDINGS + "only = ['chek']\n[jobs.check]\n", "only: no job is called 'chek'; did you mean check?"),
+        (RECORDINGS + "only = []\n[jobs.check]\n", "only: expected a list, got []"),
+        ("recordings = ['*.mcap']\n[jobs.check]\n", "[[recordings]]: expected a table, got '*.mcap'; give it paths"),
         (
             RECORDINGS + "[jobs.check]\nmatrix = { fail-on = ['error', 'error'] }\n",
             "two outputs are called a/check+fail-on=error",
