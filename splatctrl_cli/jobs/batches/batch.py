@@ -81,6 +81,8 @@ def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, li
     out = (request.out or suite.out).absolute()
     nodes = nodes_of(suite, out, command_line, request.shard)
     if not nodes:
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("interrupted; run the same again to go on") from None
         index, count = request.shard
         raise UsageError(
             f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings", remedy="give fewer shards"

@@ -48,7 +48,7 @@ class Scheduler:
         waiting = {node.name: node for node in nodes}
         futures: dict[Future[End], Node] = {}
         tries: Counter[str] = Counter()
-        clock = _Clock(len(nodes), self.ledger.mean_seconds(), self.slots)
+        clock = Clock(nodes, self.ledger.mean_seconds(), self.slots)
         while waiting or futures:
             is_busy = False
             for node in list(waiting.values()):
@@ -108,11 +108,11 @@ class Scheduler:
         self.ledger.record(run)
         return run if run.state in (DONE, FAILED) else None
 
-    def _settle(self, node: Node, run: Run, clock: "_Clock") -> None:
+    def _settle(self, node: Node, run: Run, clock: "Clock") -> None:
         self.runs[node.name] = run
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
-            self.progress.log(f"{line} {node.name}: {told(run)}{clock.left(self.runs)}")
+            self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
 
     def _task(self, node: Node, key: str) -> Task:
         return Task(
@@ -207,32 +207,34 @@ def local_executor(workers: int) -> Iterator[Executor]:
 
 
 def _interrupted(*_: object) -> None:
-    raise KeyboardInterrupt("interrupted; run the same again to go on")
+    raise KeyboardInterrupt
 
 
-class _Clock:
-    """How many nodes have passed, and about how long the others take."""
+class Clock:
+    """How many nodes have passed, and about how long the others take, by how long their jobs took."""
 
-    def __init__(self, total: int, means: Mapping[str, float], slots: int) -> None:
+    def __init__(self, nodes: Sequence[Node], means: Mapping[str, float], slots: int) -> None:
         self.started = time.time()
-        self._total, self._num, self._slots = total, 0, slots
+        self._total, self._slots = len(nodes), slots
+        self._left = Counter(node.job for node in nodes)
         self._means = dict(means)
         self._seen: dict[str, list[float]] = {}
 
     def passed(self, run: Run) -> str:
-        self._num += 1
-        if run.started >= self.started:
+        """How many have, with this one."""
+        self._left[run.job] -= 1
+        if run.started >= self.started and run.state != SKIPPED:
             self._seen.setdefault(run.job, []).append(run.seconds)
-        return f"[{self._num}/{self._total}]"
+        return f"[{self._total - self._left.total()}/{self._total}]"
 
-    def left(self, runs: Mapping[str, Run]) -> str:
-        """Nothing as long as no run has ended."""
-        rest = self._total - self._num
-        seen = [seconds for each in self._seen.values() for seconds in each]
-        if not rest or not seen:
+    def left(self) -> str:
+        """At least so long where a job comes that has not run yet; nothing where none has run."""
+        means = self._means | {job: sum(each) / len(each) for job, each in self._seen.items()}
+        known = Counter({job: count for job, count in self._left.items() if count and job in means})
+        if not known:
             return ""
-        seconds = rest * sum(seen) / len(seen) / min(self._slots, rest)
-        return f", about {duration(seconds)} left"
+        seconds = sum(count * means[job] for job, count in known.items()) / min(self._slots, known.total())
+        return f", {'about' if len(known) == len(+self._left) else 'over'} {duration(seconds)} left"
 
 
 def _end_of(future: "Future[End]") -> End:

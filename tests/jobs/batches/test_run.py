@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.jobs.batches.batch import verdict_of_runs
-from splatctrl_cli.jobs.batches.ledger import Ledger
-from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED
+from splatctrl_cli.jobs.batches.ledger import Ledger, Run
+from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Clock
 from splatctrl_cli.jobs.batches.task import End, Task, run_task, stop_runners
 from tests.jobs.batches.desk import ENTRY, batch_of, node, states
 
@@ -204,3 +204,20 @@ def test_a_runner_that_was_stopped_is_not_replaced(tmp_path: Path) -> None:
     thread.join(30)
     assert [end.cause for end in ends] == ["ended with its batch"]
     assert count(begun) == 1
+
+
+def test_the_time_left_is_that_of_the_jobs_that_are_left(tmp_path: Path) -> None:
+    names = ("a/check", "b/check", "b/fit", "c/check", "c/bake")
+    clock = Clock([node(tmp_path, name) for name in names], {"bake": 100.0}, slots=1)
+
+    def ended(name: str, seconds: float, *, state: str = DONE, before: float = 0.0) -> str:
+        recording, job = name.split("/")
+        at = clock.started + 1 - before
+        run = Run(node=name, recording=recording, job=job, command=job, key="", state=state, expect="passed")
+        return clock.passed(replace(run, seconds=seconds, started=at)) + clock.left()
+
+    assert ended("a/check", 30.0, before=60) == "[1/5], over 2 min left", "one that stands says nothing of checks"
+    assert ended("b/check", 2.0) == "[2/5], over 2 min left", "no fit was ever timed"
+    assert ended("b/fit", 50.0) == "[3/5], about 2 min left"
+    assert ended("c/bake", 0.0, state=SKIPPED) == "[4/5], about 2 s left"
+    assert ended("c/check", 4.0) == "[5/5]"
