@@ -2,7 +2,8 @@
 
 import itertools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -153,7 +154,8 @@ def _nodes_of(
                 continue
             for chosen in _combinations(job.matrix):
                 own = {f"{job.name}.{option}": value for option, value in chosen.items()}
-                node = _node(recording, job, chosen, {**inherited, **own}, before, out)
+                variant = {**inherited, **own}
+                node = _node(recording, job, variant, _suffix(variant, (each for each, _ in jobs)), before, out)
                 values: dict[str, Any] = {each.job: str(each.out) for each in before}
                 values |= {RECORDING: [str(path) for path in recording.paths], NAME: recording.name}
                 options = _placed(_merged(job.options, chosen), values.__getitem__)
@@ -170,11 +172,44 @@ def _nodes_of(
     return nodes
 
 
-def _node(
-    recording: Recording, job: Job, chosen: Variant, variant: Variant, before: Sequence[Node], out: Path
-) -> Node:
-    prefix = {key: value for key, value in variant.items() if not key.startswith(f"{job.name}.")} | dict(chosen)
-    suffix = "".join(f"+{option}={value}" for option, value in prefix.items())
+def _short(values: Sequence[Any]) -> list[str]:
+    """The values of a matrix in names: of paths only what is not the same in all."""
+    parts = [_text(value).strip("/").split("/") for value in values]
+    least = min(map(len, parts)) - 1
+    first = min(_num_alike(parts), least)
+    last = min(_num_alike([each[::-1] for each in parts]), least - first)
+    return ["/".join(each[first : len(each) - last]) for each in parts]
+
+
+def _num_alike(lists: Sequence[Sequence[str]]) -> int:
+    """How many of their first elements all lists share."""
+    return sum(1 for _ in itertools.takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False)))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return ",".join(map(_text, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _suffix(variant: Variant, jobs: Iterable[Job]) -> str:
+    """What matrices chose, in a name: each option, with its job where two jobs have it."""
+    chosen = {
+        f"{job.name}.{option}": (option.removeprefix("set."), values)
+        for job in jobs
+        for option, values in job.matrix.items()
+        if f"{job.name}.{option}" in variant
+    }
+    count = Counter(option for option, _ in chosen.values())
+    found = ""
+    for key, value in variant.items():
+        option, values = chosen[key]
+        text = next(text for each, text in zip(values, _short(values), strict=True) if each is value)
+        found += f"+{option if count[option] == 1 else key}={text}"
+    return found
+
+
+def _node(recording: Recording, job: Job, variant: Variant, suffix: str, before: Sequence[Node], out: Path) -> Node:
     place = re.sub(r"[^\w.+=-]", "_", job.name + suffix)[:_LONGEST]
     ending = ENDINGS.get(job.command, "")
     return Node(

@@ -58,9 +58,31 @@ def test_a_matrix_makes_variants_that_go_on_in_what_needs_them(tmp_path: Path) -
         for n in of["sdf-bake"]
         if dict(n.variant) == {"reconstruct.max-splats": 100, "reconstruct.set.scene.window": 4}
     )
-    assert bake.name == "a/sdf-bake+reconstruct.max-splats=100+reconstruct.set.scene.window=4"
+    assert bake.name == "a/sdf-bake+max-splats=100+scene.window=4"
     assert options(of["replay"][0])["--field"].endswith(of["replay"][0].needs[0])
     assert "--scene" not in options(of["replay"][0])
+
+
+def test_the_names_of_variants_say_only_what_differs(tmp_path: Path) -> None:
+    (tmp_path / "arms/b").mkdir(parents=True)
+    (tmp_path / "arms/a").mkdir()
+    for place in ("a/panda.urdf", "b/panda.urdf", "a/wrist.yaml", "b/coarse.yaml"):
+        (tmp_path / "arms" / place).touch()
+    jobs = """
+[jobs.scene]
+command = "reconstruct"
+matrix = { cameras = [["cam0"], ["cam0", "cam1"]], "set.scene.max_splats" = [100] }
+[jobs.audit]
+command = "replay"
+matrix = { urdf = ["arms/a/panda.urdf", "arms/b/panda.urdf"], spheres = ["arms/a/wrist.yaml", "arms/b/coarse.yaml"] }
+"""
+    found = [n.name for n in nodes(tmp_path, "[[recordings]]\npaths = ['a.mcap']\n" + jobs) if n.job == "audit"]
+    assert found[0] == "a/audit+cameras=cam0+scene.max_splats=100+urdf=a+spheres=a_wrist.yaml"
+    assert found[-1] == "a/audit+cameras=cam0_cam1+scene.max_splats=100+urdf=b+spheres=b_coarse.yaml"
+    seeds = "matrix = { seed = [1, 2] }\n"
+    both = f"[jobs.scene]\ncommand = 'reconstruct'\n{seeds}[jobs.sdf-bake]\n{seeds}"
+    found = [n.name for n in nodes(tmp_path, RECORDINGS + both)]
+    assert "a/scene+seed=1" in found and "a/sdf-bake+scene.seed=1+sdf-bake.seed=2" in found
 
 
 def test_a_recording_may_have_a_job_otherwise_or_not_at_all(tmp_path: Path) -> None:
