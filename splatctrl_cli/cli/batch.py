@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.batches.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batches.graph import Parsed
+from splatctrl_cli.jobs.batches.graph import Parsed, columns_of
 from splatctrl_cli.jobs.batches.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batches.suite import Table
@@ -157,13 +157,13 @@ def _text(value: Any) -> str:
 
 def _lines(result: BatchResult) -> Iterator[str]:
     """A row for each recording, a column for each job and variant."""
-    runs = {tuple(run.node.split("/", 1)): run for run in result.runs}
-    jobs = list(dict.fromkeys(job for _, job in runs))
+    runs = {(run.recording, run.node.removeprefix(f"{run.recording}/")): run for run in result.runs}
+    columns = columns_of(((run.job, column) for (_, column), run in runs.items()), result.jobs)
     rows = [
-        [recording, *(_cell(runs.get((recording, job))) for job in jobs)]
+        [recording, *(_cell(runs.get((recording, column))) for column in columns)]
         for recording in dict.fromkeys(recording for recording, _ in runs)
     ]
-    yield from table(("recording", *jobs), rows)
+    yield from table(("recording", *columns), rows)
     yield ""
     yield f"{len(result.runs) - result.num_kept} run, {result.num_kept} as before; wrote {result.out / 'batch.json'}"
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from splatctrl_cli.errors import InputError, SplatCtrlError
 from splatctrl_cli.files.output import output_path
+from splatctrl_cli.jobs.batches.graph import columns_of
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reports.batch_folder import AS_EXPECTED, BatchFolder, Node, is_batch, open_batch
 from splatctrl_cli.jobs.reports.changes import table_of_changes
@@ -153,7 +154,7 @@ def _of_batch(request: WriteReportRequest, batch: BatchFolder, changes: Table, p
         tables=[
             *([changes] if changes.rows else []),
             *([_list("Not as expected", unexpected, linked)] if unexpected else []),
-            _matrix(jobs, linked),
+            _matrix(batch, jobs, linked),
             replace(_list("All jobs, with time and memory", jobs, linked), is_folded=True),
         ],
         runs=sections,
@@ -218,11 +219,11 @@ def _section(
         return replace(section, no_space=f"not in 3-D: {error}")
 
 
-def _matrix(jobs: Sequence[_Job], linked: set[str]) -> Table:
+def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> Table:
     """A row for each recording, those with the worst jobs first, and a column for each job and variant."""
     nodes = {(job.node.recording, job.node.column): job.node for job in jobs}
     recordings = dict.fromkeys(job.node.recording for job in jobs)
-    names = sorted({job.node.column for job in jobs})
+    names = columns_of(((node.job, node.column) for node in batch.nodes), batch.jobs)
     rows = [
         Row(cells=[recording, *(_cell(nodes.get((recording, name)), linked) for name in names)])
         for recording in recordings

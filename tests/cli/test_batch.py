@@ -101,3 +101,49 @@ def test_ci_is_told_a_suite_for_each_recording(tmp_path: Path, capsys: pytest.Ca
     assert found["good"]["good/ingest"].time > 0.0
     joined, _ = xunitparserx.parse(str(junit))
     assert joined.properties["batch"] == "two logs"
+
+
+def test_what_a_page_reads_is_the_suite_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
+    (tmp_path / "damaged.mcap").write_bytes(b"not a log")
+
+    def states(text: str, code: int) -> dict[str, str]:
+        suite.write_text(text)
+        assert main(["batch", str(suite), "-q", "--workers", "1"]) == code
+        capsys.readouterr()
+        nodes = json.loads((out / "batch.json").read_text())["nodes"]
+        return {node["id"]: node["state"] for node in nodes}
+
+    before = states(SUITE, 1)
+    assert list(before) == ["damaged/info", "damaged/ingest", "good/info", "good/ingest"]
+    expected = SUITE.replace("[jobs.info]\n", "[recordings.jobs.ingest]\nexpect = 'exit 4'\n[jobs.info]\n")
+    assert set(states(expected, 0).values()) == {"done"}, "the last run is judged by what is expected now"
+    assert main(["batch", str(suite), "--failed", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["nodes"] == []
+    jobs = SUITE[SUITE.index("[jobs.info]") :]
+    fewer = states(f'[[recordings]]\nname = "good"\npaths = ["{LOG}"]\n{jobs}', 0)
+    assert fewer == {"good/info": "done", "good/ingest": "done"}, "what is no longer in the suite is not told"
+
+
+def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite, out = tmp_path / "nightly.toml", tmp_path / "nightly.out"
+    suite.write_text(f'[[recordings]]\nname = "good"\npaths = ["{LOG}"]\n[jobs.info]\n[jobs.check]\nquick = 3\n')
+    suite.write_text(suite.read_text() + "[jobs.look]\ncommand = 'check'\nquick = 3\n")
+    assert main(["batch", str(suite), "-q"]) == 0
+    suite.write_text(suite.read_text().replace("quick = 3", "quick = 4"))
+
+    def interrupted(console: object, line: str) -> None:
+        if "good/check" in line:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("splatctrl_cli.cli.common.Console.log", interrupted)
+        assert main(["batch", str(suite), "--workers", "1"]) == 130
+    assert "interrupted; run the same again to go on" in capsys.readouterr().err
+    nodes = json.loads((out / "batch.json").read_text())["nodes"]
+    assert [node["state"] for node in nodes] == ["done", "done", "to do"]
+    assert main(["report", str(out), "-o", str(tmp_path / "page.html")]) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert "1 of 3 jobs not as expected; first good/look: has not run since" in page

@@ -174,7 +174,7 @@ def batch(run: Runs, tmp_path: Path) -> Path:
         node |= {key: verdict[key] for key in ("outcome", "label", "sentence", "exit_code")}
         state = "failed" if number == 2 else "done"
         nodes.append(node | {"state": state, "expect": "passed" if number == 2 else "failed"})
-    document = {"format": "splatctrl-batch", "version": 1, "suite": "desk", "nodes": nodes}
+    document = {"format": "splatctrl-batch", "version": 1, "suite": "desk", "jobs": ["audit"], "nodes": nodes}
     (folder / "batch.json").write_text(json.dumps(document))
     return folder
 

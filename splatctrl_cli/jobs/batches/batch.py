@@ -1,7 +1,7 @@
 """A batch from its request to its verdict: read the suite, run its graph, write batch.json."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -13,10 +13,20 @@ from splatctrl_cli import __version__
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.files.output import write_durably, write_json
-from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of
+from splatctrl_cli.jobs.batches.graph import COMMANDS, CommandLine, Node, nodes_of, of_shard
 from splatctrl_cli.jobs.batches.keys import keys_of
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
-from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Scheduler, local_executor, told, verdict_in
+from splatctrl_cli.jobs.batches.run import (
+    DONE,
+    ERROR,
+    FAILED,
+    SKIPPED,
+    Scheduler,
+    local_executor,
+    to_do,
+    told,
+    verdict_in,
+)
 from splatctrl_cli.jobs.batches.suite import Suite as Asked
 from splatctrl_cli.jobs.batches.suite import read_suite
 from splatctrl_cli.jobs.batches.task import last_lines
@@ -45,10 +55,11 @@ class BatchRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchResult:
-    """The run of every node, in the order of the graph; num_kept of them stood from before."""
+    """The run of every node, in the order of the graph; num_kept of them stood from before. jobs: the suite's."""
 
     out: Path
     suite: str
+    jobs: Sequence[str]
     runs: Sequence[Run]
     num_kept: int
     verdict: Verdict
@@ -56,7 +67,8 @@ class BatchResult:
 
 def batch(request: BatchRequest, command_line: CommandLine, progress: Progress = SILENT) -> BatchResult:
     """Run what is not done. Raises UsageError for a suite that makes no graph, InputError for files that lack."""
-    suite, nodes, out = planned(request, command_line)
+    suite, every, out = planned(request, command_line)
+    nodes = of_shard(every, request.shard)
     with Ledger(out) as ledger, _executor(request) as (executor, slots):
         scheduler = Scheduler(
             ledger=ledger,
@@ -69,20 +81,29 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
         progress.log(f"batch: {_counted(len(nodes), 'node')} into {out}")
         try:
             runs = list(scheduler.run(nodes).values())
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("interrupted; run the same again to go on") from None
         finally:
-            write_batch(out, suite.name, ledger.latest().values())
-    verdict = verdict_of_runs(runs)
-    return BatchResult(out=out, suite=suite.name, runs=runs, num_kept=scheduler.num_kept, verdict=verdict)
+            if scheduler.keys:  # it knows what each node is to be
+                write_batch(out, suite, every, ledger.latest(), scheduler.keys)
+    return BatchResult(
+        out=out,
+        suite=suite.name,
+        jobs=[job.name for job in suite.jobs],
+        runs=runs,
+        num_kept=scheduler.num_kept,
+        verdict=verdict_of_runs(runs),
+    )
 
 
 def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, list[Node], Path]:
-    """The suite, its nodes after those they need, and where they write."""
+    """The suite, its nodes of every shard after those they need, and where they write. Raises UsageError for a shard
+    without a recording.
+    """
     suite = read_suite(request.suite, COMMANDS)
     out = (request.out or suite.out).absolute()
-    nodes = nodes_of(suite, out, command_line, request.shard)
-    if not nodes:
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("interrupted; run the same again to go on") from None
+    nodes = nodes_of(suite, out, command_line)
+    if not of_shard(nodes, request.shard):
         index, count = request.shard
         raise UsageError(
             f"--shard {index}/{count}: has none of the {len(suite.recordings)} recordings", remedy="give fewer shards"
@@ -92,7 +113,8 @@ def planned(request: BatchRequest, command_line: CommandLine) -> tuple[Asked, li
 
 def dry_run(request: BatchRequest, command_line: CommandLine) -> list[tuple[Node, str]]:
     """Every node and whether it would run; nothing is written but a ledger's digests."""
-    _, nodes, out = planned(request, command_line)
+    _, every, out = planned(request, command_line)
+    nodes = of_shard(every, request.shard)
     with Ledger(out) as ledger:
         keys, latest = keys_of(nodes, ledger, command_line.entry), ledger.latest()
     is_kept = {
@@ -168,9 +190,26 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
     return cases_of(verdict, run.node, expected=run.outcome)
 
 
-def write_batch(out: Path, suite: str, runs: Any) -> None:
-    """batch.json: the last state of every node."""
-    document = {"format": FORMAT, "version": VERSION, "suite": suite, "nodes": [node_document(run) for run in runs]}
+def write_batch(
+    out: Path, suite: Asked, nodes: Sequence[Node], latest: Mapping[str, Run], keys: Mapping[str, str]
+) -> None:
+    """batch.json: the state of every node that has a key, and the last of each other (of another shard) that has run.
+
+    A node that was not come to is to do.
+    """
+    found = list[Run]()
+    for node in nodes:
+        run = latest.get(node.name)
+        if node.name in keys and (run is None or run.key != keys[node.name]):
+            run = to_do(node, out)
+        found += [] if run is None else [run]
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "suite": suite.name,
+        "jobs": [job.name for job in suite.jobs],
+        "nodes": [node_document(run) for run in found],
+    }
     write_durably(out / "batch.json", lambda path: write_json(path, document))
 
 

@@ -72,18 +72,30 @@ class Node:
     limits: Limits = field(default_factory=Limits)
 
 
-def nodes_of(suite: Suite, out: Path, command_line: CommandLine, shard: tuple[int, int] = (1, 1)) -> list[Node]:
-    """Every node of the recordings of a shard (i of n), each after those it needs.
+def nodes_of(suite: Suite, out: Path, command_line: CommandLine) -> list[Node]:
+    """Every node, by recording in the order of the suite's jobs as far as each comes after those it needs.
 
     Raises UsageError for jobs that need each other, placeholders without a job, and options that a command lacks.
     """
-    index, count = shard
     nodes: list[Node] = []
-    for recording in sorted(suite.recordings, key=lambda each: each.name)[index - 1 :: count]:
+    for recording in sorted(suite.recordings, key=lambda each: each.name):
         jobs = jobs_for(recording, suite.jobs, COMMANDS)
         kept = {job.name: _with_roles(job, jobs, recording) for job in jobs}
         nodes += _nodes_of(recording, _in_order(kept, recording), suite.folder, out, command_line)
     return nodes
+
+
+def of_shard(nodes: Sequence[Node], shard: tuple[int, int]) -> list[Node]:
+    """Those of every n-th recording from the i-th on."""
+    index, count = shard
+    chosen = set(list(dict.fromkeys(node.recording for node in nodes))[index - 1 :: count])
+    return [node for node in nodes if node.recording in chosen]
+
+
+def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[str]:
+    """Of a table of nodes, from the job and the name of each: once each, by job, then as they come."""
+    job_of = {name: job for job, name in columns}
+    return sorted(job_of, key=lambda name: jobs.index(job_of[name]) if job_of[name] in jobs else len(jobs))
 
 
 def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
@@ -112,9 +124,19 @@ def _in_order(jobs: Mapping[str, Job], recording: Recording) -> list[tuple[Job, 
     """Jobs with the names of those that they need, which come first."""
     needs = {name: _needs(job, jobs, recording) for name, job in jobs.items()}
     try:
-        return [(jobs[name], needs[name]) for name in TopologicalSorter(needs).static_order()]
+        TopologicalSorter(needs).prepare()
     except CycleError as error:
         raise UsageError(f"[jobs]: {' needs '.join(error.args[1][::-1])}", remedy="break the circle") from None
+    ordered: dict[str, None] = {}
+
+    def add(name: str) -> None:
+        for need in needs[name]:
+            add(need)
+        ordered.setdefault(name)
+
+    for name in jobs:
+        add(name)
+    return [(jobs[name], needs[name]) for name in ordered]
 
 
 def _needs(job: Job, jobs: Mapping[str, Job], recording: Recording) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from splatctrl_cli.jobs.batches.ledger import Ledger, Run
 from splatctrl_cli.jobs.batches.task import End, Task, last_lines, read_end, run_task, stamp_of, stop_runners
 from splatctrl_cli.jobs.progress import Progress, duration
 
-DONE, FAILED, ERROR, SKIPPED = "done", "failed", "error", "skipped"
+DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
 NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
 AGAIN_S = 0.5  # between looks at what another batch runs
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
@@ -39,12 +39,14 @@ class Scheduler:
     slots: int
     progress: Progress
     again: bool = False
+    keys: dict[str, str] = field(default_factory=dict)
     runs: dict[str, Run] = field(default_factory=dict)
     num_kept: int = 0
 
     def run(self, nodes: Sequence[Node]) -> dict[str, Run]:
         """The run of each node, by its name: the one that stands from before, or a new one."""
         keys, latest = keys_of(nodes, self.ledger, self.entry), self.ledger.latest()
+        self.keys = keys
         waiting = {node.name: node for node in nodes}
         futures: dict[Future[End], Node] = {}
         tries: Counter[str] = Counter()
@@ -98,7 +100,10 @@ class Scheduler:
             return None
         if before is not None and before.key == key and before.state in (DONE, FAILED) and _stands(node, before):
             self.num_kept += 1
-            return _judged_again(before, node)
+            judged = _judged_again(before, node)
+            if judged != before:
+                self.ledger.record(judged)
+            return judged
         end = read_end(Path(self._place(node, ".end")), key)
         if end is None or end.exit_code is None or (before is not None and end.started <= before.started):
             return None
@@ -265,3 +270,9 @@ def verdict_in(result: Path) -> dict[str, Any]:
 def _skipped(node: Node, key: str, need: str, folder: Path) -> Run:
     end = End.without_one(key, f"needs {need}, which left nothing")
     return replace(run_of(node, key, end, folder), state=SKIPPED)
+
+
+def to_do(node: Node, folder: Path) -> Run:
+    """Of a node that has not run as it is now."""
+    end = End.without_one("", "has not run since the suite, its inputs or the program changed")
+    return replace(run_of(node, "", end, folder), state=TO_DO)

@@ -48,10 +48,11 @@ class Node:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchFolder:
-    """A batch and its jobs."""
+    """A batch and its nodes; jobs: the names of the suite's, in its order."""
 
     path: Path
     suite: str
+    jobs: tuple[str, ...]
     nodes: tuple[Node, ...]
 
     def inside(self, name: str) -> Path:
@@ -74,6 +75,7 @@ def open_batch(path: Path) -> BatchFolder:
         if batch["format"] != FORMAT:
             raise ValueError(f"format {batch['format']}")
         version, suite, nodes = int(batch["version"]), str(batch["suite"]), batch["nodes"]
+        jobs = tuple(map(str, batch["jobs"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: expected what batch writes: {error!r}", remedy="run the batch again") from None
     if version > VERSION:
@@ -83,4 +85,4 @@ def open_batch(path: Path) -> BatchFolder:
         made = tuple(Node(**{key: value for key, value in node.items() if key in known}) for node in nodes)
     except (TypeError, AttributeError) as error:
         raise InputError(f"{file}: nodes: {error}", remedy="run the batch again") from None
-    return BatchFolder(path=path, suite=suite, nodes=made)
+    return BatchFolder(path=path, suite=suite, jobs=jobs, nodes=made)

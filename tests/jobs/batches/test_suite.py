@@ -6,7 +6,7 @@ import pytest
 
 from splatctrl_cli.cli.batch import OfThisProgram
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.jobs.batches.graph import COMMANDS, Node, nodes_of
+from splatctrl_cli.jobs.batches.graph import COMMANDS, Node, columns_of, nodes_of, of_shard
 from splatctrl_cli.jobs.batches.suite import Limits, read_suite
 
 RECORDINGS = '[[recordings]]\npaths = ["*.mcap"]\n'
@@ -19,7 +19,7 @@ def nodes(folder: Path, text: str, shard: tuple[int, int] = (1, 1)) -> list[Node
         (folder / name).touch()
     (folder / "suite.toml").write_text(text)
     suite = read_suite(folder / "suite.toml", COMMANDS)
-    return nodes_of(suite, folder / "out", OfThisProgram(threads=1), shard)
+    return of_shard(nodes_of(suite, folder / "out", OfThisProgram(threads=1)), shard)
 
 
 def options(node: Node) -> dict[str, str]:
@@ -61,6 +61,16 @@ def test_a_matrix_makes_variants_that_go_on_in_what_needs_them(tmp_path: Path) -
     assert bake.name == "a/sdf-bake+max-splats=100+scene.window=4"
     assert options(of["replay"][0])["--field"].endswith(of["replay"][0].needs[0])
     assert "--scene" not in options(of["replay"][0])
+
+
+def test_nodes_and_columns_come_in_the_order_of_the_suite(tmp_path: Path) -> None:
+    jobs = f"[jobs.audit]\ncommand = 'replay'\n{ROBOT}[jobs.scene]\ncommand = 'reconstruct'\n"
+    found = nodes(tmp_path, RECORDINGS + jobs + "[jobs.ingest]\n[jobs.check]\n")
+    assert [node.name for node in found[:4]] == ["a/ingest", "a/scene", "a/audit", "a/check"]
+    few = "[[recordings]]\npaths = ['a.mcap']\nonly = ['check']\n[[recordings]]\npaths = ['b.mcap']\n"
+    found = nodes(tmp_path, few + "[jobs.ingest]\n[jobs.check]\nmatrix = { quick = [10, 9] }\n")
+    columns = columns_of(((node.job, node.name.split("/")[1]) for node in found), ["ingest", "check"])
+    assert columns == ["ingest", "check+quick=10", "check+quick=9"]
 
 
 def test_the_names_of_variants_say_only_what_differs(tmp_path: Path) -> None:
