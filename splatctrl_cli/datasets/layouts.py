@@ -4,6 +4,7 @@ from pathlib import Path
 
 from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.containers.log_formats import SUFFIXES, is_bag_folder
+from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.datasets.layout import Layout
 from splatctrl_cli.errors import InputError
@@ -32,6 +33,11 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
     """The records of a dataset's folder. Raises InputError where it has no layout that is known."""
     check_not_partial(folder)
     layout = layout_of(folder)
+    if layout is None and ((folder / "Rectified").is_dir() or idr_scans(folder)):
+        raise InputError(
+            f"{folder}: a DTU data set, which only reconstruct and score read",
+            remedy='give it as --dtu (in a suite dtu = "{recording}")',
+        )
     if layout is None:
         names = ", ".join(known.name for known in LAYOUTS)
         inside = readable_in(folder)

@@ -17,6 +17,7 @@ from splatctrl_cli.evaluate.protocols import score_protocol
 from splatctrl_cli.files.pfm import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
 from splatctrl_cli.records import Intrinsics, RgbdFrame
+from splatctrl_cli.sources.source import open_source
 
 K = Intrinsics(fx=61.0, fy=62.0, cx=32.5, cy=23.0, width=64, height=48)
 IMAGES, DEPTHS = "Rectified/scan7_train", "Depths_raw/scan7"
@@ -87,6 +88,12 @@ def test_a_written_scan_reads_back(scan: Path, idr: Path, layout: str) -> None:
     assert read(root, "scan7").name == "scan7"
     with pytest.raises(InputError, match="no scan 'scan9'; give --scan, one of: scan7"):
         read(root, "scan9")
+
+
+@pytest.mark.parametrize("layout", ["scan", "idr"])
+def test_a_scan_that_is_given_as_a_recording_names_its_option(request: pytest.FixtureRequest, layout: str) -> None:
+    with pytest.raises(InputError, match=r"a DTU data set, .*; give it as --dtu \(in a suite dtu = "):
+        open_source(request.getfixturevalue(layout))
 
 
 def test_camera_files_hold_world_to_camera_in_millimetres_and_pairs_the_nearest_first(scan: Path) -> None:
