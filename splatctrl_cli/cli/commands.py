@@ -332,7 +332,7 @@ COMMANDS = {
     ),
     "report": Command(
         summary="write one HTML file on a run or a batch, with scenes in 3-D",
-        examples=("report out/audit", "report out/batch --changes changes.json -o report.html"),
+        examples=("report out/audit", "report out/batch --against baseline.toml -o report.html"),
         run="report:run",
         options=report_options,
     ),

@@ -14,8 +14,8 @@ def report_options(add: Options, parser: Parser) -> None:
     add("PATH", "the folder of a run, or of a batch", Path)
     add_output(add, "HTML file to write", default="PATH.html, beside PATH")
     add(
-        "--changes FILE.json",
-        "what changed: the output of compare --json, or a JSON list of objects, a row each (docs/report.md)",
+        "--against BEFORE",
+        "say what changed since an earlier run or batch, or a baseline of compare --update-baseline",
         Path,
     )
     add("--all-scenes", "of a batch, every replay in 3-D, not only the failed, changed and worst")

@@ -11,7 +11,7 @@ from splatctrl_cli.files.output import output_path
 from splatctrl_cli.jobs.batches.graph import columns_of
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reports.batch_folder import AS_EXPECTED, BatchFolder, Node, is_batch, open_batch
-from splatctrl_cli.jobs.reports.changes import table_of_changes
+from splatctrl_cli.jobs.reports.changes import changes_since
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, open_run
 from splatctrl_cli.jobs.reports.sections import section_of
 from splatctrl_cli.jobs.reports.spaces import space_of_run
@@ -28,15 +28,14 @@ WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
 class WriteReportRequest:
     """A report on `path`, the folder of a run or of a batch, into the HTML file `out`, None for PATH.html.
 
-    changes: what `compare` prints with --json, or a JSON list of objects, a row each, of what differs; an `id` names
-    a job of the batch.
+    against: an earlier run or batch, or a stored baseline, since which it says what changed.
     roots: folders in which the scenes and robots of the runs' command lines are looked for. all_scenes: of a batch,
     every scene in 3-D and not only the failed, changed and worst.
     """
 
     path: Path
     out: Path | None = None
-    changes: Path | None = None
+    against: Path | None = None
     roots: tuple[Path, ...] = ()
     all_scenes: bool = False
     force: bool = False
@@ -59,13 +58,12 @@ class WriteReportResult:
 
 def write_report(request: WriteReportRequest, progress: Progress = SILENT) -> WriteReportResult:
     """Write the page. Raises InputError for a folder that is no run and no batch, that is not whole, or that a newer
-    version wrote.
+    version wrote, and for `against` what cannot be compared with it.
     """
-    changes = table_of_changes(request.changes)
     if is_batch(request.path):
-        page = _of_batch(request, open_batch(request.path), changes, progress)
+        page = _of_batch(request, open_batch(request.path), progress)
     else:
-        page = _of_run(request, open_run(request.path), changes)
+        page = _of_run(request, open_run(request.path))
     out = request.out or beside(request.path)
     with output_path(out, force=request.force, is_folder=False) as partial:
         partial.write_text(rendered(page), encoding="utf-8")
@@ -85,7 +83,7 @@ def beside(path: Path) -> Path:
     return place.with_name(f"{place.stem if place.is_file() else place.name}.html")
 
 
-def _of_run(request: WriteReportRequest, run: RunFolder, changes: Table) -> Page:
+def _of_run(request: WriteReportRequest, run: RunFolder) -> Page:
     section, scenes = section_of(run, anchor="run", title=run.path.absolute().name), {}
     if run.command in WITH_SPACE:
         try:
@@ -97,7 +95,7 @@ def _of_run(request: WriteReportRequest, run: RunFolder, changes: Table) -> Page
         title=f"{run.command} {run.path.absolute().name}",
         state=section.state,
         sentence=section.sentence,
-        tables=[changes] if changes.rows else [],
+        tables=changes_since(request.against, request.path, has_links=False)[0],
         runs=[replace(section, title="", sentence="")],
         scenes=scenes,
         opens=True,
@@ -133,8 +131,8 @@ class _Job:
         )
 
 
-def _of_batch(request: WriteReportRequest, batch: BatchFolder, changes: Table, progress: Progress) -> Page:
-    changed = {cell.link for row in changes.rows for cell in row.cells if isinstance(cell, Cell)}
+def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
+    changes, changed = changes_since(request.against, request.path, has_links=True)
     jobs = sorted((_job(batch, node, node.id in changed) for node in batch.nodes), key=lambda job: job.order)
     told = [job for job in jobs if _is_told(job)]
     wanted = [job for job in told if job.run is not None and job.run.command == REPLAY]
@@ -152,7 +150,7 @@ def _of_batch(request: WriteReportRequest, batch: BatchFolder, changes: Table, p
         sentence=_sentence(jobs, unexpected),
         lines=[_versions(batch)],
         tables=[
-            *([changes] if changes.rows else []),
+            *changes,
             *([_list("Not as expected", unexpected, linked)] if unexpected else []),
             _matrix(batch, jobs, linked),
             replace(_list("All jobs, with time and memory", jobs, linked), is_folded=True),

@@ -179,10 +179,20 @@ def batch(run: Runs, tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_batch_begins_with_what_is_not_as_expected(batch: Path, tmp_path: Path) -> None:
-    changes = tmp_path / "changes.json"
-    changes.write_text(json.dumps([{"id": "rec7/audit", "before": 0.05, "now": 0.01}]))
-    page = reported(batch, changes=changes)
+@pytest.fixture
+def before(batch: Path, tmp_path: Path) -> Path:
+    """The batch as it was before the seventh replay came nearer, and the eighth kept further off."""
+    shutil.copytree(batch, tmp_path / "before")
+    for number, clearance in ((7, -0.9), (8, 0.9)):
+        metrics = {"min_clearance": clearance}
+        patch_json(
+            batch / f"rec{number}/audit/run.json", lambda run, new=metrics: run | {"metrics": run["metrics"] | new}
+        )
+    return tmp_path / "before"
+
+
+def test_a_batch_begins_with_what_is_not_as_expected(batch: Path, before: Path) -> None:
+    page = reported(batch, against=before)
     sections = re.findall(r'<section id="([^"]+)"', page)
     assert sections[:3] == ["rec2/audit", "rec3/audit", "rec7/audit"]
     assert len(sections) == 10
@@ -224,17 +234,25 @@ def test_a_job_that_leads_out_of_its_batch_is_not_read(batch: Path) -> None:
     assert "expected a path in the batch" in reported(batch)
 
 
-def test_what_compare_prints_is_taken_for_the_changes(batch: Path, tmp_path: Path) -> None:
-    before = tmp_path / "before"
-    shutil.copytree(batch, before)
-    patch_json(batch / "rec7/audit/run.json", lambda run: run | {"metrics": run["metrics"] | {"min_clearance": -0.9}})
+def test_a_report_says_what_changed_since_a_batch_or_a_baseline(batch: Path, before: Path, tmp_path: Path) -> None:
+    for folder in (batch, before):  # as few recordings as are judged one by one
+        patch_json(folder / "batch.json", lambda f: f | {"nodes": [f["nodes"][k] for k in (2, 7, 8)]})
     patch_json(batch / "batch.json", lambda f: f | {"nodes": [_as_expected(node) for node in f["nodes"]]})
-    found = compare(CompareRequest(runs=(before, batch))).as_dict()
-    (tmp_path / "changes.json").write_text(json.dumps(found))
-    page = reported(batch, changes=tmp_path / "changes.json")
-    table = page[page.index("What changed") : page.index("Not as expected")]
+    page = reported(batch, against=before)
+    table, better = page[page.index("What changed") : page.index("<h2>Recordings")].split("<details>")
     assert re.findall(r'href="#([^"]+)"', table) == ["rec2/audit", "rec7/audit"]
-    assert "min_clearance" in table and "state " in table
+    assert "compare: REGRESSION" in table and "min_clearance" in table and "state " in table
+    assert re.findall(r'href="#([^"]+)"', better) == ["rec8/audit"]
+    compare(CompareRequest(runs=(before,), update_baseline=tmp_path / "baseline.toml"))
+    against = reported(batch, against=tmp_path / "baseline.toml")
+    assert re.findall(r'<tr class="failed">.*', against) == re.findall(r'<tr class="failed">.*', page)
+
+
+def test_a_report_says_that_nothing_changed(run: Runs) -> None:
+    folder = run()
+    page = reported(folder, against=folder)
+    start = page.index("What changed")
+    assert "NO REGRESSION" in page[start : start + 200] and page.count("<h2>What changed") == 1
 
 
 def _as_expected(node: dict[str, Any]) -> dict[str, Any]:
@@ -267,11 +285,12 @@ def test_variants_have_a_column_each_and_what_only_prints_has_no_folder_to_miss(
     assert "expected a path in the batch" not in page
 
 
-@pytest.mark.parametrize("text", ["{}", '{"verdicts": [1], "figures": []}', "[1]", "no"])
-def test_changes_of_another_form_are_refused(run: Runs, tmp_path: Path, text: str) -> None:
-    (tmp_path / "changes.json").write_text(text)
-    with pytest.raises(InputError, match="changes"):
-        write_report(WriteReportRequest(path=run(), changes=tmp_path / "changes.json"))
+def test_a_report_against_what_cannot_be_compared_is_refused(run: Runs, batch: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.toml").write_text("a = 1")
+    audit = run(out="audit_2")
+    for before in (batch, tmp_path / "other.toml", tmp_path / "missing.toml"):
+        with pytest.raises(InputError, match=r"expected a|cannot be read"):
+            write_report(WriteReportRequest(path=audit, against=before))
 
 
 def test_a_page_without_webgl_says_so(run: Runs) -> None:
