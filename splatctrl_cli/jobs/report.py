@@ -13,15 +13,23 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reports.batch_folder import AS_EXPECTED, BatchFolder, Node, is_batch, open_batch
 from splatctrl_cli.jobs.reports.changes import changes_since
 from splatctrl_cli.jobs.reports.run_folder import REPLAY, RunFolder, open_run
-from splatctrl_cli.jobs.reports.sections import section_of
+from splatctrl_cli.jobs.reports.sections import PASSED, section_of
 from splatctrl_cli.jobs.reports.spaces import space_of_run
-from splatctrl_cli.report.page import Cell, Page, Row, RunSection, Table, rendered
+from splatctrl_cli.report.page import Cell, Page, Picture, Row, RunSection, Table, picture, rendered
 from splatctrl_cli.report.viewer import packed
 
 MOST_SCENES = 6  # of a batch, without `all_scenes`
 PICTURES = {True: (3, 800), False: (1, 640)}  # of a batch's run with and without a scene: how many, how wide [px]
 LOG_LINES = 12  # of a job that ended in an error
+MOST_ROWS = 40  # of recordings that are shown at once
+WITHOUT_A_RUN = ("skipped", "to do")  # states of jobs
 WITH_SPACE = ("replay", "reconstruct", "sdf-bake")
+MAP = "reconstruct"
+WITH_PICTURES = {  # by command: what is in a picture's name, and what it shows
+    "score": ("_best_worst", "photo, render and depth error of the best and the worst view"),
+    "sdf-bake": ("slices", "slices of the distance"),
+}
+MOST_PICTURES, PICTURE_WIDTH = 24, 560  # of recordings as expected: how many, how wide [px]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +127,7 @@ class _Job:
         return min((float(value) for value in values if isinstance(value, int | float)), default=math.inf)
 
     @property
-    def order(self) -> tuple[bool, bool, bool, float, str]:
+    def order(self) -> tuple[bool, bool, bool, float]:
         """Not as expected first, then changed, then not passed, then by clearance."""
         node = self.node
         return (
@@ -127,15 +135,15 @@ class _Job:
             not self.is_changed,
             node.outcome in ("passed", None),
             self.least,
-            node.id,
         )
 
 
 def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progress) -> Page:
     changes, changed = changes_since(request.against, request.path, has_links=True)
     jobs = sorted((_job(batch, node, node.id in changed) for node in batch.nodes), key=lambda job: job.order)
-    told = [job for job in jobs if _is_told(job)]
-    wanted = [job for job in told if job.run is not None and job.run.command == REPLAY]
+    replayed = {job.node.recording for job in jobs if job.node.command == REPLAY}
+    told = [job for job in jobs if _is_told(job, is_seen=request.all_scenes and job.node.recording not in replayed)]
+    wanted = [job for job in told if job.run is not None and job.run.command in WITH_SPACE]
     chosen = {job.node.id for job in (wanted if request.all_scenes else wanted[:MOST_SCENES])}
     scenes: dict[str, str] = {}
     sections = []
@@ -152,12 +160,28 @@ def _of_batch(request: WriteReportRequest, batch: BatchFolder, progress: Progres
         tables=[
             *changes,
             *([_list("Not as expected", unexpected, linked)] if unexpected else []),
-            _matrix(batch, jobs, linked),
+            *_matrix(batch, jobs, linked),
             replace(_list("All jobs, with time and memory", jobs, linked), is_folded=True),
         ],
         runs=sections,
+        pictures=_gallery(jobs, linked),
         scenes=scenes,
     )
+
+
+def _gallery(jobs: Sequence[_Job], linked: set[str]) -> list[Picture]:
+    """A picture of each recording without one in a section: of its score, else of its field."""
+    shown = {job.node.recording for job in jobs if job.node.id in linked and job.run is not None}
+    found = list[Picture]()
+    for command, (name, words) in WITH_PICTURES.items():
+        for job in jobs:
+            run, recording = job.run, job.node.recording
+            if run is None or run.command != command or recording in shown or len(found) == MOST_PICTURES:
+                continue
+            files = [path for path in run.pictures() if name in path.stem]
+            shown |= {recording} if files else set()
+            found += [picture(path, f"{job.node.id}: {words}", PICTURE_WIDTH) for path in files[:1]]
+    return found
 
 
 def _sentence(jobs: Sequence[_Job], unexpected: Sequence[_Job]) -> str:
@@ -182,8 +206,14 @@ def _job(batch: BatchFolder, node: Node, is_changed: bool) -> _Job:
         return _Job(node=node, run=None, why=str(error), is_changed=is_changed)
 
 
-def _is_told(job: _Job) -> bool:
-    """Replays, and whatever did not come out as expected or as before, have a section of their own."""
+def _is_told(job: _Job, *, is_seen: bool) -> bool:
+    """Replays, and whatever did not come out as expected or as before, have a section of their own; so has a map
+    that is to be seen.
+    """
+    if is_seen and job.node.command == MAP and job.run is not None:
+        return True
+    if job.node.state in WITHOUT_A_RUN:
+        return job.is_changed
     return job.node.command == REPLAY or job.node.state != AS_EXPECTED or job.is_changed
 
 
@@ -192,15 +222,13 @@ def _section(
 ) -> RunSection:
     node, run = job.node, job.run
     if run is None:
-        lines = [line for line in (node.cause, job.why) if line]
-        details = [_log(batch, node)]
         return RunSection(
             anchor=node.id,
             title=node.id,
             state=node.state,
-            sentence=node.sentence or node.state,
-            lines=lines,
-            details=details,
+            sentence=node.sentence or node.cause or node.state,
+            lines=[f"expected: {node.expect}", *([job.why] if job.why else [])],
+            details=[_log(batch, node)],
         )
     most, width = PICTURES[has_space]
     section = section_of(run, anchor=node.id, title=node.id, most_pictures=most, width=width)
@@ -208,7 +236,7 @@ def _section(
         lines = [f"expected: {node.expect}", *([node.cause] if node.cause else []), *section.lines]
         section = replace(section, state=node.state, lines=lines, details=[*section.details, _log(batch, node)])
     if not has_space:
-        hint = "not in 3-D: --all-scenes has it" if run.command == REPLAY else ""
+        hint = "not in 3-D: --all-scenes has it" if run.command in WITH_SPACE else ""
         return replace(section, no_space=hint)
     try:
         scenes[f"scene-{len(scenes)}"] = packed(space_of_run(run, (batch.path, *request.roots)))
@@ -217,7 +245,7 @@ def _section(
         return replace(section, no_space=f"not in 3-D: {error}")
 
 
-def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> Table:
+def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> list[Table]:
     """A row for each recording, those with the worst jobs first, and a column for each job and variant."""
     nodes = {(job.node.recording, job.node.column): job.node for job in jobs}
     recordings = dict.fromkeys(job.node.recording for job in jobs)
@@ -226,7 +254,9 @@ def _matrix(batch: BatchFolder, jobs: Sequence[_Job], linked: set[str]) -> Table
         Row(cells=[recording, *(_cell(nodes.get((recording, name)), linked) for name in names)])
         for recording in recordings
     ]
-    return Table(title="Recordings", header=("recording", *(name.replace("+", " +") for name in names)), rows=rows)
+    table = Table(title="Recordings", header=("recording", *(name.replace("+", " +") for name in names)))
+    more = replace(table, title=f"{len(rows) - MOST_ROWS} more recordings", rows=rows[MOST_ROWS:], is_folded=True)
+    return [replace(table, rows=rows[:MOST_ROWS]), *([more] if more.rows else [])]
 
 
 def _cell(node: Node | None, linked: set[str]) -> Cell:
@@ -234,7 +264,7 @@ def _cell(node: Node | None, linked: set[str]) -> Cell:
     if node is None:
         return Cell(text="-")
     state = node.outcome if node.state == AS_EXPECTED and node.outcome else node.state
-    is_expected = node.state == AS_EXPECTED and node.outcome not in ("passed", None)
+    is_expected = node.state == AS_EXPECTED and node.outcome != PASSED
     words = f"{node.label or node.state}{', as expected' if is_expected else ''}"
     return Cell(text=words, state="" if is_expected else state, link=node.id if node.id in linked else "")
 
@@ -246,7 +276,8 @@ def _list(title: str, jobs: Sequence[_Job], linked: set[str]) -> Table:
         name = Cell(text=node.id, link=node.id if node.id in linked else "")
         least = None if job.least == math.inf else round(1e3 * job.least, 1)
         words = node.sentence or node.cause
-        cells = (name, node.label or node.state, node.expect, least, words, node.seconds, node.peak_mb)
+        cost = (node.seconds or None, node.peak_mb or None)
+        cells = (name, node.label or node.state, node.expect, least, words, *cost)
         rows.append(Row(cells=cells, state=node.state))
     return Table(title=title, header=("job", "verdict", "expected", "least mm", "sentence", "s", "MB"), rows=rows)
 

@@ -75,7 +75,9 @@ class RunSection:
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """A report. scenes: what `viewer.packed` made, by name; opens: the first of them at once."""
+    """A report. pictures: of runs without a section; scenes: what `viewer.packed` made, by name; opens: the first of
+    them at once.
+    """
 
     title: str
     state: str
@@ -83,6 +85,7 @@ class Page:
     lines: Sequence[str] = ()
     tables: Sequence[Table] = ()
     runs: Sequence[RunSection] = ()
+    pictures: Sequence[Picture] = ()
     scenes: Mapping[str, str] = field(default_factory=dict)
     opens: bool = False
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -283,6 +284,34 @@ def test_variants_have_a_column_each_and_what_only_prints_has_no_folder_to_miss(
     page = reported(batch)
     assert re.findall(r"<th[^>]*>(drive[^<]*)<", page) == ["drive +rate=1", "drive +rate=2"]
     assert "expected a path in the batch" not in page
+
+
+def test_many_recordings_are_folded_and_an_expected_error_is_said(batch: Path) -> None:
+    refused = {"job": "ingest", "command": "ingest", "state": "done", "label": "exit 4", "expect": "exit 4"}
+    more = [{"id": f"bag{k}/ingest", "recording": f"bag{k}", **refused} for k in range(50)]
+    skipped = {"id": "bag0/scene", "recording": "bag0", "job": "scene", "state": "skipped", "cause": "needs it"}
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *more, skipped]})
+    page = reported(batch)
+    first, _, rest = page[page.index("<h2>Recordings") :].partition("<summary>20 more recordings</summary>")
+    assert first.count("<tr") == 41 and rest.count(">exit 4, as expected<") == 20
+    assert "bag0/scene" in page and 'id="bag0/scene"' not in page, "what did not run has no section"
+    assert 'href="#bag0/scene"' not in page
+
+
+def test_recordings_as_expected_have_a_picture(batch: Path) -> None:
+    nodes = []
+    for number, (kind, name) in enumerate((("score", "cam3_best_worst"), ("sdf-bake", "slices"))):
+        folder = batch / f"other{number}/job"
+        folder.mkdir(parents=True)
+        cv2.imwrite(str(folder / f"{name}.png"), np.zeros((40, 900, 3), np.uint8))
+        run = {"command": kind, "splatctrl": "0.2.0", "parts": part_digests(folder)}
+        (folder / "run.json").write_text(json.dumps(run))
+        node = {"id": f"other{number}/job", "recording": f"other{number}", "job": "job", "command": kind}
+        nodes.append(node | {"state": "done", "outcome": "passed", "label": "passed", "out": f"other{number}/job"})
+    patch_json(batch / "batch.json", lambda f: f | {"nodes": [*f["nodes"], *nodes]})
+    page = reported(batch)
+    shown = page[page.index("Pictures of other recordings") :]
+    assert re.findall(r"<figcaption>([^:]+):", shown) == ["other0/job", "other1/job"]
 
 
 def test_a_report_against_what_cannot_be_compared_is_refused(run: Runs, batch: Path, tmp_path: Path) -> None:

@@ -60,11 +60,11 @@ def _reasons(verdict: Mapping[str, Any], *, holds: bool) -> Table:
     """The criteria of a verdict that hold, or those that do not, first the one that decided it."""
     rows = []
     for reason in verdict.get("reasons", []):
-        when = "" if reason["time_s"] is None else f"{reason['time_s']:.2f}\u00a0s"
-        words = "; ".join(part for part in (reason["sentence"], reason["cause"], reason["remedy"]) if part)
+        when = "" if reason["time_s"] is None else f" at {reason['time_s']:.2f} s"
+        words = "; ".join(part for part in (reason["sentence"] + when, reason["cause"], reason["remedy"]) if part)
         if (reason["outcome"] == PASSED) is holds:
-            rows.append(Row(cells=(reason["criterion"], reason["outcome"], words, when), state=reason["outcome"]))
-    return Table(header=("criterion", "outcome", "found", "when"), rows=rows)
+            rows.append(Row(cells=(reason["criterion"], reason["outcome"], words), state=reason["outcome"]))
+    return Table(header=("criterion", "outcome", "found"), rows=rows)
 
 
 def _held(verdict: Mapping[str, Any]) -> list[Table]:
