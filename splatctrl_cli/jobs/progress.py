@@ -48,7 +48,8 @@ class Wait:
 
     def __init__(self, progress: Progress, what: str, unit: str, total: int | None = None) -> None:
         self._progress, self._what, self._unit, self._total = progress, what, unit, total
-        self._begun = self._told = time.monotonic()
+        self._told = time.monotonic()
+        self._first: tuple[float, int] | None = None  # the time of the first steps, which take longer, and how many
         self._done = 0
 
     def announce(self) -> Self:
@@ -63,13 +64,15 @@ class Wait:
     def at(self, done: int, more: str = "", *, is_told: bool = False) -> None:
         """`done` steps are; it is said with `more` where the last line is `TELL_S` ago, or `is_told` asks for it."""
         self._done, now = done, time.monotonic()
+        self._first = self._first or ((now, done) if done else None)
         if self._total is not None and done > self._total:
             return  # of what comes after it
         if not is_told and now - self._told < TELL_S:
             return
         self._told, left = now, ""
-        if self._total is not None and done:
-            left = f", about {duration((now - self._begun) * (self._total - done) / done)} left"
+        if self._total is not None and self._first is not None and done > self._first[1]:
+            begun, before = self._first
+            left = f", about {duration((now - begun) * (self._total - done) / (done - before))} left"
         of = "" if self._total is None else f" of {self._total}"
         self._progress.log(f"{self._what}: {done}{of} {self._unit}{more}{left if done != self._total else ''}")
 

@@ -32,6 +32,18 @@ def test_a_wait_is_announced_and_says_how_long_it_still_is(clock: list[float]) -
     assert len(said.lines) == 16
 
 
+def test_a_first_step_that_prepares_the_others_says_nothing_of_them(clock: list[float]) -> None:
+    said = Said()
+    wait = Wait(said, "fits 15 views", "iterations", 60).announce()
+    for seconds in (180.0, *[5.0] * 2):
+        clock[0] += seconds
+        wait.step()
+    assert said.lines[1:] == [
+        "fits 15 views: 1 of 60 iterations",
+        "fits 15 views: 3 of 60 iterations, about 5 min left",
+    ]
+
+
 def test_a_short_wait_is_only_announced(clock: list[float]) -> None:
     said = Said()
     wait = Wait(said, "refines", "iterations", 3).announce()

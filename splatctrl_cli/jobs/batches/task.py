@@ -31,6 +31,7 @@ STOP = 2.0  # [s] for a runner to see that its stdin ended, before it is killed
 GRACE = 10.0  # [s] from asking a child to end to ending it
 PAGE = os.sysconf("SC_PAGE_SIZE")
 PR_SET_PDEATHSIG = 1  # of prctl(2): what a child gets when its parent dies
+RESUME = "--resume"  # left out where there is nothing to go on from
 PART = ".part"  # ends the name of a result that is not whole
 _LAST = 4096  # bytes of a log that are looked at for its last lines
 _local = threading.local()  # a runner for each thread that has run a task
@@ -226,8 +227,10 @@ def _be_child(function: Entry, task: Task) -> NoReturn:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         for number, path in ((0, os.devnull), (1, task.result + PART), (2, task.log)):
             os.dup2(os.open(path, os.O_RDWR if number == 0 else os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-        sys.argv = ["splatctrl", *task.words]
-        code = function(list(task.words))
+        has_begun = bool(task.out) and partial_path(Path(task.out)).exists()
+        words = [word for word in task.words if has_begun or word != RESUME]
+        sys.argv = ["splatctrl", *words]
+        code = function(words)
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 70
     except BaseException:

@@ -20,6 +20,8 @@ def main(words: list[str]) -> int:
             case "tell":  # FILE: one line for each run that got so far
                 with Path(words.pop(0)).open("a") as stream:
                     stream.write(f"{os.getpid()}\n")
+            case "words":  # FILE: what comes after it
+                Path(words.pop(0)).write_text(" ".join(words))
             case "sleep":
                 time.sleep(float(words.pop(0)))
             case "allocate":  # MB

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from splatctrl_cli.files.output import partial_path
 from splatctrl_cli.jobs.batches.batch import verdict_of_runs
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
 from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Clock
@@ -184,6 +185,16 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
     except OSError:
         return False
+
+
+def test_a_node_goes_on_only_where_something_was_begun(tmp_path: Path) -> None:
+    words, out = tmp_path / "words", tmp_path / "a/job"
+    nodes = [node(tmp_path, "a/job", "words", str(words), "--resume", "exit", "1")]
+    batch_of(tmp_path, nodes)
+    assert "--resume" not in words.read_text()
+    partial_path(out).mkdir()
+    batch_of(tmp_path, nodes, again=True)
+    assert "--resume" in words.read_text()
 
 
 def test_a_runner_that_is_killed_is_replaced(tmp_path: Path) -> None:
