@@ -32,6 +32,7 @@ from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batches.suite import Table
 
 PRELOADED = ("check", "ingest", "reconstruct", "export", "bake", "score", "replay")  # jobs of a runner
+MOST_ROWS = 40  # recordings that are all printed
 OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them
 
 
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
         "kept": result.num_kept,
         "nodes": [node_document(run) for run in result.runs],
     }
-    code = console.concluded(result.verdict, printed, _lines(result))
+    code = console.concluded(result.verdict, printed, _lines(result, is_long=args.verbose > 0))
     publish(suites_of(result), junit=args.junit, is_fatal=code != 0)
     return code
 
@@ -155,15 +156,17 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _lines(result: BatchResult) -> Iterator[str]:
-    """A row for each recording, a column for each job and variant."""
+def _lines(result: BatchResult, *, is_long: bool) -> Iterator[str]:
+    """A row for each recording, a column for each job and variant; of many recordings those not as expected."""
     runs = {(run.recording, run.node.removeprefix(f"{run.recording}/")): run for run in result.runs}
     columns = columns_of(((run.job, column) for (_, column), run in runs.items()), result.jobs)
-    rows = [
-        [recording, *(_cell(runs.get((recording, column))) for column in columns)]
-        for recording in dict.fromkeys(recording for recording, _ in runs)
-    ]
-    yield from table(("recording", *columns), rows)
+    recordings = list(dict.fromkeys(recording for recording, _ in runs))
+    odd = {run.recording for run in result.runs if run.state != DONE}
+    shown = recordings if is_long or len(recordings) <= MOST_ROWS else [name for name in recordings if name in odd]
+    rows = [[name, *(_cell(runs.get((name, column))) for column in columns)] for name in shown]
+    yield from table(("recording", *columns), rows) if rows else ()
+    if len(shown) < len(recordings):
+        yield f"{len(recordings) - len(shown)} recordings as expected; -v prints them, too"
     yield ""
     yield f"{len(result.runs) - result.num_kept} run, {result.num_kept} as before; wrote {result.out / 'batch.json'}"
 

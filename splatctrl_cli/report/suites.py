@@ -76,10 +76,13 @@ def cases_of(verdict: Mapping[str, Any], group: str, *, expected: str = "passed"
     return [Case(name="outcome", group=group, kind=kind, sentence=words, text=words), *cases]
 
 
-def error_case(group: str, line: str, *, exit_code: int) -> Case:
-    """The only case of a command that did not come to a verdict; `line` is what it said."""
-    name = WORDS.get(exit_code, "error")
-    return Case(name=name, group=group, kind=Kind.ERROR, sentence=line, text=f"{line}\nexit code: {exit_code}")
+def error_case(group: str, line: str, *, exit_code: int | None, lines: Sequence[str] = ()) -> Case:
+    """The only case of a command that did not come to a verdict, without an exit code where it was killed; `line` is
+    what it said, `lines` the end of its log.
+    """
+    name = "killed" if exit_code is None else WORDS.get(exit_code, "error")
+    text = "\n".join([line, *lines, *([] if exit_code is None else [f"exit code: {exit_code}"])])
+    return Case(name=name, group=group, kind=Kind.ERROR, sentence=line, text=text)
 
 
 def skipped_case(group: str, why: str) -> Case:

@@ -147,3 +147,19 @@ def test_nodes_that_an_interrupted_batch_did_not_come_to_are_to_do(
     assert main(["report", str(out), "-o", str(tmp_path / "page.html")]) == 0
     page = (tmp_path / "page.html").read_text()
     assert "1 of 3 jobs not as expected; first good/look: has not run since" in page
+
+
+def test_many_recordings_are_printed_where_they_are_not_as_expected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(45):
+        (tmp_path / f"bag{number}.bag").write_bytes(b"not a log")
+    suite = tmp_path / "bags.toml"
+    own = '[[recordings]]\nname = "odd"\npaths = ["bag0.bag"]\njobs.info.expect = "passed"\n'
+    suite.write_text(f'[[recordings]]\npaths = ["*.bag"]\n{own}[jobs.info]\nexpect = "exit 4"\n')
+    assert main(["batch", str(suite), "-q"]) == 1
+    rows = capsys.readouterr().out.splitlines()
+    assert [rows[2].split(), rows[4].split()] == [["recording", "info"], ["odd", "ERROR"]]
+    assert rows[5] == "45 recordings as expected; -v prints them, too"
+    assert main(["batch", str(suite), "-q", "-v"]) == 1
+    assert capsys.readouterr().out.count("exit 4\n") == 45

@@ -78,6 +78,13 @@ def test_what_could_not_run_or_was_not_run_is_no_pass() -> None:
     assert (suite.tests, suite.errors, suite.skipped) == (2, 1, 1)
 
 
+def test_what_was_killed_has_its_cause_in_a_line_and_the_end_of_its_log() -> None:
+    case = error_case("a/bake", "timed out after 5 s", exit_code=None, lines=["fits", "still fits"])
+    ((found,),) = JUnitXml.fromstring(junit_text([suite_of(case)]).encode())
+    assert (found.name, found.result[0].message) == ("killed", "timed out after 5 s")
+    assert found.result[0].text == "timed out after 5 s\nfits\nstill fits"
+
+
 def test_what_was_expected_to_fail_passes_and_fails_where_it_passes() -> None:
     assert {case.kind for case in cases_of(VERDICT, GROUP, expected="failed")} == {Kind.PASSED}
     passed = verdict_of("replay", [FAR]).as_dict()

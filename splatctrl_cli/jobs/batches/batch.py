@@ -178,15 +178,14 @@ def _cases_of(run: Run, out: Path) -> list[Case]:
     if run.state == SKIPPED:
         return [skipped_case(run.node, run.cause)]
     if run.state == ERROR:
-        said = run.cause or run.sentence or f"exit {run.exit_code}"
-        lines = "\n".join([said, *last_lines(out / run.log)])
-        return [error_case(run.node, lines, exit_code=run.exit_code or 70)]
+        said = run.cause or run.sentence or run.label
+        return [error_case(run.node, said, exit_code=run.exit_code, lines=last_lines(out / run.log))]
     verdict = verdict_in(out / run.result)
     if run.state == FAILED:
         wrong = Case(name="expected", group=run.node, kind=Kind.FAILED, sentence=told(run), text=str(_reason(run)))
         return [wrong, *(cases_of(verdict, run.node) if verdict and run.outcome != Outcome.PASSED else [])]
     if not verdict:
-        return [Case(name=run.command, group=run.node, kind=Kind.PASSED)]
+        return [Case(name=run.command, group=run.node, kind=Kind.PASSED, text="" if run.outcome else told(run))]
     return cases_of(verdict, run.node, expected=run.outcome)
 
 

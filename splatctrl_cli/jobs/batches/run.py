@@ -141,8 +141,8 @@ def run_of(node: Node, key: str, end: End, folder: Path) -> Run:
     place = folder / node.name
     verdict = verdict_in(Path(f"{place}.json")) if end.exit_code is not None else {}
     code, outcome, label = end.exit_code, verdict.get("outcome", ""), verdict.get("label", "")
-    if not verdict and code in (0, 3):
-        outcome, label = "passed", "done"
+    if not verdict and code is not None:
+        outcome, label = ("passed", "done") if code in (0, 3) else ("", f"exit {code}")
     last = last_lines(Path(f"{place}.log"), 1)
     run = Run(
         node=node.name,
@@ -184,7 +184,7 @@ def _judged_again(run: Run, node: Node) -> Run:
 
 def told(run: Run) -> str:
     """A run in a few words."""
-    what = run.cause or run.label.upper() or f"exit {run.exit_code}"
+    what = run.cause or (run.label.upper() if run.outcome else run.label)
     if run.state == SKIPPED:
         return f"skipped: {run.cause}"
     odd = "" if run.state == DONE else f", expected {run.expect}" if run.state == FAILED else ", an error"

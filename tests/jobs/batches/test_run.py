@@ -54,7 +54,7 @@ def test_one_node_that_fails_stops_only_what_needs_its_output(tmp_path: Path) ->
     ]
     runs = batch_of(tmp_path, nodes)
     assert states(runs) == {"a/broken": ERROR, "a/after": SKIPPED, "b/judged": FAILED, "b/after": DONE}
-    assert (runs["a/broken"].exit_code, runs["a/broken"].sentence) == (4, "x: cannot be read")
+    assert (runs["a/broken"].label, runs["a/broken"].sentence) == ("exit 4", "x: cannot be read")
     assert runs["a/after"].cause == "needs a/broken, which left nothing"
     verdict = verdict_of_runs(list(runs.values()))
     assert (verdict.exit_code, verdict.decisive[0].criterion) == (1, "a/broken")
