@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
+from splatctrl_cli.jobs.camera_agreement import CameraAgreement
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
@@ -22,7 +22,6 @@ from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter, workspa
 from splatctrl_cli.scene.contact import count_carried
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture, posture_of
-from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
 from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
@@ -112,7 +111,9 @@ class Reconstruction:
         self.is_refined = False
         self._early: TimeStep | None = None  # the first that said nothing of the workspace
         self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
-        self.disagreement: dict[str, float] = {}  # [m] of each pair of cameras that see enough of the same
+        self.agreement = CameraAgreement(
+            self.source.name, is_allowed=request.allow_disagreement, is_still=not self.source.has_clock
+        )
         self._saved_at, self._save_time = -float("inf"), 0.0
         if checkpoint is not None:
             self._restore(checkpoint)
@@ -173,7 +174,7 @@ class Reconstruction:
                 "warning: more views than fit in one time step: the last are refined on, the others only seed splats;"
                 " leave views out, or reconstruct them in parts"
             )
-        self._check_cameras(step, console)
+        self.agreement.check(step, self.config.occupancy, console)
         if not self.source.has_clock and not self.fitter.num_steps:
             what, scene = f"fits {len(step.frames)} views, seeds first", self.config.scene
             self.fitter.descent.heard = Wait(console, what, "iterations", scene.first_iterations).announce().step
@@ -189,39 +190,10 @@ class Reconstruction:
             self.snapshot(step.stamp_ns)
         return row
 
-    def _check_cameras(self, step: TimeStep, console: Progress) -> None:
-        """Measure once a pair how far cameras disagree on what both see. Raises InputError where that is too far."""
-        limits = self.config.occupancy
-        if not self._has_new_pairs(step):
-            return
-        for pair in agreements(step.frames, limits.min_range, limits.max_range):
-            name = " and ".join(dict.fromkeys(pair.cameras))
-            if name in self.disagreement:
-                continue
-            self.disagreement[name] = round(pair.median, 5)
-            if pair.holds:
-                continue
-            line = (
-                f"{self.source.name}: camera {name}: depths disagree by {1e3 * pair.median:.0f} mm (median of"
-                f" {pair.num_pixels} pixels that two views see; expected at most {1e3 * pair.limit:.0f} mm)"
-            )
-            if not self.request.allow_disagreement:
-                others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
-                raise InputError(
-                    line, remedy=f"{CAUSES}: correct poses or depth,{others} or give --allow-disagreement"
-                )
-            console.log(f"warning: {line}; {CAUSES}: correct poses or depth, or expect surfaces twice")
-
     def _keep_first_frames(self, step: TimeStep) -> None:
         for frame in step.frames:
             if frame.camera not in self.first_frames:
                 self.first_frames[frame.camera] = first_frame(frame).as_dict()
-
-    def _has_new_pairs(self, step: TimeStep) -> bool:
-        """Whether two views of this time step are from cameras that have not been compared yet."""
-        names = sorted(frame.camera for frame in step.frames)
-        pairs = {" and ".join(dict.fromkeys(pair)) for pair in combinations(names, 2)}
-        return not pairs <= self.disagreement.keys()
 
     def _warn_of_small_budget(self, row: AuditRow, console: Progress) -> None:
         if row.unmet:
@@ -278,7 +250,7 @@ class Reconstruction:
             "background": list(self.fitter.descent.background or (0.0, 0.0, 0.0)),
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
             "frames_without_depth": sum(row.without_depth for row in self.rows),
-            "disagreement": self.disagreement,
+            "disagreement": self.agreement.disagreement,
             **self_mask_metrics(self.rows),
             "carried": self.declared.carried_uses(),
             "first_frames": list(self.first_frames.values()),
@@ -322,7 +294,7 @@ class Reconstruction:
             "run": self.identity,
             "num_read": self.num_read,
             "is_refined": self.is_refined,
-            "disagreement": self.disagreement,
+            "disagreement": self.agreement.disagreement,
             "depth": None if self.depth is None else asdict(self.depth),
             "first_frames": self.first_frames,
             "stamps": [] if self.source.has_clock else self.stamps,
@@ -338,7 +310,7 @@ class Reconstruction:
         self.num_read = checkpoint.progress["num_read"]
         self.is_refined = checkpoint.progress["is_refined"]
         self.stamps = checkpoint.progress["stamps"]
-        self.disagreement = checkpoint.progress["disagreement"]
+        self.agreement.disagreement = checkpoint.progress["disagreement"]
         self.first_frames = checkpoint.progress["first_frames"]
         depth = checkpoint.progress["depth"]
         self._fit_to(None if depth is None else RecordedDepth(**depth))
