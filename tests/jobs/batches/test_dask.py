@@ -22,7 +22,7 @@ def test_every_node_is_done_once_although_workers_die(tmp_path: Path) -> None:
     said = [("sleep", "0.05", "tell", str(tmp_path / f"told{k}")) for k in range(NUM)]
     nodes = [node(tmp_path / "out", f"r{k}/job", *words, retries=5) for k, words in enumerate(said)]
     cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, local_directory=str(tmp_path)
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", local_directory=str(tmp_path)
     )
     with cluster, distributed.Client(cluster) as client, Ledger(tmp_path / "out") as ledger:
         over, killed = threading.Event(), list[int]()
