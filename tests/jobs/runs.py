@@ -22,7 +22,7 @@ Runs = Callable[..., Path]
 def run(desk: Desk, arm: RobotModel, unpainted: None, monkeypatch: pytest.MonkeyPatch) -> Runs:
     """A replay in which a ball comes near, as the command leaves it; its scene and robot beside it."""
 
-    def made(out: str = "audit", mode: str = "audit") -> Path:
+    def made(out: str = "audit", mode: str = "audit", *more: str) -> Path:
         desk.source.states = passing()
         near = ball_beside(arm, passing()[-1].position, 0.012, way=np.array([s.position for s in passing()[:-1]]))
         stage = Stage(desk=desk, arm=arm, balls=(FAR,), later=(near,), later_from=500_000_000)
@@ -33,7 +33,7 @@ def run(desk: Desk, arm: RobotModel, unpainted: None, monkeypatch: pytest.Monkey
         words = ["--scene", "scene", "--urdf", desk.robot[1], "--spheres", desk.robot[3]]
         monkeypatch.setattr(sys, "argv", ["splatctrl", "replay", "fake.mcap", *words, "--mode", mode])
         monkeypatch.chdir(desk.folder)
-        desk.replay(*words[:2], "--mode", mode, "-q", out=out)
+        desk.replay(*words[:2], "--mode", mode, "-q", *more, out=out)
         cv2.imwrite(str(desk.folder / out / "worst_1.png"), np.full((90, 1200, 3), 200, np.uint8))
         (desk.folder / out / "clearance.png").unlink()
         if mode != "audit":

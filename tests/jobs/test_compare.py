@@ -1,5 +1,6 @@
 """What got worse between two runs, two batches, or since a stored baseline."""
 
+import csv
 import json
 import shutil
 import tomllib
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.evaluate.metrics import Better
 from splatctrl_cli.evaluate.verdict import Outcome
@@ -17,6 +19,7 @@ from splatctrl_cli.jobs import declared_metrics
 from splatctrl_cli.jobs.compare import Change, CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.jobs.replays.standstill_baseline import BASELINES
+from tests.jobs.runs import Runs
 
 OLDER = Path(__file__).parents[1] / "data" / "older.zip"
 NEAR = {"criterion": "clearance", "outcome": "failed", "sentence": "hand[9] is 4 mm away", "time_s": 1.5}
@@ -335,3 +338,31 @@ def test_every_figure_of_a_replay_is_declared_with_a_direction_or_without_one() 
     assert declared["num_in_collision"].better is Better.LOWER
     assert declared["birrt_planning_time_s"].better is Better.NEITHER, "wall clock"
     assert all(scale.absolute >= 0 and scale.relative >= 0 for scale in declared.values())
+
+
+def test_a_margin_that_was_taken_away_is_found_with_the_state_where_it_shows(run: Runs) -> None:
+    before, after = run("before", "closed-loop"), run("after", "closed-loop", "--set", "control.margin=0.002")
+    result = compared(before, after)
+    assert result.verdict.exit_code == 1
+    assert result.differences["control.margin"] == ("0.02", "0.002")
+    worst = next(one for one in result.figures if one.metric == "min_clearance")
+    assert worst.change is Change.WORSE and worst.where is not None and "ball" not in worst.where.sphere
+    with (after / "steps.csv").open() as stream:
+        least = min(csv.DictReader(stream), key=lambda row: float(row["clearance_exact"]))
+    assert worst.where.time_s == pytest.approx(float(least["time_s"]))
+    back = compared(after, before)
+    assert not [one for one in back.figures if one.metric == "min_clearance" and one.change is Change.WORSE]
+
+
+def test_more_iterations_are_no_regression_and_fewer_are(sample_data: Path, tmp_path: Path) -> None:
+    dtu = ("--dtu", str(sample_data / "dtu"), "--protocol", "dtu-holdout8", "-q")
+    for name, count in (("few", 10), ("many", 60)):
+        scene, steps = str(tmp_path / f"{name}_scene"), f"scene.refine_iterations={count}"
+        fit = ("--max-splats", "2000", "--set", f"scene.first_iterations={count}", "--set", steps)
+        assert main(["reconstruct", *dtu, *fit, "-o", scene]) == 0
+        assert main(["score", scene, *dtu, "-o", str(tmp_path / name), "--images", "none"]) == 0
+    few, many = tmp_path / "few", tmp_path / "many"
+    assert compared(few, many).verdict.exit_code == 0
+    worse = compared(many, few)
+    assert worse.verdict.exit_code == 1
+    assert {"psnr_seen", "depth_median_seen"} <= {one.metric for one in worse.figures if one.change is Change.WORSE}

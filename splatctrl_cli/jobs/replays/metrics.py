@@ -9,6 +9,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import MOTION_WINDOW
 from splatctrl_cli.control.events import first_intervention
 from splatctrl_cli.control.fallbacks import Rung
@@ -122,7 +123,8 @@ def _map_error(name: str, figure: str, scale: Scale) -> Metric[Replay]:
 LIMIT = Scale(unit="rad", better=Better.HIGHER, absolute=1e-3)  # or m, of a prismatic joint
 SPEED = Scale(unit="rad/s", better=Better.LOWER, absolute=1e-3, relative=0.02)
 SLACK = Scale(unit="m/s", better=Better.HIGHER, absolute=1e-3, relative=0.02)  # or rad/s, by the row
-ANGLE = Scale(unit="rad", better=Better.LOWER, absolute=1e-3, relative=0.02)
+AT_GOAL = Scale(unit="m", better=Better.LOWER, absolute=ControlConfig().goal_position)  # within it, it is reached
+TURNED = Scale(unit="rad", better=Better.LOWER, absolute=ControlConfig().goal_rotation)
 RESIDUAL = Scale(better=Better.LOWER, absolute=1e-6)
 FULFILLED = Scale(better=Better.HIGHER)  # of 0 or 1, and of counts
 NEAREST = least_of("clearance_exact")
@@ -186,7 +188,12 @@ OF_STATES: Declared = (
         shown=largest_of("unknown_share"),
     ),
     counted("num_without_distance", lambda r: is_blank(r).astype(np.float64), lambda _, values: values > 0),
-    _single("num_static_violations", lambda r: len(r.static_violations), lambda r: len(r.statics), FAULTS),
+    _single(
+        "num_static_violations",
+        lambda r: len(r.static_violations),
+        lambda r: len(r.statics),
+        Scale(better=Better.LOWER, absolute=2, relative=0.05),
+    ),
     folded(
         "max_map_age_s",
         LARGEST,
@@ -258,8 +265,8 @@ OF_CLOSED_LOOP: Declared = (
     _trace("num_goals_reached", lambda trace: trace.num_reached, FULFILLED),
     _single("start_time_s", lambda replay: replay.start_time_s, scale=TIME),
     _trace("num_steps", lambda trace: len(trace.steps)),
-    _trace("position_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[:3])), ERROR),
-    _trace("rotation_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[3:])), ANGLE),
+    _trace("position_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[:3])), AT_GOAL),
+    _trace("rotation_error", lambda trace: float(np.linalg.norm(trace.steps[-1].pose_error[3:])), TURNED),
     _trace("num_scene_hits", lambda trace: sum(change.is_hit for change in trace.scene_changes), FAULTS),
     _trace("num_anchors", lambda trace: len(trace.anchored)),
     _trace("num_detours", lambda trace: len(trace.detours)),
