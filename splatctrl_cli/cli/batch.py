@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.batches.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batches.graph import Parsed, columns_of
+from splatctrl_cli.jobs.batches.graph import Parsed, columns_of, of_shard
 from splatctrl_cli.jobs.batches.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batches.suite import Table
@@ -179,17 +179,21 @@ def _cell(run: Run | None) -> str:
 
 
 def _listed(console: Console, args: argparse.Namespace, request: BatchRequest, command_line: OfThisProgram) -> int:
-    """The ledger's last runs, those that --where and --failed ask for."""
-    folder = request.suite if request.suite.is_dir() else planned(request, command_line)[2]
+    """The last runs, those that --where and --failed ask for: of the suite's nodes, or of all in a batch's folder."""
+    folder, order = request.suite, dict[str, int]()
+    if not folder.is_dir():
+        _, nodes, folder = planned(request, command_line)
+        order = {node.name: number for number, node in enumerate(of_shard(nodes, request.shard))}
     if not (folder / NAME).is_file():
         raise InputError(f"{folder}: has no {NAME}", remedy="run the batch first")
     conditions = [*args.where, *(["state!=done"] if args.failed else [])]
     with Ledger(folder) as ledger:
-        if args.csv is not None:
-            console.log(f"wrote {write_csv(args.csv, ledger.runs(conditions))} runs to {args.csv}")
         runs = list(ledger.runs(conditions))
+    if not request.suite.is_dir():
+        runs = sorted((run for run in runs if run.node in order), key=lambda run: order[run.node])
+    if args.csv is not None:
+        console.log(f"wrote {write_csv(args.csv, runs)} runs to {args.csv}")
     rows = [(run.node, run.state, told(run), f"{run.peak_mb:.0f}", run.log) for run in runs]
-    console.result(
-        {"nodes": [node_document(run) for run in runs]}, table(("node", "state", "outcome", "MB", "log"), rows)
-    )
+    lines = table(("node", "state", "outcome", "MB", "log"), rows) if rows else ["no such runs"]
+    console.result({"nodes": [node_document(run) for run in runs]}, lines)
     return 0

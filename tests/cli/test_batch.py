@@ -60,11 +60,17 @@ def test_a_suite_runs_once_tells_what_was_not_expected_and_lists_it(
     assert listed.count("good/ingest") == 2  # the node and its log
     assert (tmp_path / "runs.csv").read_text().count("\n") == 2
     assert main(["batch", str(out), "--list"]) == 0
+    capsys.readouterr()
+    listed, _ = said("--shard", "2/2", "--list", code=0)
+    assert [line.split()[0] for line in listed.splitlines()[2:]] == ["good/info", "good/ingest"], "of the shard"
+    listed, _ = said("--where", "state=lost", code=0)
+    assert listed == "no such runs\n"
 
 
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
+        (["."], 4, ".: is a folder; give the suite's file, or --list with it"),
         (["missing.toml"], 4, "missing.toml: cannot be read"),
         (["--shard", "3/2"], 2, "expected I/N with I from 1 to N, got '3/2'"),
         (["--shard", "5/9"], 2, "has none of the 2 recordings; give fewer shards"),
@@ -77,7 +83,7 @@ def test_what_cannot_run_is_said_in_a_line(
 ) -> None:
     (tmp_path / "suite.toml").write_text(SUITE)
     (tmp_path / "damaged.mcap").touch()
-    place = [] if words[0].endswith(".toml") else [str(tmp_path / "suite.toml")]
+    place = [] if words[0].endswith((".toml", ".")) else [str(tmp_path / "suite.toml")]
     assert main(["batch", *place, *words]) == code
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1

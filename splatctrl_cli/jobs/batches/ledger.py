@@ -20,7 +20,8 @@ from splatctrl_cli.files.output import sha256, write_durably
 NAME, OWNERS = "ledger.sqlite", ".owners"
 VERSION = 1  # of the tables
 BUSY_S = 30.0  # to wait for another process that writes
-_COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|=|>|<)\s*(.*)")
+_COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
+_PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,14 +146,17 @@ class Ledger:
         return {row["job"]: float(row["mean"]) for row in rows}
 
     def runs(self, conditions: Sequence[str] = (), *, only_last: bool = True) -> Iterator[Run]:
-        """Runs for which conditions such as "job=audit" or "seconds>10" hold. Raises UsageError for what is none."""
+        """Runs for which conditions hold, such as "job=audit", "node=a/*" or "seconds>10". Raises UsageError for what
+        is none.
+        """
         clauses, values = ["id IN (SELECT max(id) FROM runs GROUP BY node)"] if only_last else [], []
         for condition in conditions:
             match = _COMPARISON.fullmatch(condition.strip())
             if match is None or match[1] not in COLUMNS:
                 known = ", ".join(COLUMNS)
                 raise UsageError(f"--where {condition}: expected COLUMN=VALUE", remedy=f"columns: {known}")
-            clauses.append(f"{match[1]} {match[2]} ?")
+            means = _PATTERN.get(match[2], match[2]) if "*" in match[3] else match[2]
+            clauses.append(f"{match[1]} {means} ?")
             values.append(_value_of(match[1], match[3], condition))
         where = f" WHERE {' AND '.join(clauses)}" if clauses else ""
         for row in self._base.execute(f"SELECT * FROM runs{where} ORDER BY id", values):

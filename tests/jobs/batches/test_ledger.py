@@ -31,6 +31,9 @@ def ledger(tmp_path: Path) -> Ledger:
         (("state=error",), ["b/audit"]),
         (("job=audit", "seconds < 10"), ["a/audit"]),
         (("seconds>=2", "recording!=a"), ["b/audit"]),
+        (("node=a/*", "state==done"), ["a/audit"]),
+        (("node!=*a*",), []),
+        (("node!=a*",), ["b/audit"]),
     ],
 )
 def test_runs_are_asked_for_by_column(ledger: Ledger, conditions: tuple[str, ...], nodes: list[str]) -> None:
