@@ -1,7 +1,7 @@
 """A batch from its request to its verdict: read the suite, run its graph, write batch.json."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -69,7 +69,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
     """Run what is not done. Raises UsageError for a suite that makes no graph, InputError for files that lack."""
     suite, every, out = planned(request, command_line)
     nodes = of_shard(every, request.shard)
-    with Ledger(out) as ledger, _executor(request) as (executor, slots):
+    with Ledger(out) as ledger, _executor(request) as (executor, slots, hint):
         scheduler = Scheduler(
             ledger=ledger,
             entry=command_line.entry,
@@ -77,6 +77,7 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
             slots=slots,
             progress=progress,
             again=request.again,
+            hint=hint,
         )
         progress.log(f"batch: {_counted(len(nodes), 'node')} into {out}")
         try:
@@ -221,10 +222,11 @@ def node_document(run: Run) -> dict[str, Any]:
 
 
 @contextmanager
-def _executor(request: BatchRequest) -> Iterator[tuple[Executor, int]]:
+def _executor(request: BatchRequest) -> Iterator[tuple[Executor, int, Callable[[], str]]]:
+    """What runs nodes, how many at once, and why a wait may be in vain."""
     if request.dask is None:
         with local_executor(request.workers) as executor:
-            yield executor, request.workers
+            yield executor, request.workers, lambda: ""
         return
     try:
         client = distributed.Client(request.dask, timeout=CONNECT_S)
@@ -236,4 +238,8 @@ def _executor(request: BatchRequest) -> Iterator[tuple[Executor, int]]:
         ) from None
     with client:
         slots = max(sum(client.nthreads().values()), 1)
-        yield client.get_executor(pure=False, retries=2), 2 * slots
+        yield (
+            client.get_executor(pure=False, retries=2),
+            2 * slots,
+            lambda: "" if client.nthreads() else ": the cluster has no worker",
+        )

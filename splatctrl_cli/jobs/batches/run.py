@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -24,6 +24,7 @@ from splatctrl_cli.jobs.progress import Progress, duration
 DONE, FAILED, ERROR, SKIPPED, TO_DO = "done", "failed", "error", "skipped", "to do"
 NO_VERDICT = (2, 4, 6, 70, 130)  # exit codes of a command that came to none
 AGAIN_S = 0.5  # between looks at what another batch runs
+STILL_S = 60.0  # without an end, after which it is said what is waited for
 MAY_PASS = ("killed by SIGKILL", "killed by SIGBUS", "its runner", "lost")  # causes, when nothing here asked for it
 DISK_FULL = 6
 PRINTED = "printed"  # stands for the stamp of an output that there is none of
@@ -31,7 +32,7 @@ PRINTED = "printed"  # stands for the stamp of an output that there is none of
 
 @dataclass(kw_only=True)
 class Scheduler:
-    """Runs nodes with an executor of `slots` places, and keeps the ledger."""
+    """Runs nodes with an executor of `slots` places, and keeps the ledger. hint: why a wait may be in vain."""
 
     ledger: Ledger
     entry: str
@@ -39,6 +40,7 @@ class Scheduler:
     slots: int
     progress: Progress
     again: bool = False
+    hint: Callable[[], str] = lambda: ""
     keys: dict[str, str] = field(default_factory=dict)
     runs: dict[str, Run] = field(default_factory=dict)
     num_kept: int = 0
@@ -50,7 +52,7 @@ class Scheduler:
         waiting = {node.name: node for node in nodes}
         futures: dict[Future[End], Node] = {}
         tries: Counter[str] = Counter()
-        clock = Clock(nodes, self.ledger.mean_seconds(), self.slots)
+        clock, last = Clock(nodes, self.ledger.mean_seconds(), self.slots), time.monotonic()
         while waiting or futures:
             is_busy = False
             for node in list(waiting.values()):
@@ -72,7 +74,11 @@ class Scheduler:
                     futures[self.executor.submit(run_task, self._task(node, keys[node.name]))] = node
                 else:
                     is_busy = True
-            ended, _ = wait(futures, timeout=AGAIN_S if is_busy else None, return_when=FIRST_COMPLETED)
+            ended, _ = wait(futures, timeout=AGAIN_S if is_busy else STILL_S, return_when=FIRST_COMPLETED)
+            now = time.monotonic()
+            if not ended and now - last >= STILL_S:
+                self._tell_of([*futures.values()])
+            last = now if ended or now - last >= STILL_S else last
             if is_busy and not futures:
                 time.sleep(AGAIN_S)
             latest = self.ledger.latest() if is_busy else latest
@@ -118,6 +124,12 @@ class Scheduler:
         line = clock.passed(run)
         if run.started >= clock.started or run.state == SKIPPED:
             self.progress.log(f"{line} {node.name}: {told(run)}{clock.left()}")
+
+    def _tell_of(self, nodes: Sequence[Node]) -> None:
+        """What is waited for."""
+        names = [node.name for node in nodes] or ["what another batch runs"]
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        self.progress.log(f"batch: still waits for {names[0]}{more}{self.hint()}")
 
     def _task(self, node: Node, key: str) -> Task:
         return Task(

@@ -14,8 +14,9 @@ import pytest
 from splatctrl_cli.files.output import partial_path
 from splatctrl_cli.jobs.batches.batch import verdict_of_runs
 from splatctrl_cli.jobs.batches.ledger import Ledger, Run
-from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Clock
+from splatctrl_cli.jobs.batches.run import DONE, ERROR, FAILED, SKIPPED, Clock, Scheduler, local_executor
 from splatctrl_cli.jobs.batches.task import End, Task, run_task, stop_runners
+from tests.jobs.bakes import Said
 from tests.jobs.batches.desk import ENTRY, batch_of, node, states
 
 
@@ -126,6 +127,7 @@ def test_what_may_pass_is_tried_again_and_nothing_else(tmp_path: Path) -> None:
 PROGRAM = """
 import sys
 from pathlib import Path
+from tests.jobs.bakes import Said
 from tests.jobs.batches.desk import batch_of, node
 folder = Path(sys.argv[1])
 words = ("tell", "{0}/begun{1}", "sleep", "0.1", "tell", "{0}/told{1}")
@@ -232,3 +234,15 @@ def test_the_time_left_is_that_of_the_jobs_that_are_left(tmp_path: Path) -> None
     assert ended("b/fit", 50.0) == "[3/5], about 2 min left"
     assert ended("c/bake", 0.0, state=SKIPPED) == "[4/5], about 2 s left"
     assert ended("c/check", 4.0) == "[5/5]"
+
+
+def test_a_long_wait_says_what_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatctrl_cli.jobs.batches.run.STILL_S", 0.2)
+    said = Said()
+    with Ledger(tmp_path) as ledger, local_executor(2) as executor:
+        scheduler = Scheduler(
+            ledger=ledger, entry=ENTRY, executor=executor, slots=2, progress=said, hint=lambda: ": it is late"
+        )
+        scheduler.run([node(tmp_path, name, "sleep", "1.0") for name in ("a/job", "b/job")])
+    assert said.lines[0] == "batch: still waits for a/job and 1 more: it is late"
+    assert not any("still" in line for line in said.lines[-1:])
