@@ -9,7 +9,7 @@ ROOMS = [  # a room imports those of the rows above its own
     ["robot", "files"],
     ["containers", "splat_files", "grid_files", "report"],
     ["logs", "scene_files"],
-    ["captures", "scene", "field", "control", "simulate", "evaluate"],
+    ["captures", "scene", "field", "control", "simulate", "evaluate", "calibration"],
     ["datasets", "planner"],
     ["sources"],
     ["states", "checks"],

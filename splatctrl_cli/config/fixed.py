@@ -195,6 +195,29 @@ FREE_PROBES = (0.3, 0.6, 0.9)  # of a ball's radius; an object thinner than the 
 FREE_DIRECTIONS = 96  # of each ball
 ROBOT_MARGIN = 0.03  # [m] about the robot's spheres in which a measured point may be the robot itself
 
+# Poses put right by what views see of each other; lengths [m] are of a table at arm's length
+CALIBRATION_NOISE = (0.0005, 0.0015)  # [m], [1/m] of a depth: what every sensor errs by, and with the depth's square
+CALIBRATION_TILES = (6, 8)  # rows and columns of an image; residuals of one part of it err alike
+CALIBRATION_CREASE = 3.0  # times what a depth may err by, that it may stand out of its neighbours on one surface
+REFINE_ROWS = 240  # of an image that is looked at
+REFINE_BLUR = 0.6  # [px] of the small image, the sigma by which grey values are smoothed
+REFINE_POINTS = 6000  # of a view; every second one is laid on others, the rest says how well that went
+REFINE_ASKED = 32  # nearest views that are asked how much they share
+REFINE_NEIGHBOURS = 12  # of these, those that a view is laid on
+REFINE_OVERLAP = 0.1  # of a view's points that land on the surface of another, at least
+REFINE_ALIKE = 0.7  # cosine between the normals of two views of one surface, at least
+REFINE_WIDTHS = (60.0, 40.0, 25.0, 15.0, 10.0, 8.0, 6.0)  # sigmas from which on a distance does not count, by round
+REFINE_ROUNDS = 12  # more of the last width, at most
+REFINE_STILL = 2e-5  # [rad] or [m]: a round that moves by less is the last
+REFINE_COLOR_FROM = 25.0  # the width from which on grey values count
+REFINE_COLOR = 0.03  # what grey values in [0, 1] err by
+REFINE_CUT = 3.0  # times as much: from there on they do not count
+REFINE_GAINS = (0.7, 1.4)  # between the exposures of two images
+REFINE_FEWEST = 50  # points that a pair of views is compared by
+REFINE_PRIOR = (0.03, 0.05)  # [rad], [m] by which recorded poses are taken to err
+REFINE_FARTHEST = (0.15, 6.0)  # [m], [deg] that a pose is put right by, at most
+REFINE_GAIN = 0.03  # of the median distance between views: a smaller gain is none
+
 # Scores
 BANDS = ((0.0, 0.02), (0.02, 0.05), (0.05, 0.10), (0.10, 0.20))  # [m] true distance
 CLEARANCE_NEAR = 0.10  # [m] true clearance below which a state takes part in the comparison

@@ -46,6 +46,8 @@ PROTOCOL = {
     "Gaussian splatting has it: as ssim, but zeros beyond the border",
     "lpips": "of the whole view, colours scaled to [-1, 1]; lpips_published: with render and photo set to one colour "
     "outside the mask",
+    "posed": "the same figures at a pose that was put right by depth and colour of the training views, where those "
+    "were put right; the render takes no part in it",
     "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
     "centre lies in a voxel that was observed free; null where the scene has no occupancy grid",
 }
@@ -75,6 +77,9 @@ REGION = {
     **dict.fromkeys(("depth_within_1cm", "depth_within_2cm", "depth_coverage"), GOOD_SHARE),
     "in_front": BAD_SHARE,
 }  # of the pixels of a region
+REGIONS = ("seen", "all", "masked")
+POSED = "_posed"  # of a figure at a pose that was put right
+POSABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixels" for region in REGIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +88,7 @@ class ViewScore:
 
     Where there is a mask: `masked` is its region, ssim_published and lpips_published are those of the view with the
     rest filled; without one, ssim_published is there where the protocol has one. lpips where weights were given.
-    size: width and height [px].
+    size: width and height [px]. posed: the same view rendered from where its pose was put right.
     """
 
     view: str
@@ -97,6 +102,7 @@ class ViewScore:
     ssim_published: float | None = None
     lpips: float | None = None
     lpips_published: float | None = None
+    posed: "ViewScore | None" = None
 
     def figures(self) -> dict[str, float]:
         """The view's figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
@@ -118,6 +124,8 @@ class ViewScore:
             figures |= {f"depth_{key}_{name}": value for key, value in depth.items()}
             figures[f"depth_coverage_{name}"] = region.depth_coverage
             figures[f"in_front_{name}"] = region.in_front
+        if self.posed is not None:
+            figures |= {f"{name}{POSED}": value for name, value in self.posed.figures().items() if name in POSABLE}
         return figures
 
 
@@ -212,12 +220,13 @@ def metric_names() -> tuple[str, ...]:
 
 def metric_scales() -> dict[str, Scale]:
     """How two runs are compared by each of `metric_names`."""
-    of_regions = {f"{name}_{region}": scale for region in ("seen", "all", "masked") for name, scale in REGION.items()}
+    of_regions = {f"{name}_{region}": scale for region in REGIONS for name, scale in REGION.items()}
     return {
         **dict.fromkeys(("num_views", "valid_share", "seen_share", "mask_share"), DESCRIBES),
         "ssim_published": SIMILARITY,
         **dict.fromkeys(("lpips", "lpips_published"), DISSIMILARITY),
         **of_regions,
+        **{f"{name}{POSED}": of_regions[name] for name in POSABLE},
     }
 
 

@@ -43,8 +43,9 @@ class CameraAgreement:
             )
             if not self._is_allowed:
                 others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
+                refine = " (--refine-poses)" if self._is_still else ""
                 raise InputError(
-                    line, remedy=f"{CAUSES}: correct poses or depth,{others} or give --allow-disagreement"
+                    line, remedy=f"{CAUSES}: correct poses or depth{refine},{others} or give --allow-disagreement"
                 )
             console.log(f"warning: {line}; {CAUSES}: correct poses or depth, or expect surfaces twice")
 

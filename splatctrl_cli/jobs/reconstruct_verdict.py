@@ -23,6 +23,7 @@ GATED = {
     "max_unrepresented_voxels": UNREPRESENTED,
     "self_mask_residual_mm": Scale(unit="mm", better=Better.LOWER, absolute=0.5, relative=0.02),
     "inside_robot_points": FAULTS,
+    "pose_residual": Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.05),
     "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
     "psnr": DECIBELS,
 }  # what --require can name, and how two runs are compared by it
@@ -52,7 +53,12 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
     reasons = [reason for criterion in (_map, _blind, _calibration, _inside) for reason in criterion(made)]
     return verdict_of(
         "reconstruct",
-        [*reasons, *loss_notes(made.loss), *gate_reasons(require, {name: metrics[name] for name in GATED}, counts)],
+        [
+            *reasons,
+            *_held(metrics),
+            *loss_notes(made.loss),
+            *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
+        ],
         scope=f"{metrics['time_steps']} time steps of {', '.join(metrics['cameras'])}, {metrics['splats']} splats",
         notes=[carried_words(entry) for entry in metrics["carried"]],
         is_damaged=bool(made.loss.damaged),
@@ -70,6 +76,14 @@ def counts_of(made: Reconstructed) -> dict[str, int]:
         "loss": sum(row.loss is not None for row in made.rows),
         "psnr": sum(row.psnr is not None for row in made.rows),
     }
+
+
+def _held(metrics: Mapping[str, Any]) -> Iterator[Reason]:
+    """The views whose poses could not be put right, where that was asked for."""
+    held = metrics.get("poses", {}).get("held", [])
+    if held:
+        shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
+        yield noted("poses", f"not put right, too far off or seen by no other view: {shown}")
 
 
 def loss_notes(loss: LossReport) -> Iterator[Reason]:

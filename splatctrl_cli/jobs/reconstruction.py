@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.jobs.camera_agreement import CameraAgreement
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
+from splatctrl_cli.jobs.refine_poses import check_refinable, put_right
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -53,9 +54,10 @@ class ReconstructRequest:
     """One reconstruction of `source` into the folder `out`.
 
     urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given.
-    points: a coloured cloud to start from, instead of depth. declare: a TOML of what the robot carries. resume: go on
-    with what an interrupted run left. require: gates on its metrics. options: what else decides the bytes, by the
-    names of the options: a run that is resumed must have the same.
+    points: a coloured cloud to start from, instead of depth. declare: a TOML of what the robot carries. refine_poses:
+    put the views of a still scene where they fit each other. resume: go on with what an interrupted run left.
+    require: gates on its metrics. options: what else decides the bytes, by the names of the options: a run that is
+    resumed must have the same.
     """
 
     source: RecordSource
@@ -67,6 +69,7 @@ class ReconstructRequest:
     points: Path | None = None
     declare: Path | None = None
     allow_disagreement: bool = False
+    refine_poses: bool = False
     force: bool = False
     resume: bool = False
     seed: int = 0
@@ -109,12 +112,15 @@ class Reconstruction:
         self.first_frames: dict[str, dict[str, Any]] = {}  # of each camera, what tells this recording from another
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
+        self.poses: dict[str, Any] = {}  # what was put right of them
         self._early: TimeStep | None = None  # the first that said nothing of the workspace
         self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
         self.agreement = CameraAgreement(
             self.source.name, is_allowed=request.allow_disagreement, is_still=not self.source.has_clock
         )
         self._saved_at, self._save_time = -float("inf"), 0.0
+        if request.refine_poses:
+            check_refinable(request.source)
         if checkpoint is not None:
             self._restore(checkpoint)
 
@@ -174,11 +180,14 @@ class Reconstruction:
                 "warning: more views than fit in one time step: the last are refined on, the others only seed splats;"
                 " leave views out, or reconstruct them in parts"
             )
+        self._keep_first_frames(step)
+        if self.request.refine_poses and not self.fitter.num_steps:
+            frames, self.poses = put_right(step.frames, self.source.name, console)
+            step = replace(step, frames=tuple(frames))
         self.agreement.check(step, self.config.occupancy, console)
         if not self.source.has_clock and not self.fitter.num_steps:
             what, scene = f"fits {len(step.frames)} views, seeds first", self.config.scene
             self.fitter.descent.heard = Wait(console, what, "iterations", scene.first_iterations).announce().step
-        self._keep_first_frames(step)
         posture = self._posture(step)
         row = self.fitter.step(step.frames, posture)
         self._count_carried(step, posture)
@@ -251,6 +260,8 @@ class Reconstruction:
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.agreement.disagreement,
+            "pose_residual": None,
+            **self.poses,
             **self_mask_metrics(self.rows),
             "carried": self.declared.carried_uses(),
             "first_frames": list(self.first_frames.values()),
@@ -297,6 +308,7 @@ class Reconstruction:
             "disagreement": self.agreement.disagreement,
             "depth": None if self.depth is None else asdict(self.depth),
             "first_frames": self.first_frames,
+            "poses": self.poses,
             "stamps": [] if self.source.has_clock else self.stamps,
         }
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
@@ -312,6 +324,7 @@ class Reconstruction:
         self.stamps = checkpoint.progress["stamps"]
         self.agreement.disagreement = checkpoint.progress["disagreement"]
         self.first_frames = checkpoint.progress["first_frames"]
+        self.poses = checkpoint.progress["poses"]
         depth = checkpoint.progress["depth"]
         self._fit_to(None if depth is None else RecordedDepth(**depth))
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))

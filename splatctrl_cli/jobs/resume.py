@@ -16,7 +16,14 @@ from splatctrl_cli.scene_files.scene_writer import Checkpoint, read_checkpoint
 
 DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene beside its configuration, if not given
     **{"cameras": None, "camera": [], "camera_pose": [], "world_frame": None, "depth_scale": None},
-    **{"pairing_tolerance": 0.02, "joint_topic": None, "holdout": None, "scan": None, "box": None},
+    **{
+        "pairing_tolerance": 0.02,
+        "joint_topic": None,
+        "holdout": None,
+        "scan": None,
+        "box": None,
+        "refine_poses": False,
+    },
 }
 DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit
 

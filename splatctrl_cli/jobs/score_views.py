@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import isnan
 from operator import itemgetter
@@ -13,6 +13,7 @@ from splatctrl_cli.evaluate.score_doubts import Doubts
 from splatctrl_cli.evaluate.views import View, seen_pixels, views_to_score
 from splatctrl_cli.files.output import Stopwatch
 from splatctrl_cli.jobs.progress import Progress, Wait
+from splatctrl_cli.jobs.refine_poses import posed, posed_among
 from splatctrl_cli.jobs.score_reference import Reference
 from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
@@ -74,6 +75,7 @@ class Scorer:
             training=scene.cameras,
             has_clock=has_clock,
             numbered_by_stamp=self.reference.numbered_by_stamp,
+            posed=lambda frame: posed(frame, scene.refined_poses),
         )
         may_train = self.allow_training or self.reference.scores_training
         wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
@@ -117,12 +119,33 @@ class Scorer:
             )
 
     def _score_one(self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet) -> None:
-        frame, protocol = view.frame, self.reference.protocol
+        frame, poses = view.frame, self.scene.refined_poses
+        score, row = self._compared(view, frame, splats)
+        doubts.look(view, row.render, row.mask)
+        if poses:
+            there = (
+                posed(frame, poses) if (frame.camera, frame.stamp_ns) in poses else posed_among(frame, view.training)
+            )
+            score = replace(score, posed=self._compared(view, there, splats)[0])
+        scores.views.append(score)
+        scores.training = view.training
+        rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
+        if self.draw is not None:
+            self.draw(row)
+        scores.first = scores.first or row
+        best, worst = scores.extremes.get(frame.camera, ((rank, row), (rank, row)))
+        ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
+        scores.extremes[frame.camera] = ends
+
+    def _compared(
+        self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet
+    ) -> tuple[ViewScore, ComparisonRow]:
+        """What a view comes to where `frame` has its pose."""
+        protocol = self.reference.protocol
         rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.threads)
         rendering = rendering.before(self.scene.background)
         depth = rendering.normalised_depth()
         mask = None if self.reference.mask is None else self.reference.mask(frame)
-        doubts.look(view, rendering.color, mask)
         score = score_view(
             view=view.name,
             color=rendering.color,
@@ -134,10 +157,7 @@ class Scorer:
             is_zero_padded=protocol is not None and protocol.is_zero_padded,
             perceptual=self.perceptual,
         )
-        scores.views.append(score)
-        scores.training = view.training
-        rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
-        row = ComparisonRow(
+        return score, ComparisonRow(
             title=view.name,
             figures=_figures(score),
             photo=frame.color,
@@ -146,12 +166,6 @@ class Scorer:
             render_depth=depth,
             mask=mask,
         )
-        if self.draw is not None:
-            self.draw(row)
-        scores.first = scores.first or row
-        best, worst = scores.extremes.get(frame.camera, ((rank, row), (rank, row)))
-        ends = max(best, (rank, row), key=itemgetter(0)), min(worst, (rank, row), key=itemgetter(0))
-        scores.extremes[frame.camera] = ends
 
 
 def _figures(score: ViewScore) -> str:

@@ -12,10 +12,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import PARTIAL
-from splatctrl_cli.records import GaussianSet, SplatSet
+from splatctrl_cli.records import Float64, GaussianSet, SplatSet
 from splatctrl_cli.scene_files.voxel_file import (
     read_known_occupancy,
     read_known_states,
@@ -107,6 +109,13 @@ def _color(value: list[Any]) -> tuple[float, float, float]:
     return red, green, blue
 
 
+def _poses(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], Float64]:
+    return {
+        (str(row["camera"]), int(row["stamp_ns"])): np.array(row["T_world_camera"], np.float64).reshape(4, 4)
+        for row in rows
+    }
+
+
 def _inside(name: str) -> str:
     """The name itself. Raises ValueError where it leads out of its folder."""
     if Path(name).is_absolute() or ".." in Path(name).parts:
@@ -172,6 +181,11 @@ class SceneFolder:
     def background(self) -> tuple[float, float, float]:
         """What is seen where no splat is: a colour in [0, 1]; black in a scene of an older version."""
         return self._metric("background", _color, (0.0, 0.0, 0.0))
+
+    @property
+    def refined_poses(self) -> dict[tuple[str, int], Float64]:
+        """T_world_camera (4, 4) of training views by camera and stamp, where they were put right; else nothing."""
+        return self._metric("refined_poses", _poses, ())
 
     @property
     def is_anisotropic(self) -> bool:

@@ -78,6 +78,7 @@ class FakeScene:
     is_anisotropic: bool = False
     names_its_views: bool = True
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    refined_poses: dict[tuple[str, int], Float64] = field(default_factory=dict)
     run: dict[str, Any] = field(default_factory=lambda: {"config": {"occupancy": {"free_below": 0.3}}})
 
     def occupancy(self) -> OccupancyGrid:

@@ -1,0 +1,3 @@
+"""Where cameras stand against each other and the robot, from what they see: residuals, their least squares, and how
+sure it is.
+"""

@@ -1,0 +1,193 @@
+"""Depth images made ready to be laid over each other: surfaces, their normals, and what lands on them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import fixed
+from splatctrl_cli.geometry import back_project, project, transform_points
+from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, RgbdFrame
+
+Index = NDArray[np.int64]
+SMOOTH = 0.1  # of the depth, that a pixel and its four neighbours may differ by: beyond it they are no surface
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthView:
+    """One depth image, in its camera's optical frame [m].
+
+    surface, normals (h, w, 3): the point of every pixel, and the surface's unit normal there, towards the camera, 0
+    where it is not known. points, point_normals (K, 3): some of those with a normal, and the part of the image that
+    each lies in, tiles (K,). T_world_camera (4, 4): as recorded.
+    """
+
+    camera: str
+    stamp_ns: int
+    lens: Intrinsics
+    T_world_camera: Float64
+    surface: Float64
+    normals: Float64
+    points: Float64
+    point_normals: Float64
+    tiles: Index
+
+    @classmethod
+    def of(cls, frame: RgbdFrame, num_points: int, step: int = 1) -> "DepthView":
+        """The view of a frame, with at most so many points, spread over the image; step: of `surface_normals`."""
+        surface = back_project(frame.intrinsics, frame.depth)
+        normals = surface_normals(surface, step)
+        normals[bend(frame.depth, step) > fixed.CALIBRATION_CREASE * depth_sigma(frame.depth)] = 0.0
+        known = np.flatnonzero(np.any(normals != 0, axis=-1))
+        spread = np.linspace(0, len(known) - 1, min(num_points // 2, len(known))).astype(np.int64)
+        chosen = known[np.union1d(spread, _of_all_directions(normals.reshape(-1, 3)[known], num_points // 2))]
+        return cls(
+            camera=frame.camera,
+            stamp_ns=frame.stamp_ns,
+            lens=frame.intrinsics,
+            T_world_camera=frame.T_world_camera,
+            surface=surface,
+            normals=normals,
+            points=surface.reshape(-1, 3)[chosen],
+            point_normals=normals.reshape(-1, 3)[chosen],
+            tiles=tiles_of(chosen, frame.depth.shape),
+        )
+
+
+def _of_all_directions(normals: Float64, most: int) -> Index:
+    """At most so many of N normals (N, 3), by number in order, as many of each direction as there are: a table would
+    outnumber what stands on it, which alone says where along the table a camera is.
+
+    Normal-space sampling after Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm (2001).
+    """
+    side = np.argmax(np.abs(normals), axis=1)
+    largest = np.take_along_axis(normals, side[:, None], axis=1)[:, 0]
+    cells = np.clip(np.floor(normals * 1.5 + 1.5), 0, 2).astype(np.int64) @ [1, 3, 9]
+    bins = (2 * side + (largest > 0)) * 27 + cells
+    order = np.argsort(bins, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(bins[order])) + 1) if len(order) else []
+    chosen: list[Index] = []
+    for left, part in enumerate(sorted(parts, key=len)):
+        quota = (most - sum(map(len, chosen))) // (len(parts) - left)
+        chosen.append(part[np.linspace(0, len(part) - 1, min(quota, len(part))).astype(np.int64)])
+    return np.sort(np.concatenate(chosen)) if chosen else np.zeros(0, np.int64)
+
+
+def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
+    """The frame of every n-th pixel, so that it has no more than about `rows` rows; without colour."""
+    stride = max(1, frame.depth.shape[0] // rows)
+    depth = np.ascontiguousarray(frame.depth[::stride, ::stride])
+    lens = strided_lens(frame.intrinsics, stride)
+    human = None if frame.human is None else frame.human[::stride, ::stride]
+    color = np.zeros((*depth.shape, 3), np.uint8)
+    return replace(frame, depth=depth, color=color, intrinsics=lens, human=human, valid=None)
+
+
+def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:
+    """The camera of every `stride`-th pixel: pixel (0, 0) stays where it was."""
+    fx, fy, cx, cy = (value / stride for value in (lens.fx, lens.fy, lens.cx, lens.cy))
+    width, height = -(-lens.width // stride), -(-lens.height // stride)
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
+def surface_normals(surface: Float64, step: int = 1) -> Float64:
+    """Unit normals (h, w, 3) of a surface (h, w, 3) in a camera's frame, towards the camera, from the points `step`
+    pixels away on either side; 0 along edges and where depth is missing.
+    """
+    normals = np.zeros_like(surface)
+    middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
+    around = np.stack(
+        [surface[rows, columns] for rows, columns in
+         ((middle, middle), (middle, low), (middle, high), (low, middle), (high, middle))]
+    )  # fmt: skip
+    cross = np.cross(around[4] - around[3], around[2] - around[1])
+    length, z = np.linalg.norm(cross, axis=-1), around[..., 2]
+    is_known = (z > 0).all(axis=0) & (np.ptp(z, axis=0) < SMOOTH * z[0]) & (length > 0)
+    normals[middle, middle][is_known] = cross[is_known] / length[is_known][:, None]
+    return normals
+
+
+def bend(depth: Float32, step: int = 1) -> Float64:
+    """By how much (h, w) [m] a depth differs from the middle of those `step` pixels away on either side, at most."""
+    bent = np.zeros(depth.shape)
+    middle, low, high = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
+    z = depth.astype(np.float64)
+    bent[middle, middle] = np.maximum(
+        np.abs(z[middle, low] + z[middle, high] - 2 * z[middle, middle]),
+        np.abs(z[low, middle] + z[high, middle] - 2 * z[middle, middle]),
+    )
+    return np.asarray(0.5 * bent)
+
+
+def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
+    """Of points (K, 3) in a view's camera frame: which land on a depth of it (K,), and its surface and normals (K, 3)
+    there.
+    """
+    is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
+    pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
+    lands = is_ahead & np.all((pixels >= 0) & (pixels < [view.lens.width, view.lens.height]), axis=1)
+    u, v = np.where(lands[:, None], pixels, 0).astype(np.int64).T
+    surface = view.surface[v, u]
+    return lands & (surface[:, 2] > 0), surface, view.normals[v, u]
+
+
+def overlap_rows(
+    points: Float64, T: Float64, which: Bool, surface: Float64, normals: Float64
+) -> tuple[Float64, Float64, Float64]:
+    """Of points (K, 3) of another view that land (`landed`) on a view at T (4, 4) from there, those of `which` (K,):
+    the residual, their distance (M,) [m] from the plane of its surface, and its derivatives (M, 6) by a small turn
+    and move of the points' camera, and of the view's, each in its own frame.
+
+    T exp(x) moves points by ``x[:3] x p + x[3:]``, so that ``n . (T exp(x) p - s)`` changes by ``(p x R^T n) . x[:3]
+    + R^T n . x[3:]``; the other camera's move does the reverse to them.
+    """
+    own, there = points[which], transform_points(T, points[which])
+    normal = normals[which]
+    along = normal @ T[:3, :3]
+    residual = np.einsum("ki,ki->k", there - surface[which], normal)
+    return residual, np.hstack([np.cross(own, along), along]), -np.hstack([np.cross(there, normal), normal])
+
+
+def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
+    """What a camera that stands still sees in most of its frames: the mean of the inverse depths near their median.
+
+    A sensor errs in disparity, which is in proportion to inverse depth. A pixel counts where half of the frames agree
+    within three times `depth_sigma`.
+    """
+    if len(frames) == 1:
+        return frames[0]
+    depth = np.stack([frame.depth for frame in frames]).astype(np.float64)
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), np.inf)
+    num = (depth > 0).sum(axis=0)
+    ordered = np.sort(inverse, axis=0)
+    median = np.take_along_axis(ordered, np.maximum((num - 1) // 2, 0)[None], axis=0)[0]
+    is_seen = num > 0
+    middle = np.where(is_seen, median, 1.0)
+    near = np.abs(inverse - middle) < 3 * depth_sigma(1 / middle) * np.square(middle)
+    count = near.sum(axis=0)
+    mean = np.where(near, inverse, 0.0).sum(axis=0) / np.maximum(count, 1)
+    holds = is_seen & (2 * count >= len(frames)) & (mean > 0)
+    still = np.where(holds, 1 / np.where(holds, mean, 1.0), 0.0).astype(np.float32)
+    return replace(frames[len(frames) // 2], depth=still)
+
+
+def depth_sigma(depth: NDArray[np.floating]) -> Float64:
+    """What a depth (...) [m] may err by [m], as the residuals are weighed by: an error of disparity grows with the
+    square, and what every sensor has. The solution's own residuals say how much it really is.
+    """
+    return np.asarray(fixed.CALIBRATION_NOISE[0] + fixed.CALIBRATION_NOISE[1] * np.square(depth), np.float64)
+
+
+def without_people(frame: RgbdFrame) -> RgbdFrame:
+    """The frame without the depth of pixels that show a person."""
+    if frame.human is None:
+        return frame
+    return replace(frame, depth=np.where(frame.human > 0, np.float32(0.0), frame.depth))
+
+
+def tiles_of(pixels: Index, shape: tuple[int, ...]) -> Index:
+    """In which part of an image, of `CALIBRATION_TILES` rows and columns of them, each pixel (K,) lies."""
+    rows, columns = fixed.CALIBRATION_TILES
+    v, u = np.divmod(pixels, shape[1])
+    return np.asarray((v * rows // shape[0]) * columns + u * columns // shape[1], dtype=np.int64)

@@ -1,0 +1,29 @@
+"""The views of the sample's scan, and the same with poses that are off."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.calibration.pose_refinement import _motion
+from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
+from splatctrl_cli.records import RgbdFrame
+
+
+def views_of(sample_data: Path) -> list[RgbdFrame]:
+    """Of a still scene, at their true poses."""
+    source = open_to_train(RecordingRequest(path=sample_data / "dtu", is_dtu=True))
+    return [record for record in source.records() if isinstance(record, RgbdFrame)]
+
+
+def disturbed(views: Sequence[RgbdFrame], millimetres: float, degrees: float) -> list[RgbdFrame]:
+    """Each view moved and turned by so much, in a random direction."""
+    rng = np.random.default_rng(3)
+    found = []
+    for view in views:
+        turn, move = rng.normal(size=(2, 3))
+        turn, move = (axis / np.linalg.norm(axis) for axis in (turn, move))
+        twist = np.concatenate([np.radians(degrees) * turn, 1e-3 * millimetres * move])
+        found.append(replace(view, T_world_camera=view.T_world_camera @ _motion(twist)))
+    return found

@@ -1,0 +1,127 @@
+"""Recorded poses that are off, put right by what the views see; and those that are right."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatctrl_cli.calibration.pose_refinement import _by_twists, _motion, refined_poses
+from splatctrl_cli.geometry import invert_transform, transform_from, transform_points
+from splatctrl_cli.jobs.progress import SILENT
+from splatctrl_cli.jobs.refine_poses import posed_among, put_right
+from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
+from tests.calibration.scan import disturbed, views_of
+from tests.plain import plain_frame
+
+
+@pytest.fixture(scope="module")
+def views(sample_data: Path) -> list[RgbdFrame]:
+    return views_of(sample_data)
+
+
+def errors(poses: Sequence[Float64], truth: Sequence[RgbdFrame]) -> tuple[float, float]:
+    """The largest error [mm] and [deg] of a pose as the first view sees it."""
+    moves, turns = [0.0], [0.0]
+    for T, view in zip(poses, truth, strict=True):
+        true = invert_transform(truth[0].T_world_camera) @ view.T_world_camera
+        off = invert_transform(true) @ invert_transform(poses[0]) @ T
+        moves.append(1e3 * float(np.linalg.norm(off[:3, 3])))
+        turns.append(float(np.degrees(np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]))))
+    return max(moves), max(turns)
+
+
+def test_a_distance_changes_with_both_twists_as_the_derivative_says() -> None:
+    rng = np.random.default_rng(0)
+    T = _motion(rng.normal(size=6) * 0.3)
+    own, gradient = rng.normal(size=(5, 3)) + np.array([0, 0, 3]), rng.normal(size=(5, 3))
+    by = _by_twists(own, transform_points(T, own), gradient, T)
+    for k in range(6):
+        twist = np.zeros(6)
+        twist[k] = 1e-6
+        of_a = transform_points(T @ _motion(twist), own) - transform_points(T @ _motion(-twist), own)
+        of_b = transform_points(_motion(-twist) @ T, own) - transform_points(_motion(twist) @ T, own)
+        assert np.einsum("ki,ki->k", gradient, of_a) / 2e-6 == pytest.approx(by[:, k], abs=1e-7)
+        assert np.einsum("ki,ki->k", gradient, of_b) / 2e-6 == pytest.approx(by[:, 6 + k], abs=1e-7)
+
+
+@pytest.mark.parametrize(("millimetres", "degrees"), [(10.0, 0.5), (30.0, 1.5)])
+def test_poses_that_are_off_are_put_right(views: list[RgbdFrame], millimetres: float, degrees: float) -> None:
+    off = disturbed(views, millimetres, degrees)
+    before = errors([view.T_world_camera for view in off], views)
+    found = refined_poses(off)
+    assert found.is_better
+    assert not found.is_held.any()
+    after = errors(found.T_world_camera, views)
+    assert after[0] < 0.05 * before[0]
+    assert after[1] < 0.05 * before[1]
+    assert found.after < 0.1 * found.before
+    assert 0.3 * millimetres < 1e3 * np.median(found.moved) < 2 * millimetres
+
+
+def test_the_views_as_a_whole_stay_where_they_were(views: list[RgbdFrame]) -> None:
+    off = disturbed(views, 20.0, 1.0)
+    found = refined_poses(off)
+    moves = [T[:3, 3] - view.T_world_camera[:3, 3] for T, view in zip(found.T_world_camera, off, strict=True)]
+    assert np.linalg.norm(np.mean(moves, axis=0)) < 0.005
+
+
+def test_poses_that_are_right_stay_to_the_last_bit(views: list[RgbdFrame]) -> None:
+    found = refined_poses(views)
+    assert not found.is_better
+    assert all(np.array_equal(T, view.T_world_camera) for T, view in zip(found.T_world_camera, views, strict=True))
+
+
+def test_a_scene_ten_times_as_large_is_put_right_alike(views: list[RgbdFrame]) -> None:
+    def large(view: RgbdFrame) -> RgbdFrame:
+        T = view.T_world_camera.copy()
+        T[:3, 3] *= 10
+        return replace(view, T_world_camera=T, depth=view.depth * np.float32(10))
+
+    off = disturbed(views, 20.0, 1.0)
+    small, tenfold = refined_poses(off), refined_poses([large(view) for view in off], 10.0)
+    for a, b in zip(small.T_world_camera, tenfold.T_world_camera, strict=True):
+        assert 10 * a[:3, 3] == pytest.approx(b[:3, 3], abs=1e-3)
+
+
+def test_a_view_of_something_else_is_held_and_the_others_are_put_right(views: list[RgbdFrame]) -> None:
+    off = disturbed(views, 20.0, 1.0)
+    away = off[2].T_world_camera.copy()
+    away[:3, 3] += [30.0, 0.0, 0.0]
+    off[2] = replace(off[2], T_world_camera=away)
+    found = refined_poses(off)
+    assert found.is_held.tolist() == [number == 2 for number in range(len(views))]
+    assert np.array_equal(found.T_world_camera[2], away)
+    rest = [number for number in range(len(views)) if number != 2]
+    assert errors([found.T_world_camera[k] for k in rest], [views[k] for k in rest])[0] < 1.0
+
+
+def test_along_a_bare_wall_nothing_moves_far() -> None:
+    """Depth and colour that are the same everywhere say nothing of a move along the wall."""
+    lens = Intrinsics(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
+    poses = [transform_from([x, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]) for x in (0.0, 0.1, 0.2)]
+    walls = [plain_frame(np.full((120, 160), 1.0 + 0.01 * k, np.float32), lens, T) for k, T in enumerate(poses)]
+    found = refined_poses(walls)
+    assert found.is_better  # the wall was seen at three distances
+    for k, T in enumerate(found.T_world_camera):
+        assert T[:2, 3] == pytest.approx([0.1 * k, 0.0], abs=1e-3)
+    assert found.after < 0.1 * found.before
+
+
+def test_one_view_is_put_among_others_that_stay(views: list[RgbdFrame]) -> None:
+    off = disturbed(views[:1], 20.0, 1.0)[0]
+    there = posed_among(off, views[1:])
+    T = invert_transform(views[0].T_world_camera) @ there.T_world_camera
+    assert 1e3 * np.linalg.norm(T[:3, 3]) < 1.0
+    assert posed_among(views[0], views[1:]).T_world_camera is not None
+
+
+def test_what_is_stored_is_where_each_view_is(views: list[RgbdFrame]) -> None:
+    off = disturbed(views, 20.0, 1.0)
+    moved, told = put_right(off, "scan", SILENT)
+    for frame, row in zip(moved, told["refined_poses"], strict=True):
+        assert np.array_equal(np.reshape(row["T_world_camera"], (4, 4)), frame.T_world_camera)
+    assert told["pose_residual"] < 0.1 * told["poses"]["residual_before"]
+    assert told["poses"]["held"] == []

@@ -1,0 +1,93 @@
+"""``--refine-poses`` from the recording to the score."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import load_config
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs import score_reference
+from splatctrl_cli.jobs.open_recording import RecordingRequest
+from splatctrl_cli.jobs.reconstruct import reconstruct
+from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
+from splatctrl_cli.jobs.reconstruction import ReconstructRequest
+from splatctrl_cli.jobs.score import ScoreRequest, score
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.scene_files.scene_folder import SceneFolder
+from tests.calibration.scan import disturbed, views_of
+from tests.jobs.wall import FakeSource
+
+SMALL = [
+    "scene.max_splats=1500",
+    "scene.first_iterations=60",
+    "scene.refine_iterations=200",
+    "gaussians.iterations=50",
+]
+HELD_OUT = 3
+
+
+@pytest.fixture(scope="module")
+def views(sample_data: Path) -> list[RgbdFrame]:
+    return views_of(sample_data)
+
+
+def held_out(views: list[RgbdFrame]) -> list[RgbdFrame]:
+    return [replace(view, camera="holdout") if k == HELD_OUT else view for k, view in enumerate(views)]
+
+
+def request(views: list[RgbdFrame], out: Path, *, has_clock: bool = False, refine: bool = True) -> ReconstructRequest:
+    return ReconstructRequest(
+        source=FakeSource(frames=[view for view in views if view.camera != "holdout"], has_clock=has_clock),
+        out=out,
+        config=load_config(None, SMALL),
+        refine_poses=refine,
+        allow_disagreement=True,
+    )
+
+
+def test_a_view_held_out_is_scored_where_it_was_recorded_and_where_it_belongs(
+    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    off = held_out(disturbed(views, 15.0, 1.0))
+    result = reconstruct(request(off, tmp_path / "scene"))
+    assert result.metrics["pose_residual"] < 0.1 * result.metrics["poses"]["residual_before"]
+    assert len(SceneFolder(tmp_path / "scene").refined_poses) == len(views) - 1
+    monkeypatch.setattr(score_reference, "open_source", lambda path, options: FakeSource(frames=off, has_clock=False))
+    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
+    assert scored.metrics["psnr_all_posed"] > scored.metrics["psnr_all"] + 2.0  # type: ignore[operator]
+    assert scored.metrics["depth_median_all_posed"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+
+
+def test_right_poses_give_the_same_splats_with_and_without(views: list[RgbdFrame], tmp_path: Path) -> None:
+    right = held_out(views)
+    with_, without = (reconstruct(request(right, tmp_path / str(refine), refine=refine)) for refine in (True, False))
+    assert (with_.out / "splats.ply").read_bytes() == (without.out / "splats.ply").read_bytes()
+    assert without.metrics["pose_residual"] is None
+
+
+def test_the_baseline_is_put_right_alike(views: list[RgbdFrame], tmp_path: Path) -> None:
+    off = disturbed(views, 15.0, 1.0)
+    of_ours, of_theirs = (
+        make(request(off, tmp_path / name)).metrics["refined_poses"]
+        for name, make in (("splats", reconstruct), ("gaussians", reconstruct_gaussians))
+    )
+    assert of_ours == of_theirs
+
+
+def test_a_view_that_cannot_be_put_right_is_named(views: list[RgbdFrame], tmp_path: Path) -> None:
+    off = disturbed(views, 15.0, 1.0)
+    away = off[2].T_world_camera.copy()
+    away[:3, 3] += [30.0, 0.0, 0.0]
+    off[2] = replace(off[2], T_world_camera=away)
+    notes = [reason.sentence for reason in reconstruct(request(off, tmp_path / "scene")).verdict.reasons]
+    assert any("not put right" in note and f"at {off[2].stamp_ns}" in note for note in notes)
+
+
+def test_what_nothing_tells_is_refused(views: list[RgbdFrame], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="recorded over time"):
+        reconstruct(request(views, tmp_path / "scene", has_clock=True))
+    bare = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
+    with pytest.raises(InputError, match="depth"):
+        reconstruct_gaussians(request(bare, tmp_path / "scene"))
