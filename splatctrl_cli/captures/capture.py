@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatctrl_cli.captures.capture_header import read_capture_header
-from splatctrl_cli.captures.capture_index import COLUMNS, FileSums, FrameRows
+from splatctrl_cli.captures.capture_index import COLUMNS, ROBOT, FileSums, FrameRows
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
 from splatctrl_cli.files.image_file import decode_file
@@ -25,6 +25,7 @@ from splatctrl_cli.logs.joint_topics import (
     without_joints,
 )
 from splatctrl_cli.logs.messages import metres
+from splatctrl_cli.logs.robot_description import RobotDescription
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask
@@ -192,6 +193,16 @@ class CaptureSource:
         if not file.is_file() or self._sums.get(name) != sha256(file):
             raise InputError(f"{file}: missing, or its checksum differs from SHA256SUMS", remedy=AGAIN)
         return file
+
+
+def robot_description_of(path: Path) -> list[RobotDescription]:
+    """The robot that a capture's log described, none where it did not. Raises InputError for a file that changed."""
+    file = path / ROBOT
+    if not file.is_file():
+        return []
+    if FileSums(path).get(ROBOT) != sha256(file):
+        raise InputError(f"{file}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+    return [RobotDescription(where=ROBOT, text=file.read_bytes().decode("utf-8"))]
 
 
 def _pose(row: Mapping[str, str]) -> Float64:

@@ -18,6 +18,7 @@ from splatctrl_cli.logs.joint_topics import AGAIN
 SUMS = "SHA256SUMS"
 COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
 MASKS = ("human", "valid")  # further columns, where the recording has such masks
+ROBOT = "robot_description.urdf"  # the URDF that the log itself brings, where it does
 _FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
 _MOST_ROW = 1 << 16  # bytes of a row
 IN_MEMORY = 1 << 16  # [bytes] of the lines of one folder

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.lib import format as npy
 
-from splatctrl_cli.captures.capture_index import COLUMNS, MASKS, Checksums
+from splatctrl_cli.captures.capture_index import COLUMNS, MASKS, ROBOT, Checksums
 from splatctrl_cli.captures.capture_journal import Entry, Journal, check_same_frame
 from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, WriteError
@@ -49,6 +49,7 @@ def write_capture(
     source: FrameSource,
     *,
     topics: JointTopics | None = None,
+    robot: str = "",
     progress: Callable[[int], None] | None = None,
     identity: Mapping[str, Any] | None = None,
 ) -> CaptureSummary:
@@ -57,8 +58,8 @@ def write_capture(
     The folder is empty, or what an interrupted run left: its frames are not written again. JPEG and PNG colour is
     kept byte for byte where its pixels are the frame's; depth becomes 16-bit PNG in the unit it was recorded in, or
     .npy [m] where no unit holds it. topics: the joint states as they were recorded, beside those of `source`, which
-    are of one topic. Raises InputError when the source yields no frame, UsageError where the frames that are there
-    are not the source's.
+    are of one topic. robot: the URDF that the log itself brings, "" for none. Raises InputError when the source
+    yields no frame, UsageError where the frames that are there are not the source's.
     """
     states = StateCollector(len(source.joint_names))
     cameras: dict[str, dict[str, Any]] = {}
@@ -94,7 +95,7 @@ def write_capture(
             "loss": asdict(source.loss),
         }
         _write_joints(folder / "joints.npz", states.columns())
-        _write_index(folder, header, journal, topics)
+        _write_index(folder, header, journal, topics, robot)
         journal.remove()
     return CaptureSummary(
         num_frames={name: camera["num_frames"] for name, camera in cameras.items()},
@@ -104,9 +105,16 @@ def write_capture(
     )
 
 
-def _write_index(folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None) -> None:
-    """frames.csv, provenance.csv, joint topics, capture.json and SHA256SUMS, which names everything but itself."""
+def _write_index(
+    folder: Path, header: dict[str, Any], journal: Journal, topics: JointTopics | None, robot: str
+) -> None:
+    """frames.csv, provenance.csv, joint topics, the robot's URDF, capture.json and SHA256SUMS, which names everything
+    but itself.
+    """
     names = ["joints.npz", "frames.csv"]
+    if robot:
+        (folder / ROBOT).write_text(robot, encoding="utf-8", newline="")
+        names.append(ROBOT)
     columns = (*COLUMNS, *(name for name in MASKS if name in journal.masks))
     with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")

@@ -107,6 +107,7 @@ end-effector | note, error | replay | logged end-effector poses against the robo
 arm | note, warning |  | measured minus rendered depth of the robot's surface, per camera [mm]; a warning beyond 30
     mm, beyond 25 mm in the mean, where a quarter of the pixels show the background, or where depth is 4 % off
     throughout
+robot-model | warning |  | `--urdf` is another mechanism than the log's own robot_description
 quick | note |  | only the first images were read
 """
 _BLOCKED = {"": (), "all": ALL, "later": LATER, "replay": ("replay",)}

@@ -144,7 +144,7 @@ def _check(add: Options, parser: Parser) -> None:
         nargs="?",
         const=QUICK,
     )
-    add("--urdf FILE", "compare joint states and depth with this robot", Path)
+    add("--urdf FILE", "compare joint states and depth with this robot (with --spheres: the log's own)", Path)
     add("--spheres FILE", "its spheres (default: those of the URDF)", Path)
     more = add.group("robot")
     more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)

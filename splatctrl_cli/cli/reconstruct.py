@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
         args,
         config=config,
         source=source,
+        recording=args.source,
         out=args.out or Path("scene"),
         box=None if args.box is None else Box.from_text(args.box),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},

@@ -33,7 +33,7 @@ def replay_options(add: Options, parser: Parser) -> None:
     scene("--scene SCENE", "a reconstruction: its splats, as known at each time", Path)
     lockstep = "reconstruct the scene from LOG's own cameras, in step with the replay"
     scene("--lockstep", lockstep)
-    add("--urdf FILE", "the robot's URDF", Path, required=True)
+    add("--urdf FILE", "the robot's URDF (default: the log's own robot_description)", Path)
     add("--spheres FILE.yaml", "its spheres (default: the URDF's own)", Path)
     add("--mode", "what to replay", MODES, "audit")
     add("--start-time S", "start at this time of the log [s], or first-map: where the scene is first known", _start)

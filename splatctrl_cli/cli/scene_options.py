@@ -29,7 +29,7 @@ def reconstruct_options(add: Options, parser: Parser) -> None:
     add("--dtu ROOT", "a DTU data set in MVSNet's layout, or in IDR's and NeuS's, instead", Path)
     add_output(add, "scene folder", default="scene")
     add("--resume", "continue an interrupted run, to the same bytes")
-    add("--urdf FILE", "the robot: labels its splats, sets the workspace", Path)
+    add("--urdf FILE", "the robot (default: the log's own): labels its splats, sets the workspace", Path)
     add("--spheres FILE.yaml", "its collision spheres", Path)
     add(f"--box {BOX}", "workspace [m] (default: the robot's reach, else the valid depth)")
     budget = "budget of splats (default: 5000)"

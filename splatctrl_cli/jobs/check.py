@@ -7,13 +7,15 @@ from pathlib import Path
 
 from splatctrl_cli.checks.check_folder import check_folder
 from splatctrl_cli.checks.check_log import check_log
-from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, error, note
+from splatctrl_cli.checks.finding import CheckReport, Finding, Severity, error, note, warning
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.verdict import Outcome, Reason, Verdict, verdict_of
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.logged_robot import TAKE, differs, logged_urdf
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import read_urdf
 from splatctrl_cli.scene.recording_consistency import CAUSES, agreements
 from splatctrl_cli.sources.source import open_logs
 
@@ -24,7 +26,8 @@ NEVER = "never"
 class CheckRequest:
     """One check of a recording, `paths` of which are several only where they are logs of one session.
 
-    num_images: only so many of a topic are read, None for all. urdf: a robot to compare joint states and depth with;
+    num_images: only so many of a topic are read, None for all. urdf: a robot to compare joint states and depth with,
+    with `spheres` alone the one that the log describes;
     base: its pose in world as x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves.
     fail_on: "error", "warning" or NEVER, the least severity that fails.
     """
@@ -55,24 +58,29 @@ def check(request: CheckRequest) -> CheckResult:
     if request.num_images is not None and request.num_images < 1:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
     model, log = _robot(request), open_logs(request.paths)
+    other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
     if log is None:
         report = check_folder(request.paths[0], request.options, model=model, num_images=request.num_images)
     else:
         report = check_log(log, request.options, model=model, num_images=request.num_images)
-    report = replace(report, findings=[*report.findings, *_agreement(report)])
+    findings = [warning("robot-model", str(request.urdf), other, TAKE)] if other else []
+    report = replace(report, findings=[*report.findings, *_agreement(report), *findings])
     verdict = _verdict(report, request.fail_on)
     return CheckResult(report=report, verdict=verdict, exit_code=0 if request.fail_on == NEVER else verdict.exit_code)
 
 
 def _robot(request: CheckRequest) -> RobotModel | None:
-    if request.urdf is None:
+    urdf = None if request.urdf is None else read_urdf(request.urdf)
+    if urdf is None and request.spheres is not None:  # without spheres it is often none that can be used
+        urdf = logged_urdf(request.paths)
+    if urdf is None:
         given = {"spheres": request.spheres, "base": request.base, "lock": request.locked or None}
         for name, value in given.items():
             if value is not None:
                 raise UsageError(f"--{name}: expected --urdf beside it")
         return None
     T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
-    return RobotModel.from_urdf(request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked)
+    return RobotModel.from_urdf(urdf, request.spheres, T_world_base=T_world_base, locked=request.locked)
 
 
 def _agreement(report: CheckReport) -> Iterator[Finding]:

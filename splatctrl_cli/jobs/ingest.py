@@ -16,6 +16,7 @@ from splatctrl_cli.datasets.image_folder import HOLDOUT
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.verdict import DAMAGED
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
+from splatctrl_cli.jobs.logged_robot import logged_descriptions
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.resume import check_same_run, told_how_to_go_on
 from splatctrl_cli.logs.ros_log import RosLogSource
@@ -92,6 +93,12 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
     if set(source.cameras) == {HOLDOUT}:
         given = ",".join(options.cameras or ())
         raise UsageError(f"--cameras {given}: leaves no camera to train with", remedy="name another, or leave it out")
+    robots = [description for _, description in logged_descriptions(request.paths)]
+    if len(robots) > 1:
+        said = ", ".join(robot.where for robot in robots)
+        progress.log(
+            f"warning: {len(robots)} robots are described, by {said}: none is kept; give --urdf to each command"
+        )
     progress.log(f"{source.name}: cameras {', '.join(source.cameras)}; {len(source.joint_names)} joints")
     identity = _identity(options, source.digests())
     journal = partial_path(out) / JOURNAL
@@ -103,7 +110,14 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
         if before is not None:
             check_same_run(partial, before, identity)
         with stopwatch.stage("write"):
-            summary = write_capture(partial, source, topics=topics, progress=_counted(progress), identity=identity)
+            summary = write_capture(
+                partial,
+                source,
+                topics=topics,
+                robot=robots[0].text if len(robots) == 1 else "",
+                progress=_counted(progress),
+                identity=identity,
+            )
         if summary.num_resumed:
             progress.log(f"{summary.num_resumed} frames were there already")
         result = IngestResult(capture=out, summary=summary)

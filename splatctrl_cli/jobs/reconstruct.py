@@ -5,16 +5,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from splatctrl_cli.errors import UsageError
+from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
+from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest, training_cameras
 from splatctrl_cli.jobs.resume import checkpoint_to_go_on_from, identity, told_how_to_go_on
+from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations, read_declarations
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import UrdfFile
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT
 
 
@@ -135,14 +138,24 @@ def _goes_on(request: ReconstructRequest, checkpoint_file: Path, progress: Progr
 
 def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None:
     """The request's robot, with what a person should know of it said."""
-    if request.urdf is None:
+    urdf = urdf_of(request.urdf, [request.recording] if request.recording else [], progress)
+    if urdf is None:
         if request.spheres is not None:
             raise UsageError(f"--spheres {request.spheres}: needs the robot", remedy="give --urdf as well")
         return None
-    model = RobotModel.from_urdf(request.urdf, request.spheres)
-    if request.source.joint_names:
-        model = model.moved_by(request.source.joint_names)
-        model.joint_order(request.source.joint_names)
+    try:
+        model = RobotModel.from_urdf(urdf, request.spheres)
+        if request.source.joint_names:
+            model = model.moved_by(request.source.joint_names)
+            model.joint_order(request.source.joint_names)
+        if request.urdf is None:
+            _check_fits(urdf, request.source)
+            progress.log(f"the robot is the log's own: {urdf.path}")
+    except InputError as error:
+        if request.urdf is not None or request.spheres is not None:
+            raise
+        progress.log(f"warning: the robot stays in the map: {error.message}; {error.remedy}")  # nobody asked for it
+        return None
     for doubt in model.doubts:
         progress.log(f"warning: {doubt}")
     if model.surface.by_spheres:
@@ -152,3 +165,13 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
             " paths of the URDF's meshes"
         )
     return model
+
+
+def _check_fits(urdf: UrdfFile, source: RecordSource) -> None:
+    """Raise InputError where a robot that nobody named would stand elsewhere than it did, or would not move."""
+    if words := other_frame(urdf, source):
+        raise InputError(
+            f"{urdf.path}: {words}", remedy=f"give --world-frame {urdf.root}, or --urdf where both frames are one"
+        )
+    if not source.joint_names:
+        raise InputError(f"{source.name}: expected joint states, got none", remedy="record /joint_states")

@@ -53,7 +53,8 @@ def no_frame(source: RecordSource, cameras: Sequence[str]) -> InputError:
 class ReconstructRequest:
     """One reconstruction of `source` into the folder `out`.
 
-    urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given.
+    urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given;
+    without urdf the one that the log `recording` describes, where it does.
     points: a coloured cloud to start from, instead of depth. declare: a TOML of what the robot carries. refine_poses:
     put the views of a still scene where they fit each other. resume: go on with what an interrupted run left.
     require: gates on its metrics. options: what else decides the bytes, by the names of the options: a run that is
@@ -63,6 +64,7 @@ class ReconstructRequest:
     source: RecordSource
     out: Path
     config: Config = field(default_factory=Config)
+    recording: Path | None = None
     urdf: Path | None = None
     spheres: Path | None = None
     box: Box | None = None

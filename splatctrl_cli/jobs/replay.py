@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatctrl_cli.captures.capture_index import ROBOT
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate.gates import check_gate_names
@@ -144,7 +145,9 @@ def _read(
     request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
 ) -> tuple[ReplayInputs, LoggedStates, Evidence | None]:
     """What the replay needs; `motion` is shown all frames of the log now, or as a lockstep takes them in."""
-    robot, opened = open_log(request)
+    robot, opened = open_log(request, progress)
+    if request.urdf is None:  # for who looks at the run
+        (folder / ROBOT).write_text(robot.urdf.text, encoding="utf-8", newline="")
     model = measured_robot(request, robot, request.config.control)
     truth = None if request.truth is None else load_truth(request.truth)
     logged = read_states(opened, model)

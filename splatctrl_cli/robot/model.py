@@ -81,26 +81,26 @@ class RobotModel:
     @classmethod
     def from_urdf(
         cls,
-        urdf: Path,
+        urdf: Path | UrdfFile,
         spheres: Path | SphereSet | None = None,
         *,
         T_world_base: Float64 | None = None,
         locked: Mapping[str, float] | None = None,
         packages: Sequence[Path] = (),
     ) -> "RobotModel":
-        """The robot of a URDF file with the spheres of a file or a set, else with those that the URDF itself has.
+        """The robot of a URDF with the spheres of a file or a set, else with those that the URDF itself has.
 
         T_world_base (4, 4) places the URDF's root link (default: at the world's origin); locked holds joints still
         at a value [rad or m], e.g. fingers that no log moves, and with each the joints that mimic it; packages: where
         ``package://`` paths of `surface` are looked for, before the folders above the URDF. Raises InputError, naming
         file and remedy.
         """
-        file = read_urdf(urdf)
+        file = urdf if isinstance(urdf, UrdfFile) else read_urdf(urdf)
         try:
             model = pinocchio.buildModelFromXML(file.text)
         except (ValueError, RuntimeError) as error:
-            raise InputError(f"{urdf}: not a URDF that can be built: {error}") from None
-        model = _without(model, file.with_followers(locked or {}), urdf)
+            raise InputError(f"{file.path}: not a URDF that can be built: {error}") from None
+        model = _without(model, file.with_followers(locked or {}), file.path)
         T = np.eye(4) if T_world_base is None else T_world_base
         if spheres is None:
             return cls(file, model, spheres_of(file), T, (), are_links_renamed=False, packages=packages)

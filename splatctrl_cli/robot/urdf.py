@@ -75,6 +75,12 @@ class UrdfFile:
         return tuple((joint.parent, joint.child) for joint in self.joints)
 
     @property
+    def root(self) -> str:
+        """The link that no joint moves."""
+        children = {joint.child for joint in self.joints}
+        return next(link for link in self.links if link not in children)
+
+    @property
     def collision_links(self) -> tuple[str, ...]:
         """Links with collision geometry, in the file's order."""
         named = {
@@ -152,13 +158,13 @@ def _moves(joint: Joint, movable: Collection[str] | None) -> bool:
     return joint.kind != "fixed" if movable is None else joint.name in movable
 
 
-def read_urdf(path: Path) -> UrdfFile:
-    """The URDF at `path`, once it is known to be one robot with at least one movable joint.
+def read_urdf(path: Path, text: str | None = None) -> UrdfFile:
+    """The URDF at `path`, or the `text` that is called so, once it is known to be one robot with a movable joint.
 
     Raises InputError for a file that is missing or no URDF, several root links, a joint without the limits it needs,
     or no movable joint (which is what an unexpanded xacro looks like).
     """
-    text, root = _parse(path)
+    text, root = _parse(path, _read(path) if text is None else text)
     links = tuple(_attribute(path, element, "name") for element in root.findall("link"))
     if len(set(links)) < len(links):
         twice = next(link for link in links if links.count(link) > 1)
@@ -193,13 +199,16 @@ def read_urdf(path: Path) -> UrdfFile:
     )
 
 
-def _parse(path: Path) -> tuple[str, Any]:
+def _read(path: Path) -> str:
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give the robot's URDF file") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected a URDF, got bytes that are not text") from None
+
+
+def _parse(path: Path, text: str) -> tuple[str, Any]:
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:  # ValueError: what defusedxml forbids

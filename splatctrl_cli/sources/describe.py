@@ -17,6 +17,7 @@ from splatctrl_cli.files.listing import files_below, names_in
 from splatctrl_cli.files.summary import Grid, Summary
 from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.logs.rig import camera_topics, missing
+from splatctrl_cli.logs.robot_description import NAME as ROBOT
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
 from splatctrl_cli.logs.survey import Survey, TopicSurvey, survey_to_describe
@@ -61,6 +62,9 @@ def describe_log(log: RawLog, options: SourceOptions) -> Summary:
     joints = next((t.joints.first_names for t in found.topics.values() if t.joints.first_names is not None), ())
     if joints:
         facts["joints"] = list(joints)
+    robots = [name for name, t in sorted(found.topics.items()) if t.count and name.endswith(f"/{ROBOT}")]
+    if robots:
+        facts[ROBOT] = robots
     grids = [Grid(name="topics", header=_TOPIC_COLUMNS, rows=[_topic_row(t) for t in _by_name(found)])]
     cameras = camera_topics(log, found, options)
     if cameras:

@@ -24,7 +24,7 @@ def coverage_once(monkeypatch: pytest.MonkeyPatch) -> None:
     measure = coverage.coverage_deficit
 
     def known(urdf: UrdfFile, spheres: SphereSet, **how: Any) -> coverage.CoverageReport:
-        text = urdf.path.read_bytes()
+        text = urdf.text.encode()
         if b"<mesh" in text:
             return measure(urdf, spheres, **how)
         names = repr((how, spheres.links)).encode()

@@ -17,9 +17,11 @@ from splatctrl_cli.checks.clock_offset import (
 )
 from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.config.fixed import COVERED_COARSE
-from splatctrl_cli.errors import InputError, NotEvaluableError
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_from
+from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of
+from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource
@@ -46,20 +48,25 @@ FR3_LIMITS = (
 )
 
 
-def open_log(request: ReplayRequest) -> tuple[RobotModel, FrameSource | StateSource]:
-    """The robot of the arguments and the log that moves it, fingers locked that it does not move.
+def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[RobotModel, FrameSource | StateSource]:
+    """The robot of the arguments or the log, and the log that moves it, fingers locked that it does not move.
 
-    Raises InputError for a log without joint states.
+    Raises InputError for a log without joint states, UsageError where neither says which robot it is.
     """
+    urdf = urdf_of(request.urdf, (request.log,), progress)
+    if urdf is None:
+        raise UsageError(f"replay: {request.log} does not describe the robot", remedy="give it with --urdf FILE")
     T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
     model = RobotModel.from_urdf(
-        request.urdf, request.spheres, T_world_base=T_world_base, locked=request.locked, packages=request.packages
+        urdf, request.spheres, T_world_base=T_world_base, locked=request.locked, packages=request.packages
     )
     source = open_states(request.log, request.options, model.joint_names)
     if not source.joint_names:
         raise InputError(
             f"{request.log}: expected joint states, got none", remedy="replay needs a log with /joint_states"
         )
+    if request.urdf is None and request.base is None and (words := other_frame(urdf, source)):
+        progress.log(f"warning: the robot is placed at the origin: {words}; give --base if it stood elsewhere")
     return model.moved_by(source.joint_names), source
 
 

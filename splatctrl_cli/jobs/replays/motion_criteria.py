@@ -239,7 +239,7 @@ def surface_clearance(judged: Judged) -> Iterator[Reason]:
         yield lacking(
             sentence=f"no sphere on {', '.join(bare)}: nothing is known of their clearance",
             who=bare[0],
-            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {judged.request.urdf}",
+            remedy=f"fit a set that covers them: splatctrl robot spheres --urdf {judged.inputs.model.urdf.path}",
         )
     spheres, surface, between = _of_body(judged)
     if surface is None:

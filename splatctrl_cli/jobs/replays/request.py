@@ -26,7 +26,8 @@ FIRST_MAP = "first-map"  # a start time: that of the first map
 class ReplayRequest:
     """One replay: the options of ``splatctrl replay``, by their names.
 
-    log: a log or capture with joint states, read as `options` say. One of `scene` (a reconstruction), `field` (a
+    log: a log or capture with joint states, read as `options` say. urdf: the robot, None for the one that the log
+    describes itself. One of `scene` (a reconstruction), `field` (a
     baked grid) and `lockstep` (reconstruct the log on the way) says what is known of the scene. base: pose of the
     URDF's root in world, x, y, z, qx, qy, qz, qw; locked: values [rad or m] of joints that no log moves. Times in
     seconds; start_time may be FIRST_MAP. evidence: a camera, or every how many frame sets, that did not train the
@@ -36,8 +37,8 @@ class ReplayRequest:
     """
 
     log: Path
-    urdf: Path
     out: Path
+    urdf: Path | None = None
     config: Config = made_by(default_factory=Config)
     options: SourceOptions = made_by(default_factory=SourceOptions)
     scene: Path | None = None

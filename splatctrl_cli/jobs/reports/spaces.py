@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.captures.capture_index import ROBOT
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.output import sha256
@@ -95,13 +96,15 @@ def space_of_replay(run: RunFolder, roots: tuple[Path, ...] = ()) -> Space:
 
 
 def robot_of(run: RunFolder, states: States, roots: tuple[Path, ...] = ()) -> RobotModel:
-    """The robot of a replay with these states, as its command line named it. Raises InputError where its files are
-    not found.
+    """The robot of a replay with these states, as its command line or its log named it. Raises InputError where its
+    files are not found.
     """
     files = {name: run.option(f"--{name}") for name in ("urdf", "spheres")}
-    if files["urdf"] is None:
-        raise InputError(f"{run.path}: its command line has no --urdf", remedy="replay with the command line")
     found = {name: _file(run, given, roots) for name, given in files.items() if given is not None}
+    if files["urdf"] is None and run.parts.has(run.path / ROBOT):
+        found["urdf"] = run.parts.checked(run.path / ROBOT)
+    if "urdf" not in found:
+        raise InputError(f"{run.path}: its command line has no --urdf", remedy="replay with the command line")
     base = run.option("--base")
     locks = tuple((name, float(value)) for name, _, value in (word.partition("=") for word in run.options("--lock")))
     packages = tuple(place for word in run.options("--packages") if (place := run.place_of(word, roots)))

@@ -1,0 +1,81 @@
+"""Which robot a job works with: that of --urdf, else the one that the log describes itself."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatctrl_cli.captures.capture import CaptureSource, robot_description_of
+from splatctrl_cli.captures.capture_header import is_capture
+from splatctrl_cli.containers.log_formats import open_raw_log
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.jobs.open_recording import is_folder_of_views
+from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.logs.robot_description import NAME, RobotDescription, robot_descriptions
+from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.video_file import SUFFIXES as VIDEOS
+from splatctrl_cli.records import RecordSource
+from splatctrl_cli.robot.model_difference import model_difference
+from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.states.state_source import StateSource
+from splatctrl_cli.states.state_table import is_table
+
+TAKE = "leave --urdf out to take the log's own, or correct the file"
+
+
+def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
+    """What logs and captures of one session say of the robot, each text once, with the path that says it."""
+    found: dict[str, tuple[Path, RobotDescription]] = {}
+    for path in paths:
+        if is_capture(path):
+            said = robot_description_of(path)
+        elif not path.exists() or path.suffix.lower() in VIDEOS or is_folder_of_views(path) or is_table(path):
+            said = []  # no log
+        else:
+            said = robot_descriptions(open_raw_log(path))
+        for description in said:
+            found.setdefault(description.text, (path, description))
+    return list(found.values())
+
+
+def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:
+    """The robot that logs describe, None where none does. Raises InputError where they describe several, or none that
+    is a URDF.
+    """
+    found = logged_descriptions(paths)
+    if len(found) > 1:
+        where = ", ".join(description.where for _, description in found)
+        raise InputError(f"{paths[0]}: {len(found)} robots, of {where}", remedy="give one of them with --urdf")
+    return _urdf(*found[0]) if found else None
+
+
+def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILENT) -> UrdfFile | None:
+    """The robot of --urdf, with a warning where the logs describe another one; without it the one that they describe,
+    None where they describe none. Raises InputError.
+    """
+    if given is None:
+        return logged_urdf(paths)
+    file = read_urdf(given)
+    if words := differs(file, paths):
+        progress.log(f"warning: {words}; {TAKE}")
+    return file
+
+
+def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
+    """In words, that the poses of a log or capture are in another frame than the robot's root; empty where not."""
+    if not isinstance(source, RosLogSource | CaptureSource) or source.world_frame == file.root:
+        return ""
+    return f"the poses are in the frame '{source.world_frame}', not in that of its root '{file.root}'"
+
+
+def differs(file: UrdfFile, paths: Sequence[Path]) -> str:
+    """How a model differs from all that the logs describe, in words; empty where it does not, or there is none."""
+    words = []
+    for path, description in logged_descriptions(paths):
+        try:
+            words.append(model_difference(file, _urdf(path, description)))
+        except (InputError, ValueError, RuntimeError) as error:
+            words.append(f"{path}: its {NAME} cannot be read: {error}")
+    return words[0] if words and all(words) else ""
+
+
+def _urdf(path: Path, description: RobotDescription) -> UrdfFile:
+    return read_urdf(path / description.where.strip("/"), description.text)
