@@ -3,37 +3,18 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatctrl_cli.captures.capture import CaptureSource, robot_description_of
-from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.log_formats import open_raw_log
+from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.jobs.open_recording import is_folder_of_views
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.logs.robot_description import NAME, RobotDescription, robot_descriptions
+from splatctrl_cli.logs.robot_description import NAME, RobotDescription
 from splatctrl_cli.logs.ros_log import RosLogSource
-from splatctrl_cli.logs.video_file import SUFFIXES as VIDEOS
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.model_difference import model_difference
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.sources.source import logged_descriptions
 from splatctrl_cli.states.state_source import StateSource
-from splatctrl_cli.states.state_table import is_table
 
 TAKE = "leave --urdf out to take the log's own, or correct the file"
-
-
-def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
-    """What logs and captures of one session say of the robot, each text once, with the path that says it."""
-    found: dict[str, tuple[Path, RobotDescription]] = {}
-    for path in paths:
-        if is_capture(path):
-            said = robot_description_of(path)
-        elif not path.exists() or path.suffix.lower() in VIDEOS or is_folder_of_views(path) or is_table(path):
-            said = []  # no log
-        else:
-            said = robot_descriptions(open_raw_log(path))
-        for description in said:
-            found.setdefault(description.text, (path, description))
-    return list(found.values())
 
 
 def logged_urdf(paths: Sequence[Path]) -> UrdfFile | None:

@@ -1,15 +1,17 @@
 """Opens any recorded input as records in time order."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.captures.capture import CaptureSource, robot_description_of
 from splatctrl_cli.captures.capture_header import is_capture
-from splatctrl_cli.containers.log_formats import SessionLog
+from splatctrl_cli.containers.log_formats import SessionLog, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import open_image_folder
 from splatctrl_cli.datasets.layouts import has_views, open_layout
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.logs.robot_description import RobotDescription, robot_descriptions
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource
@@ -43,6 +45,23 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
     """
     log = open_logs(paths)
     return open_source(paths[0], options) if log is None else RosLogSource(log, options or SourceOptions())
+
+
+def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:
+    """What logs and captures of one session say of the robot, each text once, with the path that says it; other
+    recordings, and what cannot be opened, say nothing.
+    """
+    found: dict[str, tuple[Path, RobotDescription]] = {}
+    for path in paths:
+        said = []
+        if is_capture(path):
+            said = robot_description_of(path)
+        elif path.exists() and not has_views(path):
+            with suppress(InputError):  # who reads it says why
+                said = robot_descriptions(open_raw_log(path))
+        for description in said:
+            found.setdefault(description.text, (path, description))
+    return list(found.values())
 
 
 def open_logs(paths: Sequence[Path]) -> RawLog | None:

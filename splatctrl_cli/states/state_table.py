@@ -55,11 +55,6 @@ class StatesTable:
     episode: int | None = None
 
 
-def is_table(path: Path) -> bool:
-    """Whether a file is a table of numbers by its name, or a folder a dataset of them."""
-    return path.suffix.lower() in {".csv", *ARRAY_FILES} or lerobot.is_lerobot(path)
-
-
 def described_track(path: Path) -> tuple[RawTrack, Path]:
     """The states that a TOML file describes, and the file that holds them.
 
