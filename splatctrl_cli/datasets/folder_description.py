@@ -133,14 +133,15 @@ ImageFile = Path | ImagePart
 class ListedView:
     """A view by its files, where a layout names them one by one instead of by globs.
 
-    matrix: its pose as the layout writes it, None where it has none; camera: its lens, None for [camera];
+    depth: None where no view of a layout has any; matrix: its pose as the layout writes it, None where it has none;
+    camera: its lens, None for [camera];
     depth_scale: metres per count, None for that of [depth]; valid: an 8-bit grey image, 0 where a pixel is not to be
     used, None where all are.
     """
 
     name: str
     color: ImageFile
-    depth: ImageFile
+    depth: ImageFile | None
     matrix: Float64 | None
     human: Path | None = None
     stamp_ns: int | None = None
@@ -155,7 +156,8 @@ class Description:
 
     listed: the views of a layout, instead of frames; is_depth_resized: depth of another size shows the same view and
     is brought to the size of colour by nearest pixels; unpaired: colour and depth files without partner; num_damaged:
-    views that a damaged file lacks; notes: what a layout leaves open and was taken as usual.
+    views that a damaged file lacks; supply: how depth may be added where no view has any; notes: what a layout leaves
+    open and was taken as usual.
     """
 
     path: Path
@@ -171,6 +173,7 @@ class Description:
     is_depth_resized: bool = False
     unpaired: tuple[int, int] = (0, 0)
     num_damaged: int = 0
+    supply: str = "describe colour and depth files in a .toml (docs/input.md)"
     notes: tuple[str, ...] = ()
 
     @property
@@ -261,7 +264,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 def _read(content: dict[str, Any], path: Path, root: Path | None) -> Description:
     known = {f.name for f in fields(Description)} - {
-        *("path", "listed", "is_depth_resized", "unpaired", "num_damaged", "notes")
+        *("path", "listed", "is_depth_resized", "unpaired", "num_damaged", "supply", "notes")
     }
     _check_keys(content, known, str(path), "")
     try:

@@ -34,7 +34,7 @@ class View:
 
     name: str
     color: ImageFile
-    depth: ImageFile
+    depth: ImageFile | None
     human: Path | None
     T_world_camera: Float64
     stamp_ns: int
@@ -96,13 +96,14 @@ def _present(description: Description, loss: LossReport) -> list[ListedView]:
     """Listed views whose files are there; others are counted as unpaired. Raises InputError for a file outside."""
     root, present, absent = description.root.absolute(), [], []
     for view in description.listed:
-        for path in (view.color, view.depth, *([] if view.valid is None else [view.valid])):
+        files = [path for path in (view.color, view.depth, view.valid) if path is not None]
+        for path in files:
             if not Path(os.path.normpath(path.absolute())).is_relative_to(os.path.normpath(root)):
                 raise InputError(
                     f"{description.path}: {path} is not in {description.root}",
                     remedy="give the folder that holds all files",
                 )
-        missing = [path for path in (view.color, view.depth, view.valid) if path is not None and not path.is_file()]
+        missing = [path for path in files if not path.is_file()]
         absent += missing[:1]
         present += [] if missing else [view]
         loss.unpaired_color += view.depth in missing and view.color not in missing

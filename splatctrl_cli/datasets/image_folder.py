@@ -70,6 +70,18 @@ class ImageFolderSource:
         self.cameras = names if options.cameras is None else options.cameras
 
     @property
+    def has_depth(self) -> bool:
+        """Whether the views have depth; without, that of every frame is 0."""
+        return any(view.depth is not None for view in self._views)
+
+    def no_depth(self) -> InputError:
+        """What to say where depth is needed and there is none."""
+        return InputError(
+            f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
+            remedy=f"{self._description.supply}; without depth work info, score, and reconstruct --points CLOUD.ply",
+        )
+
+    @property
     def has_clock(self) -> bool:
         """Whether the description says when the images were taken."""
         stamps = self._description.stamps
@@ -98,7 +110,11 @@ class ImageFolderSource:
             stored = self._stored_frame(view)
             if stored is None:
                 continue
-            if view.camera not in checked and check_depth(stored.frame.depth, str(view.depth), view.depth_scale):
+            if (
+                view.depth is not None
+                and view.camera not in checked
+                and check_depth(stored.frame.depth, str(view.depth), view.depth_scale)
+            ):
                 checked.add(view.camera)
             yield stored
 
@@ -128,25 +144,21 @@ class ImageFolderSource:
     def _stored_frame(self, view: View) -> StoredFrame | None:
         color_bytes = view.color.read_bytes()
         color = decode_file(color_bytes, color=True)
-        depth = self._depth(view)
+        lens = self._lens(view)
+        depth = self._depth(view, lens)
         if color is None or depth is None:
             broken = view.color if color is None else view.depth
             self._damaged.append(f"{broken}: not an image that can be read")
             return None
-        lens = self._lens(view)
         _check_size(view.color, color, view.lens)
-        if self._description.is_depth_resized:
-            depth = cv2.resize(depth, (view.lens.width, view.lens.height), interpolation=cv2.INTER_NEAREST)
-        _check_size(view.depth, depth, self._description.depth_camera or view.lens)
-        if lens.registration is not None:
-            depth = lens.registration.warp(depth)
         if lens.undistortion is not None:
             color = lens.undistortion.color(np.asarray(color))
-            depth = lens.undistortion.depth(depth) if lens.registration is None else depth
         human = None if view.human is None else self._human(view.human, lens)
         valid = self._valid(view, lens)
         depth = depth if valid is None else np.where(valid, depth, np.float32(0))
-        is_counts = lens.registration is None and not _is_float(self._description.depth.encoding, view.depth)
+        is_counts = lens.registration is None and not (
+            view.depth is None or _is_float(self._description.depth.encoding, view.depth)
+        )
         is_plain = lens.undistortion is None
         return StoredFrame(
             stamp_ns=view.stamp_ns,
@@ -160,13 +172,18 @@ class ImageFolderSource:
             color_file=color_bytes if is_plain and is_kept(color_bytes) else None,
             depth_unit=view.depth_scale if is_counts else None,
             depth_file=self._depth_file(view) if is_counts and is_plain and valid is None else None,
-            origin=f"{view.color.name} {view.depth.name}",
+            origin=f"{view.color.name} {view.depth.name}" if view.depth else view.color.name,
         )
 
     def _depth_file(self, view: View) -> bytes | None:
         """The PNG of a view's depth, where its counts are the depth as they are."""
         table = self._description.depth
-        if table.encoding != "uint16" or table.invalid > 0 or self._description.is_depth_resized:
+        if (
+            view.depth is None
+            or table.encoding != "uint16"
+            or table.invalid > 0
+            or self._description.is_depth_resized
+        ):
             return None
         data = view.depth.read_bytes()
         return data if is_png(data) else None
@@ -207,14 +224,29 @@ class ImageFolderSource:
         human = human_mask(pixels, lens.intrinsics, str(path))
         return human if lens.undistortion is None else lens.undistortion.labels(human)
 
-    def _depth(self, view: View) -> Float32 | None:
-        table, path = self._description.depth, view.depth
+    def _depth(self, view: View, lens: _Lens) -> Float32 | None:
+        """Depth (H, W) [m] at the pixels of colour, 0 where there is none; None where its file cannot be read."""
+        if view.depth is None:
+            return np.zeros((view.lens.height, view.lens.width), np.float32)
+        depth = self._recorded_depth(view.depth, view.depth_scale)
+        if depth is None:
+            return None
+        if self._description.is_depth_resized:
+            size = (view.lens.width, view.lens.height)
+            depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+        _check_size(view.depth, depth, self._description.depth_camera or view.lens)
+        if lens.registration is not None:
+            return lens.registration.warp(depth)
+        return depth if lens.undistortion is None else lens.undistortion.depth(depth)
+
+    def _recorded_depth(self, path: ImageFile, scale: float) -> Float32 | None:
+        table = self._description.depth
         if _is_float(table.encoding, path):
             pixels = _float_pixels(path)
             if pixels is None:
                 return None
             self._num_invalid += num_invalid(pixels)
-            return measured(pixels, view.depth_scale)
+            return measured(pixels, scale)
         counts = decode_file(path.read_bytes(), color=False)
         if counts is None:
             return None
@@ -225,7 +257,7 @@ class ImageFolderSource:
             )
         if table.encoding == "uint16-rotated3":
             counts = (counts >> 3) | (counts << 13)
-        return metres(np.where(counts == table.invalid, np.uint16(0), counts), view.depth_scale)
+        return metres(np.where(counts == table.invalid, np.uint16(0), counts), scale)
 
 
 def _is_float(encoding: str, path: ImageFile) -> bool:

@@ -142,6 +142,7 @@ def described(
     has_stamps: bool = False,
     is_depth_resized: bool = False,
     num_damaged: int = 0,
+    supply: str = Description.supply,
     notes: tuple[str, ...] = (),
 ) -> Description:
     """The description of paired views, all of the lens that --intrinsics gives, else of `lens` (of the first image);
@@ -164,6 +165,7 @@ def described(
         is_depth_resized=is_depth_resized,
         unpaired=pairs.unpaired,
         num_damaged=num_damaged,
+        supply=supply,
         notes=notes,
     )
 

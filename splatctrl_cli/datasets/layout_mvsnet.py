@@ -51,7 +51,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
     lenses, views = Lenses(), []
     for stem, color in colors.items():
         camera, depth = cameras[stem], depths.get(int(stem) if stem.isdigit() else -1)
-        if depth is None:
+        if depth is None and depths:
             continue
         k = fitted_intrinsics(camera.K, image_size(color), files[stem])
         matrix = camera.T_camera_world.copy()
@@ -67,6 +67,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
         poses=PosesTable(format="matrix-files", file=_CAMERAS, convention="world_to_camera"),
         depth=DepthTable(encoding="float32", scale=unit),
         is_depth_resized=True,
+        supply="add a folder depths/ with a .pfm for each number, or describe the files in a .toml (docs/input.md)",
         notes=tuple(notes),
     )
 

@@ -27,25 +27,27 @@ from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64
 
-FILE = "transforms.json"
+FILES = ("transforms.json", "transforms_train.json")  # the second is Blender's of NeRF, which has no depth
 _RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # nerfstudio's CAMERA_MODEL_TO_TYPE
 _MODELS = {**dict.fromkeys(_RADIAL, "plumb_bob"), "OPENCV_FISHEYE": "equidistant"}
+SUPPLY = "add depth_file_path to each frame (16-bit PNG in mm, or .npy in m), or describe the files in a .toml"
 _DEPTHS = ("depth_file_path", "depth_path")
 _SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 
 
 def matches(folder: Path) -> bool:
     """Whether the folder has a transforms.json."""
-    return (folder / FILE).is_file()
+    return any((folder / name).is_file() for name in FILES)
 
 
 def read(folder: Path, options: SourceOptions) -> Description:
     """The folder as a description; depth is in millimetres unless the file or --depth-scale says otherwise."""
     options.refuse(("intrinsics",), "a folder with transforms.json", folder)
+    file = next(name for name in FILES if (folder / name).is_file())
     description = Description(
-        path=folder / FILE,
+        path=folder / file,
         root=folder,
-        poses=PosesTable(format="nerfstudio", file=FILE, axes="opengl"),
+        poses=PosesTable(format="nerfstudio", file=file, axes="opengl"),
     )
     return with_transforms(description)
 
@@ -62,6 +64,12 @@ def with_transforms(description: Description) -> Description:
     views = [_view(content, entry, path, lenses, description, matrices) for entry in content["frames"]]
     if not views:
         raise InputError(f"{path}: no frames", remedy="give a transforms.json with frames")
+    bare = [view.name for view in views if view.depth is None]
+    if bare and len(bare) < len(views):
+        raise InputError(
+            f"{path}: {bare[0]}: depth_file_path is missing ({len(bare)} of {len(views)} frames)",
+            remedy="add it, or leave the frame out",
+        )
     if description.frames is not None:
         if len(lenses) > 1:
             raise InputError(
@@ -70,7 +78,7 @@ def with_transforms(description: Description) -> Description:
             )
         return replace(description, camera=views[0].camera)
     listed = tuple(sorted(_short(views), key=lambda v: v.name))
-    return replace(description, camera=views[0].camera, listed=listed, is_depth_resized=True)
+    return replace(description, camera=views[0].camera, listed=listed, is_depth_resized=True, supply=SUPPLY)
 
 
 def _view(
@@ -85,11 +93,6 @@ def _view(
     name, said = str(entry["file_path"]), {**content, **entry}
     color = _image(path.parent / name)
     depth = next((str(entry[key]) for key in _DEPTHS if entry.get(key)), None)
-    if depth is None and description.frames is None:
-        raise InputError(
-            f"{path}: {name}: depth_file_path is missing",
-            remedy="record depth, or give [frames] in a description (docs/input.md)",
-        )
     scale = next((said[key] for key in _SCALES if key in said), None)
     mask = entry.get("mask_path")
     try:
@@ -102,7 +105,7 @@ def _view(
     return ListedView(
         name=name,
         color=color,
-        depth=path.parent / (depth or ""),
+        depth=None if depth is None else path.parent / depth,
         matrix=matrix,
         camera=description.camera or lenses.named(_camera(said, color, path), str(path)),
         depth_scale=unit,
@@ -159,8 +162,8 @@ def _short(views: list[ListedView]) -> list[ListedView]:
 
 
 _DOCS = """
-nerfstudio, instant-ngp | `transforms.json` with `depth_file_path` or `depth_path` | `transform_matrix`, without
-    `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest pixels | of the file or
-    each frame; `mask_path` leaves pixels out
+nerfstudio, instant-ngp, Blender | `transforms.json` or `transforms_train.json`, `depth_file_path` or `depth_path` |
+    `transform_matrix`, without `applied_scale` | 1 mm, or `integer_depth_scale`; `.npy` too; of another size: nearest
+    pixels | of the file or each frame; `mask_path` leaves pixels out
 """
 ENTRIES = (Layout(name="nerfstudio", order=4, matches=matches, read=read, docs=_DOCS),)

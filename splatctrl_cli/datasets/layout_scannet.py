@@ -135,7 +135,7 @@ def read(folder: Path, options: SourceOptions) -> Description:
     calibration = read_text_files(folder)
     pairs = paired_by_name(folder, colors, depths, lambda name: read_pose(folder / "pose" / f"{name}.txt"))
     first = pairs.views[0]
-    lens, depth_camera = calibration.cameras(first.color, first.depth, options)
+    lens, depth_camera = calibration.cameras(first.color, depths[first.name], options)
     return described(
         pairs.moved(lambda T: T @ calibration.T_base_color),
         folder,

@@ -66,7 +66,9 @@ def read(path: Path, options: SourceOptions) -> Description:
     has_stamps = len({frame.stamp_ns for frame in frames}) == len(frames)
     views = frames if has_stamps else [replace(frame, stamp_ns=None) for frame in frames]
     missing = sens.num_frames - len(frames)
-    lens, depth_camera = sens.calibration.cameras(frames[0].color, frames[0].depth, options)
+    color, depth = frames[0].color, frames[0].depth
+    assert depth is not None
+    lens, depth_camera = sens.calibration.cameras(color, depth, options)
     return described(
         Pairs(path=file, views=views, unpaired=(0, 0)).moved(lambda T: T @ sens.calibration.T_base_color),
         root,

@@ -6,12 +6,13 @@ from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.containers.log_formats import SUFFIXES, is_bag_folder
 from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.datasets.image_folder import ImageFolderSource
-from splatctrl_cli.datasets.layout import Layout
+from splatctrl_cli.datasets.layout import Layout, images_of
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import names_in
 from splatctrl_cli.files.registry import entries_of
 from splatctrl_cli.logs.source_options import SourceOptions
 
+_COLORS = ("images", "image", "rgb", "color")  # where folders of colour alone keep it
 _MOST_LOOKED_AT, _MOST_NAMED = 200, 8  # things in a folder that is not itself one
 
 LAYOUTS = entries_of(__package__, Layout)
@@ -41,6 +42,8 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
     if layout is None:
         names = ", ".join(known.name for known in LAYOUTS)
         inside = readable_in(folder)
+        if not inside and (found := bare_images(folder)):
+            raise InputError(f"{folder}: {found}", remedy=BARE_REMEDY)
         raise InputError(
             f"{folder}: a folder that is neither a capture nor a ROS 2 bag, nor laid out as {names}",
             remedy=f"give one that is in it: {inside}"
@@ -49,6 +52,23 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
         )
     options.refuse(("root",), f"a folder laid out as {layout.name}", folder)
     return ImageFolderSource(folder, options, layout.read(folder, options))
+
+
+BARE_REMEDY = (
+    "describe colour, depth, intrinsics and poses in a .toml (docs/input.md); with a transforms.json (ns-process-data"
+    " writes it) info, score, and reconstruct --points CLOUD.ply work without depth"
+)
+
+
+def bare_images(folder: Path) -> str:
+    """That depth is missing, in words, of a folder that holds colour alone; empty where it holds no images."""
+    num = max(len(images_of(place)) for place in (folder, *(folder / name for name in _COLORS)) if place.is_dir())
+    is_colmap = any((folder / place).exists() for place in ("sparse", "images.bin", "images.txt"))
+    return (
+        f"depth is missing: {num} images{' of a COLMAP model' if is_colmap else ''} and nothing beside them"
+        if num
+        else ""
+    )
 
 
 def readable_in(folder: Path) -> str:

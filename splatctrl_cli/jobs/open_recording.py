@@ -51,8 +51,8 @@ def open_to_train(
         return scan
     refuse_scan_options(recording)
     if recording.protocol is not None:
-        return open_held_out(recording)[0]
-    source = open_source(recording.path, recording.options)
+        return open_held_out(recording, needs_depth=needs_depth)[0]
+    source = open_source(recording.path, recording.options, needs_depth=needs_depth)
     check_pose_jumps(source, max_pose_jump)
     return source
 
@@ -70,7 +70,9 @@ def open_dtu(recording: RecordingRequest) -> DtuSource:
     )
 
 
-def open_held_out(recording: RecordingRequest) -> tuple[RecordSource, ScoreProtocol, Split]:
+def open_held_out(
+    recording: RecordingRequest, *, needs_depth: bool = False
+) -> tuple[FrameSource, ScoreProtocol, Split]:
     """An image folder with the views held out that the protocol holdout:RULE names, by their places in it."""
     name, path = recording.protocol or "", recording.path
     protocol = score_protocol(name)
@@ -83,8 +85,10 @@ def open_held_out(recording: RecordingRequest) -> tuple[RecordSource, ScoreProto
     if recording.options.holdout:
         raise UsageError("--holdout: the protocol says what is held out", remedy="leave one of them out")
     options = replace(recording.options, cameras=None)
-    split = protocol.split(range(sum(1 for _ in open_source(path, options).poses())), str(path))
-    return open_source(path, replace(options, holdout=tuple(map(str, split.scored)))), protocol, split
+    num = sum(1 for _ in open_source(path, options, needs_depth=needs_depth).poses())
+    split = protocol.split(range(num), str(path))
+    options = replace(options, holdout=tuple(map(str, split.scored)))
+    return open_source(path, options, needs_depth=needs_depth), protocol, split
 
 
 def is_folder_of_views(path: Path) -> bool:

@@ -13,7 +13,7 @@ from splatctrl_cli.jobs.open_recording import RecordingRequest, open_dtu, open_h
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Bool, RecordSource, RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
-from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.sources.source import lacks_depth, open_source
 
 Mask = Callable[[RgbdFrame], Bool | None]
 """A frame -> the pixels (H, W) that the mask rule selects."""
@@ -52,9 +52,10 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
     refuse_scan_options(recording)
     where = recording.path
     if recording.protocol is None:
-        return Reference(where=where, source=open_source(where, replace(recording.options, cameras=None)))
+        source = open_source(where, replace(recording.options, cameras=None), needs_depth=False)
+        return Reference(where=where, source=source, has_depth=lacks_depth(source) is None)
     source, protocol, split = open_held_out(recording)
-    stamps = [stamp for stamp, _, _ in source.poses()]  # type: ignore[attr-defined]
+    stamps = [stamp for stamp, _, _ in source.poses()]
     return Reference(
         where=where,
         source=source,
@@ -62,6 +63,7 @@ def open_reference(recording: RecordingRequest, progress: Progress) -> Reference
         protocol=protocol,
         split=split,
         training_stamps_ns=frozenset(stamps[n] for n in split.training),
+        has_depth=lacks_depth(source) is None,
     )
 
 

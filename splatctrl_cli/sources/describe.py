@@ -11,7 +11,7 @@ from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.containers.log_formats import CONTAINERS, SUFFIXES, is_bag_folder
 from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
-from splatctrl_cli.datasets.layouts import layout_of, open_layout, readable_in
+from splatctrl_cli.datasets.layouts import BARE_REMEDY, bare_images, layout_of, open_layout, readable_in
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.listing import files_below, names_in
 from splatctrl_cli.files.summary import Grid, Summary
@@ -26,6 +26,7 @@ from splatctrl_cli.logs.video_file import open_log
 from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
 from splatctrl_cli.sources.describe_file import describe_file
+from splatctrl_cli.sources.source import lacks_depth
 
 
 def describe(path: Path, options: SourceOptions | None = None) -> Summary:
@@ -131,6 +132,8 @@ def _describe_folder(path: Path, options: SourceOptions) -> Summary:
     is_dtu = all((path / name).is_dir() for name in ("Cameras", "Rectified"))
     if not ("run.json" in names or "splats.ply" in names or is_dtu):
         inside = readable_in(path)
+        if not inside and (found := bare_images(path)):
+            raise InputError(f"{path}: {found}", remedy=BARE_REMEDY)
         raise InputError(
             f"{path}: a folder of no known kind",
             remedy=f"give one that is in it: {inside}"
@@ -226,4 +229,6 @@ def _describe_images(path: Path, source: ImageFolderSource | RigFolderSource, ki
         "without_pose": loss.without_pose,
     }
     grid = Grid(name="cameras", header=("camera", "frames"), rows=[list(item) for item in counts.items()])
-    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), notes=tuple(loss.notes))
+    refusal = lacks_depth(source)
+    lacks = () if refusal is None else (str(refusal)[str(refusal).index("depth is missing") :],)
+    return Summary(path=str(path), kind=kind, facts=facts, grids=(grid,), missing=lacks, notes=tuple(loss.notes))

@@ -8,7 +8,7 @@ from splatctrl_cli.captures.capture import CaptureSource, robot_description_of
 from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.containers.log_formats import SessionLog, open_raw_log
 from splatctrl_cli.containers.raw_log import RawLog
-from splatctrl_cli.datasets.image_folder import open_image_folder
+from splatctrl_cli.datasets.image_folder import ImageFolderSource, open_image_folder
 from splatctrl_cli.datasets.layouts import has_views, open_layout
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.robot_description import RobotDescription, robot_descriptions
@@ -20,22 +20,28 @@ from splatctrl_cli.logs.video_file import open_log
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
 
 
-def open_source(path: Path, options: SourceOptions | None = None) -> FrameSource:
+def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth: bool = True) -> FrameSource:
     """The records of an MCAP, ROS 1 or ROS 2 bag, capture folder, dataset folder or file, or image folder's
     TOML description.
 
-    Raises InputError where there is nothing, or nothing that can be used.
+    Raises InputError where there is nothing, or nothing that can be used, as images without depth where it is needed.
     """
     options = options or SourceOptions()
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
-    if path.suffix == ".toml":
-        return open_image_folder(path, options)
+    if path.suffix == ".toml" or (not is_capture(path) and has_views(path)):
+        source = open_image_folder(path, options) if path.suffix == ".toml" else open_layout(path, options)
+        if needs_depth and (refusal := lacks_depth(source)) is not None:
+            raise refusal
+        return source
     if is_capture(path):
         return CaptureSource(path, options)
-    if has_views(path):
-        return open_layout(path, options)
     return RosLogSource(open_log(path), options)
+
+
+def lacks_depth(source: FrameSource) -> InputError | None:
+    """What to say where a recording is without depth, as only images in a folder may be."""
+    return source.no_depth() if isinstance(source, ImageFolderSource) and not source.has_depth else None
 
 
 def open_session(paths: Sequence[Path], options: SourceOptions | None = None) -> FrameSource:

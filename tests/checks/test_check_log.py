@@ -22,6 +22,7 @@ from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log
 
 ROOT = Path(__file__).parents[2]
 COLOR, DEPTH, INFO = "/cam0/color/image_raw/compressed", "/cam0/depth/image_raw", "/cam0/color/camera_info"
+NO_DEPTH = "record 16UC1, mono16 or 32FC1 depth images (info, and replay of joint states, work without)"
 JOINTS = "/joint_states"
 GOOD = LogRecipe(num_frames=30)
 CAMERAS_2, CAMERAS_3 = (replace(GOOD, cameras=tuple(f"cam{i}" for i in range(num))) for num in (2, 3))
@@ -240,7 +241,7 @@ FAULTS = [
     Fault(code="damaged", change=edited(JOINTS, _with(position=np.zeros(0))), value=30,
           what="a JointState with 2 names, 0 positions and 2 velocities (30 times)"),
     Fault(code="missing", severity=ERROR, recipe=LogRecipe(has_depth=False),
-          what="no depth topic; colour topics there: " + COLOR, remedy="record 16UC1, mono16 or 32FC1 depth images"),
+          what="no depth topic; colour topics there: " + COLOR, remedy=NO_DEPTH),
 ]  # fmt: skip
 
 

@@ -1,6 +1,8 @@
 """Folders of public datasets, opened by their own files: small trees with a known pose and depth."""
 
 import json
+import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from tests.datasets.make_layout import (
     EXAMPLES,
     GIVEN,
     HEIGHT,
+    POSES,
     WIDTH,
     K,
     check,
@@ -25,6 +28,7 @@ from tests.datasets.make_layout import (
     frames_of,
     make_bop,
     make_frames,
+    make_mvsnet,
     make_nerfstudio,
     make_redwood,
     make_scannet,
@@ -173,7 +177,7 @@ def test_a_nerfstudio_frame_without_depth_is_named(tmp_path: Path) -> None:
     content = json.loads((folder / "transforms.json").read_text())
     del content["frames"][2]["depth_file_path"]
     (folder / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"frame_2.png: depth_file_path is missing"):
+    with pytest.raises(InputError, match=r"frame_2.png: depth_file_path is missing \(1 of 3 frames\)"):
         open_source(folder)
 
 
@@ -220,3 +224,50 @@ def test_a_tum_folder_without_its_poses_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"groundtruth.txt: no such file.*; copy it too, or give --camera-pose"):
         open_source(folder)
     assert open_source(folder, SourceOptions(camera_poses={"camera": (0, 0, 0, 0, 0, 0, 1)})).cameras == ("camera",)
+
+
+def without_depth(folder: Path, kind: str) -> Path:
+    """Colour, poses and lenses of three views, as sets for novel views have them."""
+    if kind == "MVSNet":
+        shutil.rmtree(make_mvsnet(folder) / "depths")
+        return folder
+    content = json.loads((make_nerfstudio(folder) / "transforms.json").read_text())
+    frames = [{k: v for k, v in frame.items() if k != "depth_file_path"} for frame in content["frames"]]
+    if kind == "nerfstudio":
+        (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
+        return folder
+    angle = 2 * math.atan(WIDTH / 2 / K[0])
+    frames = [{**frame, "file_path": frame["file_path"].removesuffix(".png"), "rotation": 0.01} for frame in frames]
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    (folder / "transforms.json").unlink()
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["nerfstudio", "Blender", "MVSNet"])
+def test_views_without_depth_say_so_first_and_what_works_without(tmp_path: Path, kind: str) -> None:
+    folder = without_depth(tmp_path / "set", kind)
+    with pytest.raises(InputError) as caught:
+        open_source(folder)
+    message = str(caught.value)
+    assert "depth is missing: none of its 3 views has any; add " in message
+    assert "without depth work info, score, and reconstruct --points CLOUD.ply" in message
+    assert "\n" not in message
+    assert describe(folder).missing[0].startswith("depth is missing: none of its 3 views has any; add ")
+    frames = [r for r in open_source(folder, needs_depth=False).records() if isinstance(r, RgbdFrame)]
+    assert len(frames) == 3
+    for index, frame in enumerate(frames):
+        assert not frame.depth.any()
+        assert np.array_equal(frame.color, color_of(index))
+        assert frame.T_world_camera == pytest.approx(POSES[index], abs=1e-9)
+        assert frame.intrinsics.fx == pytest.approx(K[0])
+
+
+@pytest.mark.parametrize("places", [["a.png"], ["images/a.jpg", "sparse/0/cameras.bin"]])
+def test_images_alone_say_that_depth_is_missing(tmp_path: Path, places: list[str]) -> None:
+    for place in places:
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_bytes(b"x")
+    what = "1 images of a COLMAP model" if len(places) > 1 else "1 images"
+    for look in (open_source, describe):
+        with pytest.raises(InputError, match=f"depth is missing: {what} and nothing beside them; describe colour"):
+            look(tmp_path)

@@ -27,7 +27,7 @@ STRETCHED = np.array([1.0, 0.6, 1.4], np.float32)
 def scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder; every recording is of one view from the side."""
     frames = [frame for frame in FRAMES if frame.camera == "cam3"][:1]
-    monkeypatch.setattr(score_reference, "open_source", lambda path, options: FakeSource(frames=frames))
+    monkeypatch.setattr(score_reference, "open_source", lambda path, options, **_: FakeSource(frames=frames))
     return tmp_path
 
 

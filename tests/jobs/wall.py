@@ -113,4 +113,4 @@ def write_scene(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def set_up(monkeypatch: pytest.MonkeyPatch, scene: FakeScene, recording: FakeSource) -> None:
     """Every scene is `scene`, and every recording `recording`."""
     monkeypatch.setattr(score, "open_splats", lambda path: scene)
-    monkeypatch.setattr(score_reference, "open_source", lambda path, options: recording)
+    monkeypatch.setattr(score_reference, "open_source", lambda path, options, **_: recording)
