@@ -17,6 +17,7 @@ from splatctrl_cli.geometry import invert_transform, project, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
 POSE = 6  # a turn and a move in the camera's own frame
+EVERY = slice(None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +59,11 @@ def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | 
     held where it was.
     """
     views = [gray_view(frame, scale) for frame in frames]
-    recorded = [_scaled(frame.T_world_camera, 1 / scale) for frame in frames]
+    recorded = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
     wanted = np.ones(len(views), np.bool_) if free is None else free.copy()
     is_free = wanted.copy()
     while True:
-        pairs = _pairs(views, recorded, is_free | ~wanted, is_free)
+        pairs = overlapping(views, recorded, is_free | ~wanted, is_free)
         is_free &= np.bincount(np.ravel(pairs).astype(np.int64), minlength=len(views)) > 0
         poses = _solved(views, recorded, pairs, is_free)
         moved, turned = _motions(recorded, poses)
@@ -75,7 +76,7 @@ def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | 
     if not is_better:
         poses, moved, turned, after = recorded, 0.0 * moved, 0.0 * turned, before
     return RefinedPoses(
-        T_world_camera=tuple(_scaled(T, scale) if f else frame.T_world_camera
+        T_world_camera=tuple(scaled(T, scale) if f else frame.T_world_camera
                              for T, f, frame in zip(poses, is_free & is_better, frames, strict=True)),
         moved=scale * moved,
         turned=turned,
@@ -109,13 +110,16 @@ def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
     )
 
 
-def _scaled(T: Float64, factor: float) -> Float64:
-    scaled = T.copy()
-    scaled[:3, 3] *= factor
-    return scaled
+def scaled(T: Float64, factor: float) -> Float64:
+    """A pose (4, 4) whose lengths are multiplied."""
+    there = T.copy()
+    there[:3, 3] *= factor
+    return there
 
 
-def _pairs(views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool) -> list[tuple[int, int]]:
+def overlapping(
+    views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool
+) -> list[tuple[int, int]]:
     """Of each view among those that take part, those others that see most of its points; one of the two is free."""
     chosen = np.flatnonzero(among).tolist()
     middles = np.array([transform_points(poses[i], np.median(views[i].depth.points, axis=0)[None])[0]
@@ -177,7 +181,7 @@ def _rows(a: GrayView, b: GrayView, T: Float64, width: float) -> tuple[Float64, 
     every second point of view a that lands on view b, at T (4, 4) from there.
     """
     points = a.depth.points[::2]
-    there, lands, surface, normals, distance = _on_surface(a, b, T, slice(None, None, 2))
+    there, lands, surface, normals, distance = on_surface(a, b, T, slice(None, None, 2))
     sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(points[:, 2]))
     lands &= np.abs(distance) < width * sigma
     own, there, normals, surface = points[lands], there[lands], normals[lands], surface[lands]
@@ -204,8 +208,8 @@ def _rows(a: GrayView, b: GrayView, T: Float64, width: float) -> tuple[Float64, 
     )
 
 
-def _on_surface(
-    a: GrayView, b: GrayView, T: Float64, which: slice
+def on_surface(
+    a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
 ) -> tuple[Float64, Bool, Float64, Float64, Float64]:
     """Of some points of view a, at T (4, 4) from view b: where they are there (K, 3), which of them land on a surface
     that faces as theirs (K,), its points and normals (K, 3), and their distances (K,) from it.
@@ -244,7 +248,7 @@ def _distances(
     found = [np.zeros(0)]
     for i, j in pairs:
         T = invert_transform(poses[j]) @ poses[i]
-        _, lands, _, _, distance = _on_surface(views[i], views[j], T, slice(int(odd), None, 2))
+        _, lands, _, _, distance = on_surface(views[i], views[j], T, slice(int(odd), None, 2))
         found.append(np.minimum(np.abs(distance[lands]), fixed.REFINE_FARTHEST[0]))
     every = np.concatenate(found)
     return float(np.median(every)) if len(every) else 0.0

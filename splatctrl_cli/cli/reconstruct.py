@@ -10,6 +10,7 @@ from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import UsageError
+from splatctrl_cli.jobs.correct_views import Corrections
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
@@ -38,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
         recording=args.source,
         out=args.out or Path("scene"),
         box=None if args.box is None else Box.from_text(args.box),
+        corrections=Corrections(poses=args.refine_poses, exposure=args.refine_exposure),
         options={name: getattr(args, name) for name in DECIDING_OPTIONS},
     )
     console, is_baseline = Console(args), args.method == "3dgs"

@@ -54,6 +54,7 @@ def reconstruct_options(add: Options, parser: Parser) -> None:
     add_declare(more)
     add_disagreement(more)
     more("--refine-poses", "put the views of a still scene where they see the same surfaces, by depth and colour")
+    more("--refine-exposure", "give the views of a still scene one brightness and white balance")
     Options(parser.run_group)("--device", "where to compute", ("auto", "cpu", "cuda"), "auto")
 
 

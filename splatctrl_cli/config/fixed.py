@@ -217,6 +217,12 @@ REFINE_FEWEST = 50  # points that a pair of views is compared by
 REFINE_PRIOR = (0.03, 0.05)  # [rad], [m] by which recorded poses are taken to err
 REFINE_FARTHEST = (0.15, 6.0)  # [m], [deg] that a pose is put right by, at most
 REFINE_GAIN = 0.03  # of the median distance between views: a smaller gain is none
+EXPOSURE_BLUR = 1.5  # [px] of the small image, the sigma by which colours are smoothed
+EXPOSURE_NEAR = 4.0  # sigmas of the depth within which two views show one surface
+EXPOSURE_LEVELS = (12.0, 243.0)  # of 255, between which a colour tells of the exposure
+EXPOSURE_ERROR = 0.01  # of the logarithm of a ratio of two views, however many pixels it is of
+EXPOSURE_PRIOR = 0.3  # of the logarithm of a gain
+EXPOSURE_GAIN = 0.01  # of the logarithm of the largest gain: below it colours stay as they were
 
 # Scores
 BANDS = ((0.0, 0.02), (0.02, 0.05), (0.05, 0.10), (0.10, 0.20))  # [m] true distance

@@ -46,8 +46,8 @@ PROTOCOL = {
     "Gaussian splatting has it: as ssim, but zeros beyond the border",
     "lpips": "of the whole view, colours scaled to [-1, 1]; lpips_published: with render and photo set to one colour "
     "outside the mask",
-    "posed": "the same figures at a pose that was put right by depth and colour of the training views, where those "
-    "were put right; the render takes no part in it",
+    "corrected": "the same figures with the view's pose or exposure corrected by depth and colour of the training "
+    "views, where theirs were; the render takes no part in it",
     "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
     "centre lies in a voxel that was observed free; null where the scene has no occupancy grid",
 }
@@ -78,8 +78,8 @@ REGION = {
     "in_front": BAD_SHARE,
 }  # of the pixels of a region
 REGIONS = ("seen", "all", "masked")
-POSED = "_posed"  # of a figure at a pose that was put right
-POSABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixels" for region in REGIONS)
+CORRECTED = "_corrected"  # of a figure of a view whose pose or exposure was
+CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixels" for region in REGIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,8 @@ class ViewScore:
 
     Where there is a mask: `masked` is its region, ssim_published and lpips_published are those of the view with the
     rest filled; without one, ssim_published is there where the protocol has one. lpips where weights were given.
-    size: width and height [px]. posed: the same view rendered from where its pose was put right.
+    size: width and height [px]. corrected: the same view at
+    its corrected pose and exposure.
     """
 
     view: str
@@ -102,7 +103,7 @@ class ViewScore:
     ssim_published: float | None = None
     lpips: float | None = None
     lpips_published: float | None = None
-    posed: "ViewScore | None" = None
+    corrected: "ViewScore | None" = None
 
     def figures(self) -> dict[str, float]:
         """The view's figures by flat name, ``psnr_seen``, ``depth_median_all`` [m], …"""
@@ -124,8 +125,10 @@ class ViewScore:
             figures |= {f"depth_{key}_{name}": value for key, value in depth.items()}
             figures[f"depth_coverage_{name}"] = region.depth_coverage
             figures[f"in_front_{name}"] = region.in_front
-        if self.posed is not None:
-            figures |= {f"{name}{POSED}": value for name, value in self.posed.figures().items() if name in POSABLE}
+        if self.corrected is not None:
+            figures |= {
+                f"{name}{CORRECTED}": value for name, value in self.corrected.figures().items() if name in CORRECTABLE
+            }
         return figures
 
 
@@ -226,7 +229,7 @@ def metric_scales() -> dict[str, Scale]:
         "ssim_published": SIMILARITY,
         **dict.fromkeys(("lpips", "lpips_published"), DISSIMILARITY),
         **of_regions,
-        **{f"{name}{POSED}": of_regions[name] for name in POSABLE},
+        **{f"{name}{CORRECTED}": of_regions[name] for name in CORRECTABLE},
     }
 
 

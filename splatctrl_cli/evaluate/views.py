@@ -33,16 +33,16 @@ def views_to_score(
     training: Collection[str],
     has_clock: bool,
     numbered_by_stamp: bool = False,
-    posed: Callable[[RgbdFrame], RgbdFrame] = lambda frame: frame,
+    corrected: Callable[[RgbdFrame], RgbdFrame] = lambda frame: frame,
 ) -> Iterator[View]:
     """The frames of the `scoring` cameras in time order.
 
     With a clock, what counts is the newest frame of each training camera not later than the view (a frame of the same
-    stamp counts); without one, every training frame of the recording, which is then read twice, each where `posed`
-    puts it.
+    stamp counts); without one, every training frame of the recording, which is then read twice, each as
+    `corrected` has it.
     """
     if not has_clock:
-        known = tuple(posed(frame) for frame in frames_of(source) if frame.camera in training)
+        known = tuple(corrected(frame) for frame in frames_of(source) if frame.camera in training)
         for number, frame in enumerate(frames_of(source)):
             if frame.camera in scoring:
                 name = _name(frame.camera, frame.stamp_ns if numbered_by_stamp else number)

@@ -17,7 +17,6 @@ from splatctrl_cli.jobs.reconstruct import ReconstructResult, written_run
 from splatctrl_cli.jobs.reconstruct_verdict import GATED as SPLATS_GATED
 from splatctrl_cli.jobs.reconstruct_verdict import loss_notes, map_reason
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest, no_frame, training_cameras
-from splatctrl_cli.jobs.refine_poses import put_right
 from splatctrl_cli.records import RecordSource, RgbdFrame
 from splatctrl_cli.scene.gaussian_fitter import GaussianAuditRow, GaussianFitter
 from splatctrl_cli.scene.scale import RecordedDepth, fitted_to
@@ -45,9 +44,8 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
         rows: list[GaussianAuditRow] = []
         with stopwatch.stage("read"):
             frames = _frames(source)
-            recorded, poses = frames, dict[str, Any]()
-            if request.refine_poses:
-                frames, poses = put_right(frames, source.name, progress)
+            recorded = frames
+            frames, told = request.corrections.of(frames, source.name, progress)
             depth = RecordedDepth.of(frames)
             config = config if depth is None else fitted_to(config, depth)
             limit, scale = config.occupancy.max_range, config.scene.scale or 1.0
@@ -63,7 +61,7 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
         figures = _figures(rows)
         metrics = (
             _views(recorded)
-            | poses
+            | told
             | figures
             | {
                 "background": list(fitter.background),

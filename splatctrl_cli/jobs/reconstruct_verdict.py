@@ -24,6 +24,7 @@ GATED = {
     "self_mask_residual_mm": Scale(unit="mm", better=Better.LOWER, absolute=0.5, relative=0.02),
     "inside_robot_points": FAULTS,
     "pose_residual": Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.05),
+    "exposure_spread": DESCRIBES,
     "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
     "psnr": DECIBELS,
 }  # what --require can name, and how two runs are compared by it

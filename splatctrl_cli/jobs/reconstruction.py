@@ -13,8 +13,8 @@ from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.jobs.camera_agreement import CameraAgreement
+from splatctrl_cli.jobs.correct_views import Corrections
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
-from splatctrl_cli.jobs.refine_poses import check_refinable, put_right
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
@@ -54,11 +54,10 @@ class ReconstructRequest:
     """One reconstruction of `source` into the folder `out`.
 
     urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given;
-    without urdf the one that the log `recording` describes, where it does.
-    points: a coloured cloud to start from, instead of depth. declare: a TOML of what the robot carries. refine_poses:
-    put the views of a still scene where they fit each other. resume: go on with what an interrupted run left.
-    require: gates on its metrics. options: what else decides the bytes, by the names of the options: a run that is
-    resumed must have the same.
+    without urdf the one that the log `recording` describes, where it does. points: a coloured cloud to start from,
+    instead of depth. declare: a TOML of what the robot carries. corrections: of the views of a still scene, by
+    each other. resume: go on with what an interrupted run left. require: gates on its metrics. options: what else
+    decides the bytes, by the names of the options: a run that is resumed must have the same.
     """
 
     source: RecordSource
@@ -71,7 +70,7 @@ class ReconstructRequest:
     points: Path | None = None
     declare: Path | None = None
     allow_disagreement: bool = False
-    refine_poses: bool = False
+    corrections: Corrections = field(default_factory=Corrections)
     force: bool = False
     resume: bool = False
     seed: int = 0
@@ -114,15 +113,14 @@ class Reconstruction:
         self.first_frames: dict[str, dict[str, Any]] = {}  # of each camera, what tells this recording from another
         self.num_read = 0  # time steps of the source, those that were left out included
         self.is_refined = False
-        self.poses: dict[str, Any] = {}  # what was put right of them
+        self.corrected: dict[str, Any] = {}  # what was corrected of the views
         self._early: TimeStep | None = None  # the first that said nothing of the workspace
         self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
         self.agreement = CameraAgreement(
             self.source.name, is_allowed=request.allow_disagreement, is_still=not self.source.has_clock
         )
         self._saved_at, self._save_time = -float("inf"), 0.0
-        if request.refine_poses:
-            check_refinable(request.source)
+        request.corrections.check(request.source)
         if checkpoint is not None:
             self._restore(checkpoint)
 
@@ -182,9 +180,11 @@ class Reconstruction:
                 "warning: more views than fit in one time step: the last are refined on, the others only seed splats;"
                 " leave views out, or reconstruct them in parts"
             )
-        self._keep_first_frames(step)
-        if self.request.refine_poses and not self.fitter.num_steps:
-            frames, self.poses = put_right(step.frames, self.source.name, console)
+        for frame in step.frames:
+            if frame.camera not in self.first_frames:
+                self.first_frames[frame.camera] = first_frame(frame).as_dict()
+        if self.request.corrections and not self.fitter.num_steps:
+            frames, self.corrected = self.request.corrections.of(step.frames, self.source.name, console)
             step = replace(step, frames=tuple(frames))
         self.agreement.check(step, self.config.occupancy, console)
         if not self.source.has_clock and not self.fitter.num_steps:
@@ -200,11 +200,6 @@ class Reconstruction:
         if self.source.has_clock and self._is_snapshot_due(index, step.stamp_ns):
             self.snapshot(step.stamp_ns)
         return row
-
-    def _keep_first_frames(self, step: TimeStep) -> None:
-        for frame in step.frames:
-            if frame.camera not in self.first_frames:
-                self.first_frames[frame.camera] = first_frame(frame).as_dict()
 
     def _warn_of_small_budget(self, row: AuditRow, console: Progress) -> None:
         if row.unmet:
@@ -262,8 +257,8 @@ class Reconstruction:
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.agreement.disagreement,
-            "pose_residual": None,
-            **self.poses,
+            **dict.fromkeys(("pose_residual", "exposure_spread")),
+            **self.corrected,
             **self_mask_metrics(self.rows),
             "carried": self.declared.carried_uses(),
             "first_frames": list(self.first_frames.values()),
@@ -310,7 +305,7 @@ class Reconstruction:
             "disagreement": self.agreement.disagreement,
             "depth": None if self.depth is None else asdict(self.depth),
             "first_frames": self.first_frames,
-            "poses": self.poses,
+            "corrected": self.corrected,
             "stamps": [] if self.source.has_clock else self.stamps,
         }
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
@@ -326,7 +321,7 @@ class Reconstruction:
         self.stamps = checkpoint.progress["stamps"]
         self.agreement.disagreement = checkpoint.progress["disagreement"]
         self.first_frames = checkpoint.progress["first_frames"]
-        self.poses = checkpoint.progress["poses"]
+        self.corrected = checkpoint.progress["corrected"]
         depth = checkpoint.progress["depth"]
         self._fit_to(None if depth is None else RecordedDepth(**depth))
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))

@@ -23,6 +23,7 @@ DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene 
         "scan": None,
         "box": None,
         "refine_poses": False,
+        "refine_exposure": False,
     },
 }
 DECIDING_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pin")  # their versions may change a bit

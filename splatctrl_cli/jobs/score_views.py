@@ -12,8 +12,8 @@ from splatctrl_cli.evaluate.score import Perceptual, ViewScore, score_view
 from splatctrl_cli.evaluate.score_doubts import Doubts
 from splatctrl_cli.evaluate.views import View, seen_pixels, views_to_score
 from splatctrl_cli.files.output import Stopwatch
+from splatctrl_cli.jobs.correct_views import corrected, corrected_among
 from splatctrl_cli.jobs.progress import Progress, Wait
-from splatctrl_cli.jobs.refine_poses import posed, posed_among
 from splatctrl_cli.jobs.score_reference import Reference
 from splatctrl_cli.records import Float64, GaussianSet, Intrinsics, RgbdFrame, SplatSet
 from splatctrl_cli.report.pictures import ComparisonRow
@@ -75,7 +75,7 @@ class Scorer:
             training=scene.cameras,
             has_clock=has_clock,
             numbered_by_stamp=self.reference.numbered_by_stamp,
-            posed=lambda frame: posed(frame, scene.refined_poses),
+            corrected=lambda frame: corrected(frame, scene.corrections),
         )
         may_train = self.allow_training or self.reference.scores_training
         wait = Wait(progress, f"scores {', '.join(self.cameras)}", "views").announce()
@@ -119,14 +119,12 @@ class Scorer:
             )
 
     def _score_one(self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet) -> None:
-        frame, poses = view.frame, self.scene.refined_poses
+        frame = view.frame
         score, row = self._compared(view, frame, splats)
         doubts.look(view, row.render, row.mask)
-        if poses:
-            there = (
-                posed(frame, poses) if (frame.camera, frame.stamp_ns) in poses else posed_among(frame, view.training)
-            )
-            score = replace(score, posed=self._compared(view, there, splats)[0])
+        if self.scene.corrections:
+            there = corrected_among(frame, view.training, self.scene.corrections)
+            score = replace(score, corrected=self._compared(view, there, splats)[0])
         scores.views.append(score)
         scores.training = view.training
         rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
@@ -140,7 +138,7 @@ class Scorer:
     def _compared(
         self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet
     ) -> tuple[ViewScore, ComparisonRow]:
-        """What a view comes to where `frame` has its pose."""
+        """What a view comes to where `frame` stands for it."""
         protocol = self.reference.protocol
         rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.threads)
         rendering = rendering.before(self.scene.background)

@@ -75,6 +75,16 @@ class Snapshot:
         return path if self.parts is None else self.parts.checked(path)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ViewCorrection:
+    """Where a training view is instead of where it was recorded, T_world_camera (4, 4), and by what its red, green
+    and blue are divided, gain (3,); None where they were taken as recorded.
+    """
+
+    T_world_camera: Float64 | None
+    gain: Float64 | None
+
+
 T = TypeVar("T")
 
 
@@ -109,9 +119,14 @@ def _color(value: list[Any]) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _poses(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], Float64]:
+def _corrections(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], ViewCorrection]:
+    def numbers(value: Any, *shape: int) -> Float64 | None:
+        return None if value is None else np.array(value, np.float64).reshape(shape)
+
     return {
-        (str(row["camera"]), int(row["stamp_ns"])): np.array(row["T_world_camera"], np.float64).reshape(4, 4)
+        (str(row["camera"]), int(row["stamp_ns"])): ViewCorrection(
+            T_world_camera=numbers(row.get("T_world_camera"), 4, 4), gain=numbers(row.get("gain"), 3)
+        )
         for row in rows
     }
 
@@ -183,9 +198,9 @@ class SceneFolder:
         return self._metric("background", _color, (0.0, 0.0, 0.0))
 
     @property
-    def refined_poses(self) -> dict[tuple[str, int], Float64]:
-        """T_world_camera (4, 4) of training views by camera and stamp, where they were put right; else nothing."""
-        return self._metric("refined_poses", _poses, ())
+    def corrections(self) -> dict[tuple[str, int], ViewCorrection]:
+        """Of training views, by camera and stamp; empty where they were taken as recorded."""
+        return self._metric("corrected_views", _corrections, ())
 
     @property
     def is_anisotropic(self) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from splatctrl_cli.calibration.pose_refinement import _motion
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
-from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.records import Float64, RgbdFrame
 
 
 def views_of(sample_data: Path) -> list[RgbdFrame]:
@@ -27,3 +27,10 @@ def disturbed(views: Sequence[RgbdFrame], millimetres: float, degrees: float) ->
         twist = np.concatenate([np.radians(degrees) * turn, 1e-3 * millimetres * move])
         found.append(replace(view, T_world_camera=view.T_world_camera @ _motion(twist)))
     return found
+
+
+def gains_of(num: int) -> Float64:
+    """Gains (N, 3) of as many views: brighter or darker by up to a quarter, each colour by its own."""
+    rng = np.random.default_rng(5)
+    gains = np.exp(rng.uniform(-0.2, 0.2, (num, 1)) + rng.uniform(-0.05, 0.05, (num, 3)))
+    return np.asarray(gains / np.exp(np.log(gains).mean(axis=0)))

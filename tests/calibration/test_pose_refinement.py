@@ -10,9 +10,10 @@ import pytest
 
 from splatctrl_cli.calibration.pose_refinement import _by_twists, _motion, refined_poses
 from splatctrl_cli.geometry import invert_transform, transform_from, transform_points
+from splatctrl_cli.jobs.correct_views import Corrections, corrected_among
 from splatctrl_cli.jobs.progress import SILENT
-from splatctrl_cli.jobs.refine_poses import posed_among, put_right
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.scene_files.scene_folder import ViewCorrection
 from tests.calibration.scan import disturbed, views_of
 from tests.plain import plain_frame
 
@@ -112,16 +113,15 @@ def test_along_a_bare_wall_nothing_moves_far() -> None:
 
 def test_one_view_is_put_among_others_that_stay(views: list[RgbdFrame]) -> None:
     off = disturbed(views[:1], 20.0, 1.0)[0]
-    there = posed_among(off, views[1:])
+    there = corrected_among(off, views[1:], {("other", 0): ViewCorrection(T_world_camera=np.eye(4), gain=None)})
     T = invert_transform(views[0].T_world_camera) @ there.T_world_camera
     assert 1e3 * np.linalg.norm(T[:3, 3]) < 1.0
-    assert posed_among(views[0], views[1:]).T_world_camera is not None
 
 
 def test_what_is_stored_is_where_each_view_is(views: list[RgbdFrame]) -> None:
     off = disturbed(views, 20.0, 1.0)
-    moved, told = put_right(off, "scan", SILENT)
-    for frame, row in zip(moved, told["refined_poses"], strict=True):
+    moved, told = Corrections(poses=True).of(off, "scan", SILENT)
+    for frame, row in zip(moved, told["corrected_views"], strict=True):
         assert np.array_equal(np.reshape(row["T_world_camera"], (4, 4)), frame.T_world_camera)
     assert told["pose_residual"] < 0.1 * told["poses"]["residual_before"]
     assert told["poses"]["held"] == []

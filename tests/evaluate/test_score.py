@@ -157,7 +157,7 @@ def test_the_names_of_the_totals_are_known_beforehand() -> None:
     total = total_score([score(perfect(), np.ones((H, W), np.float32), NONE)])
     assert set(metric_names()) >= set(total)
     view = masked_score()
-    assert set(metric_names()) == set(total_score([replace(view, posed=view)]))
+    assert set(metric_names()) == set(total_score([replace(view, corrected=view)]))
 
 
 def test_a_figure_of_views_rests_on_the_views_that_have_it() -> None:

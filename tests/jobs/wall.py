@@ -12,6 +12,7 @@ from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs import score, score_reference
 from splatctrl_cli.records import Float64, Intrinsics, LossReport, Record, RgbdFrame, SplatSet
 from splatctrl_cli.scene.render import render
+from splatctrl_cli.scene_files.scene_folder import ViewCorrection
 from splatctrl_cli.splat_files.splats import write_ply
 from splatctrl_cli.voxels import OccupancyGrid
 from tests.plain import plain_frame, plain_grid, plain_splats
@@ -78,7 +79,7 @@ class FakeScene:
     is_anisotropic: bool = False
     names_its_views: bool = True
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    refined_poses: dict[tuple[str, int], Float64] = field(default_factory=dict)
+    corrections: dict[tuple[str, int], ViewCorrection] = field(default_factory=dict)
     run: dict[str, Any] = field(default_factory=lambda: {"config": {"occupancy": {"free_below": 0.3}}})
 
     def occupancy(self) -> OccupancyGrid:

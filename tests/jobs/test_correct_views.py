@@ -1,4 +1,4 @@
-"""``--refine-poses`` from the recording to the score."""
+"""``--refine-poses`` and ``--refine-exposure`` from the recording to the score."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.calibration.exposure import exposed
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs import score_reference
+from splatctrl_cli.jobs.correct_views import Corrections
 from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
@@ -16,7 +18,7 @@ from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.score import ScoreRequest, score
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
-from tests.calibration.scan import disturbed, views_of
+from tests.calibration.scan import disturbed, gains_of, views_of
 from tests.jobs.wall import FakeSource
 
 SMALL = [
@@ -26,6 +28,7 @@ SMALL = [
     "gaussians.iterations=50",
 ]
 HELD_OUT = 3
+POSES, EXPOSURE = Corrections(poses=True), Corrections(exposure=True)
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +40,14 @@ def held_out(views: list[RgbdFrame]) -> list[RgbdFrame]:
     return [replace(view, camera="holdout") if k == HELD_OUT else view for k, view in enumerate(views)]
 
 
-def request(views: list[RgbdFrame], out: Path, *, has_clock: bool = False, refine: bool = True) -> ReconstructRequest:
+def request(
+    views: list[RgbdFrame], out: Path, *, corrections: Corrections = POSES, has_clock: bool = False
+) -> ReconstructRequest:
     return ReconstructRequest(
         source=FakeSource(frames=[view for view in views if view.camera != "holdout"], has_clock=has_clock),
         out=out,
         config=load_config(None, SMALL),
-        refine_poses=refine,
+        corrections=corrections,
         allow_disagreement=True,
     )
 
@@ -53,24 +58,39 @@ def test_a_view_held_out_is_scored_where_it_was_recorded_and_where_it_belongs(
     off = held_out(disturbed(views, 15.0, 1.0))
     result = reconstruct(request(off, tmp_path / "scene"))
     assert result.metrics["pose_residual"] < 0.1 * result.metrics["poses"]["residual_before"]
-    assert len(SceneFolder(tmp_path / "scene").refined_poses) == len(views) - 1
-    monkeypatch.setattr(score_reference, "open_source", lambda path, options: FakeSource(frames=off, has_clock=False))
+    assert len(SceneFolder(tmp_path / "scene").corrections) == len(views) - 1
+    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
     scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
-    assert scored.metrics["psnr_all_posed"] > scored.metrics["psnr_all"] + 2.0  # type: ignore[operator]
-    assert scored.metrics["depth_median_all_posed"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+    assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 2.0  # type: ignore[operator]
+    assert scored.metrics["depth_median_all_corrected"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
 
 
-def test_right_poses_give_the_same_splats_with_and_without(views: list[RgbdFrame], tmp_path: Path) -> None:
+def test_right_views_give_the_same_splats_with_and_without(views: list[RgbdFrame], tmp_path: Path) -> None:
     right = held_out(views)
-    with_, without = (reconstruct(request(right, tmp_path / str(refine), refine=refine)) for refine in (True, False))
+    both, none = Corrections(poses=True, exposure=True), Corrections()
+    with_, without = (reconstruct(request(right, tmp_path / str(bool(c)), corrections=c)) for c in (both, none))
     assert (with_.out / "splats.ply").read_bytes() == (without.out / "splats.ply").read_bytes()
     assert without.metrics["pose_residual"] is None
+    assert without.metrics["exposure_spread"] is None
+
+
+def test_a_view_held_out_is_scored_at_its_own_exposure_and_at_that_of_the_others(
+    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gains = gains_of(len(views))
+    gains[HELD_OUT] = [1.3, 1.2, 1.1]
+    off = held_out([exposed(view, 1 / gain) for view, gain in zip(views, gains, strict=True)])
+    result = reconstruct(request(off, tmp_path / "scene", corrections=EXPOSURE))
+    assert result.metrics["exposure_spread"] > 0.1
+    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
+    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
+    assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 1.0  # type: ignore[operator]
 
 
 def test_the_baseline_is_put_right_alike(views: list[RgbdFrame], tmp_path: Path) -> None:
     off = disturbed(views, 15.0, 1.0)
     of_ours, of_theirs = (
-        make(request(off, tmp_path / name)).metrics["refined_poses"]
+        make(request(off, tmp_path / name)).metrics["corrected_views"]
         for name, make in (("splats", reconstruct), ("gaussians", reconstruct_gaussians))
     )
     assert of_ours == of_theirs
