@@ -99,7 +99,7 @@ class LossWeights:
 @dataclass(frozen=True, kw_only=True)
 class TargetView:
     """What a camera saw: color (3, H, W) uint8; depth (H, W) float32 [m], 0 = none; counted (H, W) uint8, 0 = a pixel
-    that the map need not explain.
+    whose colour and depth the map need not explain.
     """
 
     color: NDArray[np.uint8]

@@ -18,15 +18,17 @@ from splatctrl_cli.scene.render import camera_array
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A frame as the optimiser takes it, with the pixels (H, W) that the map has to explain; `reach` [m] is that of
-    `nearest`.
-    """
+    """A frame as the optimiser takes it; `reach` [m] is that of `nearest`."""
 
     frame: RgbdFrame
     camera: Float64
     target: TargetView
-    mappable: Bool
     reach: float
+
+    @property
+    def mappable(self) -> Bool:
+        """Pixels (H, W) whose depth the map has to explain."""
+        return np.asarray((self.target.counted != 0) & (self.target.depth > 0))
 
     @cached_property
     def nearest(self) -> Float32:
@@ -42,16 +44,16 @@ def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, 
     """
     counted = mappable | (frame.depth <= 0)
     if frame.valid is not None:
-        mappable, counted = mappable & frame.valid, counted & frame.valid
+        counted &= frame.valid
     if mounted is not None:
-        mappable, counted = mappable & ~mounted, counted & ~mounted
+        counted &= ~mounted
     target = TargetView(
         color=np.ascontiguousarray(np.moveaxis(frame.color, 2, 0)),
-        depth=np.where(mappable, frame.depth, np.float32(0.0)).astype(np.float32),
+        depth=np.ascontiguousarray(frame.depth, np.float32),
         counted=counted.astype(np.uint8),
     )
     camera = camera_array(frame.intrinsics, frame.T_world_camera)
-    return View(frame=frame, camera=camera, target=target, mappable=mappable, reach=reach)
+    return View(frame=frame, camera=camera, target=target, reach=reach)
 
 
 def halved(view: View) -> View:
@@ -63,13 +65,13 @@ def halved(view: View) -> View:
     height, width = k.height // 2, k.width // 2
     camera = view.camera.copy()
     camera[:6] = [k.fx / 2, k.fy / 2, (k.cx - 0.5) / 2, (k.cy - 0.5) / 2, width, height]
-    nearest = _quads(np.where(target.depth > 0, target.depth, np.float32(np.inf))).min(axis=(-3, -1))
+    nearest = _quads(np.where(view.mappable, target.depth, np.float32(np.inf))).min(axis=(-3, -1))
     halved_target = TargetView(
         color=np.ascontiguousarray(np.rint(_quads(target.color).mean(axis=(-3, -1))).astype(np.uint8)),
         depth=np.where(np.isfinite(nearest), nearest, np.float32(0.0)),
         counted=_quads(target.counted).min(axis=(-3, -1)).astype(np.uint8),
     )
-    return View(frame=view.frame, camera=camera, target=halved_target, mappable=view.mappable, reach=view.reach)
+    return View(frame=view.frame, camera=camera, target=halved_target, reach=view.reach)
 
 
 def _quads(image: NDArray[np.generic]) -> Float32:

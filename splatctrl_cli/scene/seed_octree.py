@@ -5,8 +5,9 @@ leaves objects as coarse as the floor. Here a cube is split in eight while its p
 do not lie on a plane.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +42,9 @@ def cube_levels(points: Float32, colors: Float32, edge: float, num_levels: int) 
     above: Index = np.zeros(len(points), np.int64)
     for level in range(num_levels):
         size = edge / 2**level
-        cell = np.floor(points.astype(np.float64) / size).astype(np.int64)
-        key = (cell[:, 0] * 2_097_152 + cell[:, 1]) * 2_097_152 + cell[:, 2]
+        key: Index = np.zeros(len(points), np.int64)
+        for column in points.T:
+            key = key * 2_097_152 + np.floor(column.astype(np.float64) / size).astype(np.int64)
         first, cube = np.unique(key, return_index=True, return_inverse=True)[1:]
         levels.append(_level(points, colors, cube, above[first], size))
         above = cube
@@ -50,20 +52,20 @@ def cube_levels(points: Float32, colors: Float32, edge: float, num_levels: int) 
 
 
 def _level(points: Float32, colors: Float32, cube: Index, parent: Index, edge: float) -> CubeLevel:
+    """Column by column: millions of points are looked at."""
     count = np.bincount(cube).astype(np.float64)
 
-    def mean(values: NDArray[np.floating]) -> Float64:
-        columns = [np.bincount(cube, weights=column) / count for column in values.reshape(len(values), -1).T]
-        return np.stack(columns, 1)
+    def mean(columns: Iterable[NDArray[np.floating]]) -> Float64:
+        return np.stack([np.bincount(cube, weights=column) / count for column in columns], 1)
 
-    center, color = mean(points), mean(colors)
-    color_variance = (mean(colors.astype(np.float64) ** 2) - color**2).sum(axis=1)
-    offset = points - center[cube]
-    upper = mean(offset[:, [0, 0, 0, 1, 1, 2]] * offset[:, [0, 1, 2, 1, 2, 2]])
+    center, color = mean(points.T), mean(colors.T)
+    color_variance = (mean(column.astype(np.float64) ** 2 for column in colors.T) - color**2).sum(axis=1)
+    offset = [column - middle[cube] for column, middle in zip(points.T, center.T, strict=True)]
+    upper = mean(a * b for a, b in combinations_with_replacement(offset, 2))
     covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     thickness = np.maximum(np.linalg.eigvalsh(covariance)[:, 0], 0.0)
     detail = count * (np.maximum(color_variance, 0.0) + SEED_BEND * thickness / edge**2)
-    nearest = _least(np.sum(offset**2, axis=1), cube, len(count))
+    nearest = _least(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2, cube, len(count))
     return CubeLevel(edge=edge, points=points[nearest], colors=color, detail=detail, parent=parent)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from splatctrl_cli.config.fixed import FRAMES_PER_STEP, JOINTS_GAP_NS
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import Box, Float64, JointState, PointCloud, Record, RgbdFrame
-from splatctrl_cli.scene.seeding import world_points
+from splatctrl_cli.scene.seeding import thinned, thinning, world_points_at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,10 +74,16 @@ def time_steps(
         if frames and _is_complete(frames, record, has_clock=has_clock, tolerance_ns=tolerance_ns):
             yield _time_step(frames, at_frames)
             frames = []
-        frames.append(record)
+        frames.append(record if has_clock else planar(record))
         at_frames = newest
     if frames:
         yield _time_step(frames, at_frames)
+
+
+def planar(frame: RgbdFrame) -> RgbdFrame:
+    """The same frame, its colour stored plane by plane, as the optimiser takes it: many views are then kept once."""
+    planes = np.ascontiguousarray(np.moveaxis(frame.color, 2, 0))
+    return replace(frame, color=np.moveaxis(planes, 0, 2))
 
 
 def _is_complete(frames: Sequence[RgbdFrame], record: RgbdFrame, *, has_clock: bool, tolerance_ns: int) -> bool:
@@ -110,8 +116,11 @@ def depth_box(frames: Sequence[RgbdFrame], max_range: float, scale: float = 1.0)
 
     Raises InputError when there is no valid depth at all.
     """
-    points = [world_points(frame)[(frame.depth > 0) & (frame.depth <= max_range)] for frame in frames]
+    masks = [(frame.depth > 0) & (frame.depth <= max_range) for frame in frames]
+    every = thinning(masks)
+    points = [world_points_at(frame, thinned(mask, every)) for frame, mask in zip(frames, masks, strict=True)]
     joined = np.concatenate(points)
+    del points
     if not len(joined):
         names = ", ".join(sorted({frame.camera for frame in frames}))
         raise InputError(

@@ -47,7 +47,7 @@ def loss(
     l1 = (x - color).abs().sum() / num_values
     d_ssim = (1 - ssim_map(x, color)).sum() / num_values
     rendered = torch.where(planes[4] > 0.1, planes[3] / planes[4], planes[3]) if normalised else planes[3]
-    is_valid = depth > 0
+    is_valid = (depth > 0) & counted
     l_depth = (rendered - depth).abs()[is_valid].mean() if is_valid.any() else torch.zeros(())
     empty = (1 - planes[4])[is_valid].mean() if is_valid.any() else torch.zeros(())
     return color_weight * ((1 - dssim) * l1 + dssim * d_ssim) + depth_weight * l_depth + opacity_weight * empty

@@ -262,7 +262,7 @@ struct Band {
         const Float8 target = load_pixels(images.depth + row, x, width);
         const Float8 rendered = load_pixels(images.planes + 3 * size + row, x, width);
         const Float8 opacity = load_pixels(images.planes + 4 * size + row, x, width);
-        const Int8 is_valid = target > 0.0f;
+        const Int8 is_valid = (target > 0.0f) & (load_bytes(images.counted + row, x, width) != 0);
         const Int8 divides = weights.normalised ? opacity > kOpaqueEnough : Int8{};
         const Float8 inverse = divides ? 1.0f / opacity : splat8(1.0f);
         const Float8 error = rendered * inverse - target;
@@ -291,8 +291,11 @@ LossTerms ImageLoss::evaluate(const float* planes, const std::uint8_t* color, co
                               const std::uint8_t* counted, int width, int height, const LossWeights& weights,
                               float* plane_gradients, int num_threads) {
   const Images images{planes, color, depth, counted, width, height};
-  const auto num_valid = std::count_if(depth, depth + images.size(), [](float d) { return d > 0.0f; });
-  const auto num_counted = std::count_if(counted, counted + images.size(), [](std::uint8_t c) { return c != 0; });
+  long num_valid = 0, num_counted = 0;
+  for (std::size_t i = 0; i < images.size(); ++i) {
+    num_counted += counted[i] != 0;
+    num_valid += counted[i] != 0 && depth[i] > 0.0f;
+  }
   const double num_values = 3.0 * static_cast<double>(std::max<long>(num_counted, 1));
   const auto per_value = static_cast<float>(1.0 / num_values);
   const float weight_l1 = weights.color * (1.0f - weights.dssim) * per_value;
