@@ -21,6 +21,7 @@ RANK = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
 HOMES = {
     "torch": {"scene"},
     "pinocchio": {"robot"},
+    "coal": {"robot"},
     "clarabel": {"control"},
     "daqp": {"control"},
     "rosbags": {"containers", "logs"},

@@ -63,7 +63,7 @@ def self_collision_pairs(
     """
     links = tuple(dict.fromkeys(model.sphere_set.links))
     owner = np.array([links.index(link) for link in model.sphere_set.links], dtype=np.int64)
-    known = {frozenset(pair.links): f"SRDF: {pair.reason}" for pair in disabled} | _joined(model)
+    known = {frozenset(pair.links): f"SRDF: {pair.reason}" for pair in disabled} | joined_links(model, links)
     num_postures = 0 if disabled else num_postures
     a, b = np.triu_indices(len(links), k=1)
     gaps = _gaps(model, owner, np.stack([a, b], axis=1), num_postures, seed)
@@ -118,7 +118,7 @@ def never_apart(
     pairs, links = model.self_pairs(), model.sphere_set.links
     if not len(pairs):
         return ()
-    centers, radii = model.sphere_centers_batch(_postures(model, num_postures, seed)), model.sphere_set.radii
+    centers, radii = model.sphere_centers_batch(random_postures(model, num_postures, seed)), model.sphere_set.radii
     a, b = pairs.T
     gaps = np.linalg.norm(centers[:, a] - centers[:, b], axis=2) - radii[a] - radii[b]
     owners = [(links[i], links[j]) for i, j in pairs]
@@ -130,10 +130,9 @@ def never_apart(
     return tuple(found)
 
 
-def _joined(model: RobotModel) -> dict[frozenset[str], str]:
-    """Pairs of links that no posture tells anything about: of one rigid body, or of two bodies with one joint."""
+def joined_links(model: RobotModel, links: Sequence[str]) -> dict[frozenset[str], str]:
+    """Pairs of links that no posture tells anything about, and why: of one rigid body, or of two with one joint."""
     bodies = model.urdf.rigid_bodies(model.joint_names)
-    links = dict.fromkeys(model.sphere_set.links)
     leader = {link: bodies[link][0] for link in links}
     parent = {joint.child: bodies[joint.parent][0] for joint in model.urdf.joints}
     reasons = {}
@@ -155,7 +154,7 @@ def _sampled_reason(gaps: Float64, drop_never: bool) -> str | None:
     return None
 
 
-def _postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
+def random_postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
     """Postures (T, J) even within the limits; a joint without limits turns once."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     lower, upper = np.where(limited, model.lower, -np.pi), np.where(limited, model.upper, np.pi)
@@ -164,7 +163,7 @@ def _postures(model: RobotModel, num_postures: int, seed: int) -> Float64:
 
 def _gaps(model: RobotModel, owner: Int64, pairs: Int64, num_postures: int, seed: int) -> Float64:
     """Smallest gap (T, P) between the spheres of each pair of links in each posture."""
-    postures = _postures(model, num_postures, seed)
+    postures = random_postures(model, num_postures, seed)
     radii = model.sphere_set.radii
     members = [np.flatnonzero(owner == link) for link in range(int(owner.max(initial=-1)) + 1)]
     gaps = np.empty((num_postures, len(pairs)))
