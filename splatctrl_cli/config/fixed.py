@@ -168,6 +168,7 @@ COVERED_EDGE = 2e-3  # [m] longest edge of a triangle that is counted as covered
 COVERED_COARSE = 0.02  # [m] the same of areas that a replay does not report; the deficit is as exact as ever
 CYLINDER_SIDES = 96  # of the prism that stands for a cylinder: 0.05 % of its radius
 SPHERE_ROUNDS = 4  # of splitting an octahedron's faces: 2048 stand for a sphere, 0.3 % of its radius
+SELF_POSTURES = 2000  # random ones by which a pair of links is judged
 SELF_TOUCHING = 100  # random ones, in all of which links overlap that no posture parts
 LEAST_OVERLAP = 1e-6  # [m] said of links whose surfaces cross without a vertex inside
 NEVER_MARGIN = 0.02  # [m] a pair that comes nearer than this in a sample is kept, though it never collides there

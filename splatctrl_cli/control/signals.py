@@ -19,9 +19,11 @@ def audit_signals(
     margin: float,
     spheres: Sequence[str],
     joints: Sequence[str],
-    self_pairs: Sequence[tuple[int, int]] = (),
+    pairs: Sequence[str] = (),
 ) -> list[Signal]:
-    """What the clearances, limits and known space of T states amount to; self_pairs (P, 2): of spheres."""
+    """What the clearances, limits and known space of T states amount to; pairs: names of what may
+    collide with each other.
+    """
     signals = []
     for source, clearance in audit.clearance.items():
         signals += clearance_signals(source, clearance.distance, clearance.sphere, margin, spheres)
@@ -42,7 +44,7 @@ def audit_signals(
     signals.append(
         _low(EventKind.OUTSIDE_LIMITS, outside < 0, outside, OneEach(names=joints, index=audit.limit_joint))
     )
-    touching, pairs = audit.self_clearance, [f"{spheres[a]} and {spheres[b]}" for a, b in self_pairs]
+    touching = audit.self_clearance
     signals.append(
         _low(EventKind.SELF_COLLISION, touching < 0, touching, OneEach(names=pairs, index=audit.self_pair))
     )

@@ -21,12 +21,14 @@ from splatctrl_cli.jobs.replays.goal import check_goal, check_twists
 from splatctrl_cli.jobs.replays.golden import read_golden
 from splatctrl_cli.jobs.replays.inputs import (
     LoggedStates,
+    MeasuredRobot,
     clock_of,
-    coverage_words,
     doubts_of,
     measured_robot,
     open_log,
     read_states,
+    recorded_postures,
+    words_of,
 )
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene, reads_whole_log
 from splatctrl_cli.jobs.replays.metrics import Metrics, metric_names, metrics_of
@@ -75,8 +77,8 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         motion = ImageMotion()
         with stopwatch.stage("read"):
-            inputs, logged, evidence = _read(request, folder, progress, motion)
-        for doubt in doubts_of(request, inputs.model, config.control):
+            inputs, logged, evidence, robot = _read(request, folder, progress, motion)
+        for doubt in doubts_of(request, robot, config.control):
             progress.log(f"warning: {doubt}")
         with stopwatch.stage("replay"):
             found = replayed(request, inputs, config, progress)
@@ -94,13 +96,16 @@ def replay(request: ReplayRequest, progress: Progress = SILENT) -> ReplayResult:
         with stopwatch.stage("worst_frames"):
             unseen = draw_worst_frames(folder, found, sights)
         write_json(folder / "states.json", logged.as_dict())
-        write_replay(folder, found, metrics, verdict, config=config, inputs=inputs.digests, stopwatch=stopwatch)
+        of_robot = words_of(robot, config.control)
+        write_replay(
+            folder, found, metrics, verdict, of_robot, config=config, inputs=inputs.digests, stopwatch=stopwatch
+        )
     return ReplayResult(
         out=request.out,
         replay=found,
         metrics=metrics,
         verdict=verdict,
-        notes=(coverage_words(inputs.model, config.control), *unseen, *logged.lines()),
+        notes=(*of_robot.values(), *unseen, *logged.lines()),
         is_damaged=bool(inputs.source.loss.damaged),
     )
 
@@ -143,14 +148,15 @@ def _seen_by_cameras(
 
 def _read(
     request: ReplayRequest, folder: Path, progress: Progress, motion: ImageMotion
-) -> tuple[ReplayInputs, LoggedStates, Evidence | None]:
+) -> tuple[ReplayInputs, LoggedStates, Evidence | None, MeasuredRobot]:
     """What the replay needs; `motion` is shown all frames of the log now, or as a lockstep takes them in."""
-    robot, opened = open_log(request, progress)
+    model, opened = open_log(request, progress)
     if request.urdf is None:  # for who looks at the run
-        (folder / ROBOT).write_text(robot.urdf.text, encoding="utf-8", newline="")
-    model = measured_robot(request, robot, request.config.control)
-    truth = None if request.truth is None else load_truth(request.truth)
+        (folder / ROBOT).write_text(model.urdf.text, encoding="utf-8", newline="")
     logged = read_states(opened, model)
+    robot = measured_robot(request, model, request.config.control, recorded_postures(logged.states))
+    model = robot.model
+    truth = None if request.truth is None else load_truth(request.truth)
     if truth is not None and (other := truth_mismatch(truth, logged.states, model)) is not None:
         raise InputError(other.sentence, remedy=other.remedy)
     declared = declarations_of(request.declare, model)
@@ -173,8 +179,9 @@ def _read(
         digests=digests,
         mismatches=_mismatches(request, logged, model),
         declared=declared,
+        surfaces=robot.surfaces,
     )
-    return inputs, logged, evidence
+    return inputs, logged, evidence, robot
 
 
 def _mismatches(request: ReplayRequest, logged: LoggedStates, model: RobotModel) -> tuple[Mismatch, ...]:

@@ -1,5 +1,6 @@
 """What replays share."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,30 +11,32 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from splatctrl_cli.jobs.replays import files, inputs, lockstep
 from splatctrl_cli.records import SphereSet
 from splatctrl_cli.robot import coverage
+from splatctrl_cli.robot.link_meshes import Solid
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
 from splatctrl_cli.states import state_source
 from tests.cli.replay_desk import Desk, FakeSource, logged
 
+Solids = Mapping[str, Sequence[Solid]]
 MEASURED: dict[tuple[bytes, ...], coverage.CoverageReport] = {}
 
 
 @pytest.fixture
 def coverage_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """What spheres leave uncovered of a robot without meshes is measured once: that takes longer than a replay."""
-    measure = coverage.coverage_deficit
+    measure = coverage.coverage_of_solids
 
-    def known(urdf: UrdfFile, spheres: SphereSet, **how: Any) -> coverage.CoverageReport:
+    def known(urdf: UrdfFile, solids: Solids, spheres: SphereSet, **how: Any) -> coverage.CoverageReport:
         text = urdf.text.encode()
         if b"<mesh" in text:
-            return measure(urdf, spheres, **how)
+            return measure(urdf, solids, spheres, **how)
         names = repr((how, spheres.links)).encode()
         key = (text, names, spheres.centers.tobytes(), spheres.radii.tobytes())
         if key not in MEASURED:
-            MEASURED[key] = measure(urdf, spheres, **how)
+            MEASURED[key] = measure(urdf, solids, spheres, **how)
         return MEASURED[key]
 
-    monkeypatch.setattr(inputs, "coverage_deficit", known)
+    monkeypatch.setattr(inputs, "coverage_of_solids", known)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from splatctrl_cli.control.replay import ReplayTask, closed_loop
 from splatctrl_cli.files import spilled_rows
 from splatctrl_cli.geometry import transform_points
 from splatctrl_cli.jobs.replays import files, state_pass, state_store
-from splatctrl_cli.jobs.replays.inputs import doubts_of, measured_robot
+from splatctrl_cli.jobs.replays.inputs import MeasuredRobot, doubts_of, measured_robot
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
@@ -146,11 +146,12 @@ def test_an_fr3_is_reminded_of_its_limits_by_position(sample_data: Path, tmp_pat
     urdf.write_text((tabletop / "robot.urdf").read_text().replace('joint name="joint', 'joint name="fr3_joint'))
     model = RobotModel.from_urdf(urdf, tabletop / "robot_spheres.yaml")
     drive, audit = Namespace(mode="closed-loop"), Namespace(mode="audit")
-    (doubt,) = doubts_of(drive, model, ControlConfig())
+    robot = MeasuredRobot(model=model, surfaces=None)
+    (doubt,) = doubts_of(drive, robot, ControlConfig())
     assert "control.velocity_limits = fr3" in doubt
     assert (
-        doubts_of(drive, model, ControlConfig(velocity_limits="fr3"))
-        == doubts_of(audit, model, ControlConfig())
+        doubts_of(drive, robot, ControlConfig(velocity_limits="fr3"))
+        == doubts_of(audit, robot, ControlConfig())
         == []
     )
 
@@ -183,7 +184,7 @@ def test_a_replay_finds_the_meshes_of_the_self_mask_where_its_packages_are(tmp_p
     for packages, missing in (((), ("base",)), ((tmp_path / "elsewhere",), ())):
         request = ReplayRequest(log=tmp_path, out=tmp_path, urdf=urdf, spheres=file, packages=packages)
         model = RobotModel.from_urdf(urdf, file, packages=packages)
-        assert measured_robot(request, model, ControlConfig()).surface.by_spheres == missing
+        assert measured_robot(request, model, ControlConfig()).model.surface.by_spheres == missing
 
 
 FILES = ("steps.csv", "events.json", "summary.json", "states.json")

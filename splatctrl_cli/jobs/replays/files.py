@@ -17,7 +17,6 @@ from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, write_json, write_run
 from splatctrl_cli.files.spilled_rows import BLOCK
 from splatctrl_cli.jobs.replays.compare import document_of, draw_methods
-from splatctrl_cli.jobs.replays.inputs import coverage_words
 from splatctrl_cli.jobs.replays.metrics import Metrics
 from splatctrl_cli.jobs.replays.pictures import draw_replay
 from splatctrl_cli.jobs.replays.result import Replay
@@ -116,19 +115,18 @@ def write_replay(
     replay: Replay,
     metrics: Metrics,
     verdict: Verdict,
+    robot: Mapping[str, str],
     *,
     config: Config,
     inputs: Mapping[str, str],
     stopwatch: Stopwatch,
 ) -> None:
-    """Write steps.csv, events.json, summary.json, pictures and run.json."""
+    """Write steps.csv, events.json, summary.json, pictures and run.json; robot: what is said of it, by subject."""
     write_steps(folder / "steps.csv", chunks_of(replay))
     write_json(folder / "events.json", events_document(replay))
     if replay.comparison.methods:
         write_json(folder / "methods.json", document_of(replay.comparison))
-    write_json(
-        folder / "summary.json", summary_of(replay, metrics, verdict, coverage_words(replay.model, config.control))
-    )
+    write_json(folder / "summary.json", summary_of(replay, metrics, verdict, robot))
     with stopwatch.stage("picture"):
         draw_replay(folder, replay, seconds_of(replay))
         draw_methods(folder, replay.comparison, replay.period, replay.margin)
@@ -143,13 +141,13 @@ def write_replay(
     )
 
 
-def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, coverage: str) -> dict[str, Any]:
+def summary_of(replay: Replay, metrics: Metrics, verdict: Verdict, robot: Mapping[str, str]) -> dict[str, Any]:
     """The verdict, when and why, the metrics, and the words that go with them."""
     words = {
         "mode": replay.mode,
         "outcome": str(replay.closed_loop.outcome) if replay.closed_loop else f"{replay.mode}: every state",
         "margin": replay.margin,
-        "coverage": coverage,
+        **robot,
         "units": "m, rad, s",
         "min_clearance": "the smallest exact distance from a moving sphere's surface to the splats",
     }

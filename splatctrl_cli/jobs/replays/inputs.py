@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from splatctrl_cli.checks.clock_offset import (
     states_asked,
 )
 from splatctrl_cli.config import ControlConfig
-from splatctrl_cli.config.fixed import COVERED_COARSE
+from splatctrl_cli.config.fixed import COVERED_COARSE, SELF_POSTURES
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.evaluate.metrics import DESCRIBES, LENGTH, TIME, Scale
 from splatctrl_cli.geometry import transform_from
@@ -26,10 +25,12 @@ from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Box, Float64, RecordSource
-from splatctrl_cli.robot.coverage import LinkCoverage, coverage_deficit
+from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
+from splatctrl_cli.robot.link_gaps import SelfSurfaces
+from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import never_apart, without_disabled
-from splatctrl_cli.robot.srdf import read_srdf
+from splatctrl_cli.robot.srdf import DisabledPair, read_srdf
 from splatctrl_cli.states.state_source import StateSource, open_states
 
 MAX_NOTES = 10  # printed
@@ -70,23 +71,44 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
     return model.moved_by(source.joint_names), source
 
 
-def measured_robot(request: ReplayRequest, model: RobotModel, config: ControlConfig) -> RobotModel:
-    """The robot without the pairs that its SRDF names, and its spheres measured against the URDF's collision geometry
-    where that can be read.
-
-    Raises InputError where `config.coverage` is "margin" and no distance bounds what is uncovered.
+@dataclass(frozen=True, kw_only=True)
+class MeasuredRobot:
+    """A robot whose spheres were measured against the URDF's collision geometry, and the surfaces of its links; None
+    where they cannot be read.
     """
+
+    model: RobotModel
+    surfaces: SelfSurfaces | None
+
+
+def measured_robot(
+    request: ReplayRequest, model: RobotModel, config: ControlConfig, recorded: Float64 | None = None
+) -> MeasuredRobot:
+    """The robot without the pairs that its SRDF names, and the surfaces of its links.
+
+    recorded: `recorded_postures`. Raises InputError where `config.coverage` is "margin" and no distance bounds what
+    is uncovered.
+    """
+    disabled: tuple[DisabledPair, ...] = ()
     if request.srdf is not None:
         disabled, _ = read_srdf(request.srdf, model.urdf)
         model = model.with_self_pairs(without_disabled(model, disabled))
-    model = _measured(model, list(request.packages))
+    try:
+        solids = read_solids(model.urdf, list(request.packages))
+    except InputError as error:
+        model, surfaces = model.with_coverage(None, str(error)), None
+    else:
+        report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=COVERED_COARSE)
+        model = model.with_coverage(report)
+        surfaces = SelfSurfaces(model, solids, disabled, recorded)
     if config.coverage == "margin":
         _check_bounded(model)
-    return model
+    return MeasuredRobot(model=model, surfaces=surfaces)
 
 
-def doubts_of(request: ReplayRequest, model: RobotModel, config: ControlConfig) -> list[str]:
+def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
     """What a person should know of the robot before trusting this replay; a sentence each."""
+    model = robot.model
     if request.mode == "audit":
         return list(model.doubts)
     found = never_apart(model, config.self_margin)
@@ -101,6 +123,17 @@ def doubts_of(request: ReplayRequest, model: RobotModel, config: ControlConfig) 
             for pair in found
         ),
     ]
+
+
+def words_of(robot: MeasuredRobot, config: ControlConfig) -> dict[str, str]:
+    """What the robot's spheres stand for, by subject, a sentence each."""
+    words = {"coverage": coverage_words(robot.model, config)}
+    if robot.surfaces is not None and robot.surfaces.fused:
+        pairs = ", ".join(" and ".join(pair) for pair in robot.surfaces.fused)
+        words["fused"] = (
+            f"not judged whether they touch, for they overlap in every posture recorded or sampled: {pairs}"
+        )
+    return words
 
 
 def coverage_words(model: RobotModel, config: ControlConfig) -> str:
@@ -124,15 +157,6 @@ def coverage_words(model: RobotModel, config: ControlConfig) -> str:
         )
     bare = f", and nothing of {', '.join(report.bare_links)}, which have no sphere" if report.bare_links else ""
     return words + bare
-
-
-def _measured(model: RobotModel, packages: list[Path]) -> RobotModel:
-    try:
-        return model.with_coverage(
-            coverage_deficit(model.urdf, model.sphere_set, folders=packages, resolution=COVERED_COARSE)
-        )
-    except InputError as error:
-        return model.with_coverage(None, str(error))
 
 
 def _check_bounded(model: RobotModel) -> None:
@@ -217,6 +241,11 @@ def read_states(source: FrameSource | StateSource, model: RobotModel) -> LoggedS
     check_states(states, model.joint_names)
     check_angles(model, states, source.name)
     return LoggedStates(source=source, states=states, poses=pose_agreement(model, states))
+
+
+def recorded_postures(states: StateColumns) -> Float64:
+    """Postures (R, J) of a log: SELF_POSTURES of them or somewhat more, evenly over it, or all."""
+    return states.position[np.arange(0, len(states), max(len(states) // SELF_POSTURES, 1))]
 
 
 def check_inside(model: RobotModel, q: Float64, box: Box) -> None:

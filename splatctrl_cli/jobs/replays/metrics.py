@@ -158,7 +158,7 @@ OF_STATES: Declared = (
         "min_self_clearance",
         LEAST,
         lambda replay: replay.audit.self_clearance,
-        lambda replay: num_states(replay) if len(replay.model.self_pairs()) else 0,
+        lambda replay: int(np.isfinite(replay.audit.self_clearance).sum()),
         scale=GAP,
         shown=least_of("self_clearance"),
     ),

@@ -162,6 +162,7 @@ def _record(request: ReplayRequest, inputs: ReplayInputs, config: Config) -> Rep
         is_continuous=request.re_anchor is None,
         declared=inputs.declared,
         first_state_ns=int(inputs.states.stamp_ns[0]),
+        surfaces=inputs.surfaces,
     )
 
 

@@ -127,7 +127,7 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two spheres of the arm overlap."""
+    """No two links of the arm overlap, by their collision surfaces; by their spheres where these cannot be read."""
     least = least_of(judged.replay.audit.self_clearance)
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
     if least is None or not np.isfinite(least):

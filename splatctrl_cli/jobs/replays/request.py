@@ -15,6 +15,7 @@ from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations
+from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.truth import Truth
 
@@ -88,7 +89,9 @@ class ReplayRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayInputs:
-    """Everything a replay reads; states in the model's joint order. mismatches: of what does not belong together."""
+    """Everything a replay reads; states in the model's joint order. mismatches: of what does not belong together.
+    surfaces: of the robot's links, None where they cannot be read.
+    """
 
     source: RecordSource
     states: StateColumns
@@ -98,6 +101,7 @@ class ReplayInputs:
     digests: dict[str, str]
     mismatches: tuple[Mismatch, ...] = ()
     declared: Declarations = made_by(default_factory=Declarations)
+    surfaces: SelfSurfaces | None = None
 
     def motion(self) -> LoggedMotion:
         """Every logged state, whether a scene was known or not."""

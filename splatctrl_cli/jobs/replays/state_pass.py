@@ -21,6 +21,7 @@ from splatctrl_cli.jobs.replays.known_scene import KnownFields, KnownScene
 from splatctrl_cli.jobs.replays.state_store import BLOCK, Figures, StoredAudit, StoredObjects
 from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
+from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.model import RobotModel
 
 
@@ -47,9 +48,11 @@ class ReplayRecord:
         is_continuous: bool = True,
         declared: Declarations | None = None,
         first_state_ns: int = 0,
+        surfaces: SelfSurfaces | None = None,
     ) -> None:
         """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states.
-        declared: contact that is meant, at times that count from `first_state_ns`.
+        declared: contact that is meant, at times that count from `first_state_ns`. surfaces: of the links, which tell
+        where the arm touches itself; None for its spheres alone.
         """
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
@@ -60,7 +63,9 @@ class ReplayRecord:
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self._spheres = sphere_names(model.sphere_set)
         self._number = {name: number for number, name in enumerate(self._spheres)}
-        self._pairs = [(int(a), int(b)) for a, b in model.self_pairs()]
+        self._surfaces, self._enough = surfaces, config.control.self_margin
+        spheres = [f"{self._spheres[a]} and {self._spheres[b]}" for a, b in model.self_pairs()]
+        self._pairs = spheres if surfaces is None else surfaces.names
         self._reach, self._is_continuous = Reach.of(model), is_continuous
         limit = np.asarray(config.control.max_acceleration, np.float64)
         self._limits = MotionLimits(
@@ -89,7 +94,7 @@ class ReplayRecord:
         part = audited(
             self._model, stamps, positions, lambda stamp: scene.at(stamp).distances, observed=scene.observed
         )
-        part = self._without_expected(part)
+        part = self._look_at_self(self._without_expected(part))
         self.audit.add(part)
         self.obstacles.extend(["" if obstacle is None else str(obstacle) for obstacle in self._nearest(part)])
         self.ages.append(map_age_s=np.array([scene.age_s(stamp) for stamp in stamps.tolist()]))
@@ -138,6 +143,16 @@ class ReplayRecord:
             of_spheres[name] = kept
             clearance[name] = Clearance(distance=kept[np.arange(len(kept)), nearest], sphere=moving[nearest])
         return replace(part, clearance=clearance, of_spheres=of_spheres)
+
+    def _look_at_self(self, part: AuditTrace) -> AuditTrace:
+        """The audit with how near the links' own surfaces come to each other, where they are known: spheres that
+        stick out may overlap where nothing touches, and those that leave something uncovered be apart where it does.
+        """
+        if self._surfaces is None:
+            return part
+        gaps = self._surfaces.gaps(part.position, self._model.sphere_centers_batch(part.position), self._enough)
+        nearest = gaps.argmin(axis=1) if gaps.size else np.full(len(gaps), -1)
+        return replace(part, self_clearance=gaps.min(axis=1, initial=np.inf), self_pair=nearest)
 
     def _bound(self, part: AuditTrace, velocities: Float64) -> None:
         """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
