@@ -15,7 +15,8 @@ class ArmModel(Protocol):
 
     J joints, S spheres; positions [m] and poses in world. sphere_deficit (S,) [m]: how far outside the spheres the
     surface of a sphere's body may be, NaN where nobody measured it. lever_arms (S, J): how far [m] a sphere goes, at
-    most, per radian (or metre) of each joint. chain: its bodies and spheres as the kernels walk them, None where only
+    most, per radian (or metre) of each joint. self_allowance (P,) [m]: how much less than the margin asked for each
+    of `self_pairs` keeps. chain: its bodies and spheres as the kernels walk them, None where only
     its methods know.
     """
 
@@ -42,6 +43,9 @@ class ArmModel(Protocol):
 
     @property
     def sphere_deficit(self) -> Float64: ...
+
+    @property
+    def self_allowance(self) -> Float64: ...
 
     @property
     def middle(self) -> Float64: ...

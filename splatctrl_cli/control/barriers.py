@@ -106,7 +106,7 @@ class SelfRows(BarrierTerm):
         self._config, self._acceleration = config, acceleration
         self._radii = np.asarray(model.sphere_set.radii, dtype=np.float64)
         self._pairs = np.asarray(model.self_pairs(), dtype=np.int64).reshape(-1, 2)
-        self._margin = np.full(len(self._pairs), config.self_margin)
+        self._margin = config.self_margin - np.asarray(model.self_allowance, dtype=np.float64)
         names = sphere_names(model.sphere_set)
         self.names = tuple(f"{names[a]}~{names[b]}" for a, b in self._pairs)
 

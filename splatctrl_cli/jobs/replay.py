@@ -180,6 +180,7 @@ def _read(
         mismatches=_mismatches(request, logged, model),
         declared=declared,
         surfaces=robot.surfaces,
+        kept=robot.kept,
     )
     return inputs, logged, evidence, robot
 

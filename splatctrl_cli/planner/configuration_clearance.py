@@ -66,7 +66,7 @@ class Clearance:
         lipschitz: float = 1.0,
     ) -> "Clearance":
         """The clearance of an arm in a scene; margins [m] are taken off the distances, to the scene (one number, or
-        (S,) of every sphere) and to itself.
+        (S,) of every sphere) and to itself, there less the model's allowance.
 
         Raises InputError where no sphere moves.
         """
@@ -75,7 +75,8 @@ class Clearance:
             raise InputError("robot: no collision sphere moves with a joint", remedy="check --spheres")
         levers, pairs = model.lever_arms(), np.asarray(model.self_pairs()).reshape(-1, 2)
         names, radii = sphere_names(model.sphere_set), np.asarray(model.sphere_set.radii, dtype=np.float64)
-        taken = np.concatenate([(radii + margin)[moving], radii[pairs].sum(axis=1) + self_margin])
+        own = radii[pairs].sum(axis=1) + self_margin - model.self_allowance
+        taken = np.concatenate([(radii + margin)[moving], own])
         rows = np.concatenate([lipschitz * levers[moving], _between(levers, pairs)])
         chain, compiled = model.chain, None
         if chain is not None:

@@ -63,6 +63,7 @@ class RobotModel:
         self._packages = packages
         self.held = dict(held or {})
         self._chosen_pairs: Index | None = None
+        self._allowance: Float64 | None = None
         self._is_wrapped = np.array([joint.nq == 2 for joint in model.joints][1:], dtype=bool)
         rows = [joint.idx_q for joint in model.joints][1:]
         self.lower: Float64 = np.where(self._is_wrapped, -np.inf, model.lowerPositionLimit[rows])
@@ -146,7 +147,16 @@ class RobotModel:
 
     def with_self_pairs(self, pairs: Index) -> "RobotModel":
         """The same robot, whose `self_pairs` are these (P, 2)."""
-        return self._changed(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2))
+        return self._changed(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2), _allowance=None)
+
+    def with_self_allowance(self, allowance: Float64) -> "RobotModel":
+        """The same robot with a `self_allowance` (P,) [m] of its pairs."""
+        return self._changed(_allowance=allowance)
+
+    @property
+    def self_allowance(self) -> Float64:
+        """How much less (P,) [m] than the margin asked for each of `self_pairs` keeps (robot.self_margins)."""
+        return np.zeros(len(self.self_pairs())) if self._allowance is None else self._allowance
 
     def _changed(self, **attributes: object) -> "RobotModel":
         other = object.__new__(RobotModel)

@@ -100,36 +100,6 @@ def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Int
     return np.asarray(pairs[np.array(keep, dtype=np.bool_)])
 
 
-@dataclass(frozen=True, kw_only=True)
-class NeverApart:
-    """Two links whose spheres were never farther apart than largest_gap [m] in a sample of postures."""
-
-    links: tuple[str, str]
-    largest_gap: float
-
-
-def never_apart(
-    model: RobotModel, margin: float, *, num_postures: int = 200, seed: int = 0
-) -> tuple[NeverApart, ...]:
-    """Links whose spheres to check keep no `margin` [m] in any of a sample of postures.
-
-    No controller can keep it there: the spheres stick out of the links, or the links are that near each other.
-    """
-    pairs, links = model.self_pairs(), model.sphere_set.links
-    if not len(pairs):
-        return ()
-    centers, radii = model.sphere_centers_batch(random_postures(model, num_postures, seed)), model.sphere_set.radii
-    a, b = pairs.T
-    gaps = np.linalg.norm(centers[:, a] - centers[:, b], axis=2) - radii[a] - radii[b]
-    owners = [(links[i], links[j]) for i, j in pairs]
-    found = []
-    for owner in dict.fromkeys(owners):
-        largest = float(gaps[:, [pair == owner for pair in owners]].min(axis=1).max())
-        if largest < margin:
-            found.append(NeverApart(links=owner, largest_gap=largest))
-    return tuple(found)
-
-
 def joined_links(model: RobotModel, links: Sequence[str]) -> dict[frozenset[str], str]:
     """Pairs of links that no posture tells anything about, and why: of one rigid body, or of two with one joint."""
     bodies = model.urdf.rigid_bodies(model.joint_names)

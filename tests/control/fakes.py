@@ -76,6 +76,10 @@ class PlanarArm:
     def self_pairs(self) -> "np.ndarray":
         return self.pairs
 
+    @property
+    def self_allowance(self) -> Float64:
+        return np.zeros(len(self.pairs))
+
     def reach(self) -> float:
         return sum(self.lengths)
 

@@ -18,6 +18,7 @@ from splatctrl_cli.jobs.replays.inputs import MeasuredRobot, doubts_of, measured
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs import state_columns
 from splatctrl_cli.records import Float64, JointState, SphereSet
+from splatctrl_cli.robot import self_margins
 from splatctrl_cli.robot.coverage import coverage_deficit, refined
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
@@ -156,21 +157,22 @@ def test_an_fr3_is_reminded_of_its_limits_by_position(sample_data: Path, tmp_pat
     )
 
 
-def test_a_margin_that_no_posture_keeps_between_two_links_is_said(
-    desk: Desk, arm: RobotModel, capsys: pytest.CaptureFixture[str]
+def test_a_margin_that_spheres_cannot_keep_is_lowered_and_said_once(
+    desk: Desk, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(self_margins, "SELF_POSTURES", 100)
     scene = write_scene(desk.folder / "scene", (0, splats_of(BALL)))
     drive = ("--scene", str(scene), "--force", "--set", "control.solver=daqp", "--set", "control.max_time=0.1")
-    assert desk.replay(*drive, "--mode", "closed-loop") == 0
-    assert "cannot be kept" not in capsys.readouterr().err
-    wide = ("--set", "control.self_margin=0.3")
-    assert desk.replay(*drive, "--mode", "closed-loop", *wide) == 0
-    assert (
-        "control.self_margin = 300 mm cannot be kept; lower it, or leave the pair out (--srdf)"
-        in capsys.readouterr().err
-    )
-    assert desk.replay(*drive, *wide) == 0
-    assert "cannot be kept" not in capsys.readouterr().err
+    wide = ("--set", "control.self_margin=0.06")
+    for options, said in (("--mode=closed-loop", 0), (("--mode=closed-loop", *wide), 1), (wide, 0)):
+        assert desk.replay(*drive, *([options] if isinstance(options, str) else options)) == 0
+        told = capsys.readouterr()
+        lines = [line for line in (told.out + told.err).splitlines() if "self-collision margin" in line]
+        assert len(lines) == said
+    assert desk.replay(*drive, "--mode=closed-loop", *wide) == 0
+    told = json.loads((desk.folder / "out" / "summary.json").read_text())["about"]["self_margins"]
+    assert told.startswith("self-collision margin: 60 mm, or what spheres can keep: ")
+    assert "link5 and link7" in told and told.endswith("whether links touch is judged by their surfaces")
 
 
 def test_a_replay_finds_the_meshes_of_the_self_mask_where_its_packages_are(tmp_path: Path) -> None:

@@ -282,7 +282,8 @@ def test_a_share_of_the_time_may_be_left_unjudged(stage: Stage) -> None:
     assert stage.judged("--set", "verdict.unjudged=0.51", scene=scene)[0] == 0
 
 
-def test_a_controller_that_cannot_keep_its_rows_fails_alone(stage: Stage) -> None:
+def test_a_controller_that_cannot_keep_its_rows_fails_alone(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatctrl_cli.jobs.replays.inputs.kept_margins", lambda *_: ())  # no pair keeps less
     goal = "--goal-joints=" + ",".join(str(v) for v in START)
     code, verdict = stage.judged("--set", "control.self_margin=0.06", goal, mode="closed-loop")
     assert (code, verdict["label"], decisive(verdict)) == (1, "controller failed", {"controller": "failed"})

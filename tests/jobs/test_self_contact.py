@@ -1,4 +1,4 @@
-"""Where an arm touches itself is told by its links' surfaces, whatever its spheres say."""
+"""Where an arm touches itself is told by its links' surfaces, whatever its spheres say and its rows may keep."""
 
 import json
 import re
@@ -18,6 +18,8 @@ from tests.robot.shapes import written
 FAR = ((1.2, 1.2, 0.9), 0.05)
 COVERING, FAT = covering_spheres(), covering_spheres(1.6)  # the fat ones overlap in every posture
 BLIND = covering_spheres(parts=("block", "neck", "drum"))  # nothing stands for the blade
+FAT_BLIND = covering_spheres(1.6, parts=("block", "neck", "drum"))
+TALL = URDF.replace("0 0 0.052", "0 0 0.1")  # the drum turns 70 mm above the block
 LOST = URDF.replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="package://lost/block.stl"/>')
 # a bob that slides in a post of 10 m, out of which it looks in 3 cm of its way
 POST = f"""<robot name="post">
@@ -28,6 +30,7 @@ POST = f"""<robot name="post">
 <joint name="slide" type="prismatic"><parent link="carriage"/><child link="bob"/><axis xyz="0 0 1"/>
 <limit lower="-9" upper="0.05" velocity="1" effort="1"/></joint></robot>"""
 POST_SPHERES = SphereSet(links=("post", "bob"), centers=np.array([[0, 0, -0.05], [0, 0, 0]]), radii=np.full(2, 0.04))
+DRIVE = ("--mode", "closed-loop", "--set", "control.solver=daqp", "--set", "control.max_time=4")
 SRDF = '<robot name="folding"><disable_collisions link1="block" link2="drum" reason="Never"/></robot>'
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -86,6 +89,52 @@ def test_a_pair_that_an_srdf_names_may_touch(tmp_path: Path, monkeypatch: pytest
     assert judged(desk, "--srdf", str(written(tmp_path, SRDF, "folding.srdf"))) == {}
 
 
+@pytest.mark.parametrize("spheres", [COVERING, BLIND], ids=["covering", "blind"])
+def test_a_lowered_margin_hides_no_contact_of_the_driven_arm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], spheres: SphereSet
+) -> None:
+    desk = desk_of(tmp_path, monkeypatch, spheres, OPEN, FOLDED)
+    found = judged(desk, *DRIVE)
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("self-collision margin: 20 mm")]
+    assert len(said) == 1 and "block and drum" in said[0]
+    if spheres is COVERING:  # its row stops the arm before the block, and the goal in it is not reached
+        assert found["outcome"] == "passed" and desk.metrics()["goal_reached"] == 0
+        assert "(their surfaces then" in said[0]
+    else:  # no row knows of the blade
+        assert (found["outcome"], found["label"]) == ("failed", "contact") and desk.metrics()["goal_reached"] == 1
+        assert "(their spheres do not tell when their surfaces meet)" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("urdf", "spheres", "goal", "least"),
+    [(URDF, BLIND, "0.5,2.08", 11.0), (TALL, FAT_BLIND, "0.5,2.4", 20.0)],
+    ids=["never-far", "far"],
+)
+def test_links_apart_in_the_recording_that_a_lowered_margin_lets_come_together_are_not_safe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, urdf: str, spheres: SphereSet, goal: str, least: float
+) -> None:
+    there = np.array([float(part) for part in goal.split(",")])
+    apart = desk_of(tmp_path, monkeypatch, spheres, OPEN, -OPEN, OPEN, urdf=urdf)
+    found = judged(apart, *DRIVE, f"--goal-joints={goal}")
+    assert apart.metrics()["goal_reached"] == 1 and apart.metrics()["num_relaxed"] == 0
+    assert (found["outcome"], found["label"], found["who"]) == ("failed", "margin broken", "block and drum")
+    assert 0 < found["value"] < found["threshold"] == pytest.approx(1e-3 * least, abs=1e-6)
+    said = f"came together to {1e3 * found['value']:.1f} mm, in the recording {least} mm or more: their spheres keep"
+    assert said in found["sentence"] and found["time_s"] > 0.5
+    assert judged(apart)["outcome"] == judged(apart, *DRIVE)["outcome"] == "passed"
+    as_near = desk_of(tmp_path / "as_near", monkeypatch, spheres, OPEN, there, urdf=urdf)
+    assert judged(as_near, *DRIVE)["outcome"] == judged(as_near)["outcome"] == "passed"
+
+
+def test_without_surfaces_spheres_that_a_lowered_margin_lets_come_together_are_not_safe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = desk_of(tmp_path, monkeypatch, COVERING, OPEN, -OPEN, OPEN, urdf=LOST)
+    found = judged(desk, *DRIVE, "--goal-joints=0.5,1.9")
+    assert (found["outcome"], found["label"], found["who"]) == ("failed", "margin broken", "block and drum")
+    assert desk.metrics()["num_relaxed"] == 0 and found["value"] < found["threshold"] - 0.001
+
+
 def test_links_that_hardly_any_posture_parts_are_judged_where_the_recording_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -103,3 +152,5 @@ def test_without_geometry_spheres_that_overlap_are_a_contact(tmp_path: Path, mon
     desk = desk_of(tmp_path, monkeypatch, COVERING, OPEN, FOLDED)
     written(tmp_path, LOST)
     assert judged(desk)["label"] == "contact"
+    assert judged(desk, "--mode", "closed-loop", "--set", "control.max_time=0.2")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["about"]["self_margins"].count("mm") >= 2

@@ -7,7 +7,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import never_apart, self_collision_pairs
+from splatctrl_cli.robot.self_collision import self_collision_pairs
 from splatctrl_cli.robot.srdf import read_srdf
 from tests.robot.shapes import BALL, arm_of, written
 
@@ -123,13 +123,3 @@ def test_the_panda_srdf_names_only_links_of_the_panda(real_data: Path) -> None:
     by_srdf, by_sample = self_collision_pairs(panda, known), self_collision_pairs(panda)
     assert len(by_srdf.pairs) < len(by_sample.pairs)
     assert reasons(by_srdf)["panda_link2", "panda_link6"] == "SRDF: Never"
-
-
-def test_spheres_that_no_posture_parts_by_the_margin_are_named(tmp_path: Path) -> None:
-    model = RobotModel.from_urdf(written(tmp_path, chain(0.05, 0.05, 0.05, 0.05)))
-    assert never_apart(model, 0.2) == never_apart(model, 0.2, num_postures=200)
-    found = {pair.links: pair.largest_gap for pair in never_apart(model, 0.31)}
-    assert set(found) == {("l0", "l2"), ("l1", "l3")}  # 0.2 m links: at most 0.4 m less two radii
-    assert all(0.29 < gap <= 0.3 for gap in found.values())
-    assert never_apart(model, 0.2) == ()
-    assert never_apart(model.with_self_pairs(np.zeros((0, 2), dtype=np.int64)), 9.0) == ()

@@ -1,6 +1,6 @@
 """What a replay reads: the robot's model and what its spheres leave uncovered, and the states of a log."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -29,7 +29,8 @@ from splatctrl_cli.robot.coverage import LinkCoverage, coverage_of_solids
 from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import never_apart, without_disabled
+from splatctrl_cli.robot.self_collision import without_disabled
+from splatctrl_cli.robot.self_margins import KeptMargin, kept_margins, with_kept_margins
 from splatctrl_cli.robot.srdf import DisabledPair, read_srdf
 from splatctrl_cli.states.state_source import StateSource, open_states
 
@@ -73,18 +74,19 @@ def open_log(request: ReplayRequest, progress: Progress = SILENT) -> tuple[Robot
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredRobot:
-    """A robot whose spheres were measured against the URDF's collision geometry, and the surfaces of its links; None
-    where they cannot be read.
+    """A robot whose spheres were measured against the URDF's collision geometry, the surfaces of its links (None
+    where they cannot be read), and the pairs of links whose spheres keep less than `control.self_margin`.
     """
 
     model: RobotModel
     surfaces: SelfSurfaces | None
+    kept: tuple[KeptMargin, ...] = ()
 
 
 def measured_robot(
     request: ReplayRequest, model: RobotModel, config: ControlConfig, recorded: Float64 | None = None
 ) -> MeasuredRobot:
-    """The robot without the pairs that its SRDF names, and the surfaces of its links.
+    """The robot without the pairs that its SRDF names; for a controller, each pair with a margin that it can keep.
 
     recorded: `recorded_postures`. Raises InputError where `config.coverage` is "margin" and no distance bounds what
     is uncovered.
@@ -103,7 +105,8 @@ def measured_robot(
         surfaces = SelfSurfaces(model, solids, disabled, recorded)
     if config.coverage == "margin":
         _check_bounded(model)
-    return MeasuredRobot(model=model, surfaces=surfaces)
+    kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
+    return MeasuredRobot(model=with_kept_margins(model, config.self_margin, kept), surfaces=surfaces, kept=kept)
 
 
 def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
@@ -111,16 +114,15 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
     model = robot.model
     if request.mode == "audit":
         return list(model.doubts)
-    found = never_apart(model, config.self_margin)
     is_fr3 = all(name.startswith("fr3_joint") for name in model.joint_names)
     return [
         *model.doubts,
         *([FR3_LIMITS] if is_fr3 and config.velocity_limits == "urdf" else []),
         *(
-            f"{' and '.join(pair.links)}: their spheres are no farther than {1e3 * pair.largest_gap:.1f} mm apart in "
-            f"any posture sampled: control.self_margin = {1e3 * config.self_margin:g} mm cannot be kept; lower it, "
-            "or leave the pair out (--srdf)"
-            for pair in found
+            f"{' and '.join(pair.links)}: their spheres overlap in every posture sampled, and nothing tells whether "
+            "they touch: fit finer spheres (splatctrl robot spheres), or leave the pair out (--srdf)"
+            for pair in robot.kept
+            if pair.margin is None
         ),
     ]
 
@@ -128,12 +130,30 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
 def words_of(robot: MeasuredRobot, config: ControlConfig) -> dict[str, str]:
     """What the robot's spheres stand for, by subject, a sentence each."""
     words = {"coverage": coverage_words(robot.model, config)}
+    kept = [pair for pair in robot.kept if pair.margin is not None]
+    if kept:
+        words["self_margins"] = _self_margin_words(robot, kept, config)
     if robot.surfaces is not None and robot.surfaces.fused:
         pairs = ", ".join(" and ".join(pair) for pair in robot.surfaces.fused)
         words["fused"] = (
             f"not judged whether they touch, for they overlap in every posture recorded or sampled: {pairs}"
         )
     return words
+
+
+def _self_margin_words(robot: MeasuredRobot, kept: Sequence[KeptMargin], config: ControlConfig) -> str:
+    """Which pairs of links keep less than the margin asked for."""
+    each = ", ".join(f"{' and '.join(pair.links)} {1e3 * (pair.margin or 0.0):.1f} mm{_told(pair)}" for pair in kept)
+    judged = "" if robot.surfaces is None else "; whether links touch is judged by their surfaces"
+    return f"self-collision margin: {1e3 * config.self_margin:g} mm, or what spheres can keep: {each}{judged}"
+
+
+def _told(pair: KeptMargin) -> str:
+    if pair.surface_gap is None:
+        return ""
+    if pair.surface_gap <= 0:
+        return " (their spheres do not tell when their surfaces meet)"
+    return f" (their surfaces then {1e3 * pair.surface_gap:.1f} mm)"
 
 
 def coverage_words(model: RobotModel, config: ControlConfig) -> str:

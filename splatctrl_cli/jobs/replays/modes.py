@@ -163,6 +163,7 @@ def _record(request: ReplayRequest, inputs: ReplayInputs, config: Config) -> Rep
         declared=inputs.declared,
         first_state_ns=int(inputs.states.stamp_ns[0]),
         surfaces=inputs.surfaces,
+        kept=inputs.kept,
     )
 
 
@@ -210,6 +211,7 @@ def _replay(
         unwatched=tuple(record.hindsight.found),
         strain=record.strain,
         statics=record.statics,
+        closest=record.closest,
         events=record.events.events(),
     )
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, MOUNTED_CHANGE, STATIC_CHANGE
+from splatctrl_cli.config.fixed import LIMIT_EXCEEDED, MOUNTED_CHANGE, SLIGHTLY_UNDER, STATIC_CHANGE
 from splatctrl_cli.control.events import Event, EventKind
 from splatctrl_cli.evaluate.verdict import Criterion, Reason, failed, held, lacking
 from splatctrl_cli.jobs.replays.control_criteria import commanded, controller, goal, scene_hits
@@ -23,6 +23,8 @@ from splatctrl_cli.jobs.replays.criteria_input import (
     mm,
     time_of_least,
 )
+from splatctrl_cli.jobs.replays.inputs import recorded_postures
+from splatctrl_cli.robot.self_margins import least_gap
 
 
 def clearance(judged: Judged) -> Iterator[Reason]:
@@ -127,13 +129,16 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links of the arm overlap, by their collision surfaces; by their spheres where these cannot be read."""
+    """No two links of the arm overlap, and none that were given a lower margin are driven nearer to each other than
+    `control.self_margin` (or half of the largest gap that they ever have) and than in the recording. By their
+    collision surfaces; by their spheres where these cannot be read.
+    """
     least = least_of(judged.replay.audit.self_clearance)
     events = events_of(judged.replay, EventKind.SELF_COLLISION)
     if least is None or not np.isfinite(least):
         return
     if not events:
-        yield held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+        yield _brought_together(judged) or held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
         return
     worst = min(events, key=lambda event: event.worst)
     reason = failed(
@@ -146,6 +151,35 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
         label=CONTACT,
     )
     yield _at_worst(worst, reason)
+
+
+def _brought_together(judged: Judged) -> Reason | None:
+    """What our controller brought nearer than a lowered margin is to keep it, and than the recording had it: the rows
+    did not hold there what was asked for.
+    """
+    inputs, replay = judged.inputs, judged.replay
+    if replay.outside is not None:
+        return None
+    recorded = recorded_postures(inputs.states)
+    for pair, (gap, stamp) in sorted(replay.closest.items(), key=lambda item: item[1][0] - item[0].apart):
+        if gap >= pair.apart - SLIGHTLY_UNDER:
+            continue
+        before = least_gap(inputs.model, inputs.surfaces, pair, recorded)
+        if gap < before - SLIGHTLY_UNDER:
+            bound = f"at least {mm(before)}" if before < pair.apart else f"{mm(pair.apart)} or more"
+            return failed(
+                sentence=f"{' and '.join(pair.links)} came together to {mm(gap)}, in the recording {bound}: their "
+                f"spheres keep {mm(pair.margin or 0.0)} of {mm(replay.config.control.self_margin)} asked for",
+                value=gap,
+                threshold=min(pair.apart, before),
+                unit="m",
+                remedy="fit finer spheres there (splatctrl robot spheres), or lower control.self_margin",
+                count=judged.num_states,
+                label=MARGIN,
+                time_s=float(stamp - int(replay.audit.stamp_ns[0])) * 1e-9,
+                who=" and ".join(pair.links),
+            )
+    return None
 
 
 def static_clearance(judged: Judged) -> Iterator[Reason]:
@@ -316,13 +350,13 @@ OF_MOTION: tuple[Criterion[Judged], ...] = (
     ),
     Criterion(name="clearance of people", find=clearance_of_people, broken=BROKEN),
     Criterion(name="true clearance", find=true_clearance, broken=BROKEN),
-    Criterion(name="self-clearance", find=self_clearance, broken=f"{BROKEN} (contact)"),
+    Criterion(name="self-clearance", find=self_clearance, broken=f"{BROKEN} (contact, margin broken)"),
     Criterion(name="static clearance", find=static_clearance, broken=BROKEN),
     Criterion(name="position limits", find=position_limits, broken=BROKEN),
     Criterion(name="velocity limits", find=velocity_limits, broken=BROKEN),
     Criterion(name="acceleration limits", find=acceleration_limits, broken=BROKEN),
     Criterion(name="controller", find=controller, broken=BROKEN),
-    Criterion(name="scene hits", find=scene_hits, broken=f"{BROKEN} (contact)"),
+    Criterion(name="scene hits", find=scene_hits, broken=f"{BROKEN} (contact, margin broken)"),
     Criterion(name="goal", find=goal, broken=BROKEN),
     Criterion(name="surface clearance", find=surface_clearance, broken=UNKNOWN),
     Criterion(name="clearance between states", find=clearance_between_states, broken=UNKNOWN),

@@ -17,6 +17,7 @@ from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_margins import KeptMargin
 from splatctrl_cli.simulate.truth import Truth
 
 MODES = ("audit", "open-loop", "closed-loop")
@@ -90,7 +91,7 @@ class ReplayRequest:
 @dataclass(frozen=True, kw_only=True)
 class ReplayInputs:
     """Everything a replay reads; states in the model's joint order. mismatches: of what does not belong together.
-    surfaces: of the robot's links, None where they cannot be read.
+    surfaces: of the robot's links, None where they cannot be read; kept: what pairs of them keep of the margin.
     """
 
     source: RecordSource
@@ -102,6 +103,7 @@ class ReplayInputs:
     mismatches: tuple[Mismatch, ...] = ()
     declared: Declarations = made_by(default_factory=Declarations)
     surfaces: SelfSurfaces | None = None
+    kept: tuple[KeptMargin, ...] = ()
 
     def motion(self) -> LoggedMotion:
         """Every logged state, whether a scene was known or not."""

@@ -18,6 +18,7 @@ from splatctrl_cli.planner.comparison import Motion, MotionFigures
 from splatctrl_cli.planner.planned import PlannedPath
 from splatctrl_cli.records import FloatRows
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_margins import KeptMargin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +49,7 @@ class Replay:
     """One finished replay of T states: their audit, the trace of its mode, and the truth where it is known.
 
     num_before_scene: requested states earlier than the first scene, left out, over lead_in_s [s]; start_time_s: of
-    the first state in the log [s]; between, near, unwatched, strain and statics: as `ReplayRecord` has them;
+    the first state in the log [s]; between, near, unwatched, strain, statics and closest: as `ReplayRecord` has them;
     obstacles (T,): what is nearest to the nearest sphere, in words; map_age_s (T,): of the scene in use; kept_steps:
     of a controller; divergence: of a closed loop from the log, by columns joints [rad], position [m], rotation [rad];
     map_error: where the request names evidence of it; separations: with a standstill the distances from people, by
@@ -71,6 +72,7 @@ class Replay:
     unwatched: tuple[Unwatched, ...]
     strain: Figures
     statics: Mapping[str, tuple[float, float]]
+    closest: Mapping[KeptMargin, tuple[float, int]]
     open_loop: StoredOpenLoop | None = None
     closed_loop: ReplayTrace | None = None
     divergence: Figures | None = None

@@ -23,6 +23,7 @@ from splatctrl_cli.records import Float64, Stamps
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_margins import KeptMargin, sphere_gaps
 
 
 class ReplayRecord:
@@ -35,7 +36,8 @@ class ReplayRecord:
     near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at.
     hindsight: what later depth says of times without any. strain:
     velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in
-    the first scene and the least in any.
+    the first scene and the least in any. closest: of pairs of links that keep less than the margin asked for, how
+    near they came [m] and the stamp; nothing of those that stayed apart.
     """
 
     def __init__(
@@ -49,10 +51,11 @@ class ReplayRecord:
         declared: Declarations | None = None,
         first_state_ns: int = 0,
         surfaces: SelfSurfaces | None = None,
+        kept: Sequence[KeptMargin] = (),
     ) -> None:
         """is_continuous: False where the arm is put elsewhere on the way, so that nothing holds between states.
         declared: contact that is meant, at times that count from `first_state_ns`. surfaces: of the links, which tell
-        where the arm touches itself; None for its spheres alone.
+        where the arm touches itself; None for its spheres alone. kept: margins of pairs of links.
         """
         self._declared, self._first_state_ns = declared or Declarations(), first_state_ns
         self.audit, self.obstacles, self.ages = StoredAudit(), StoredObjects[str](), Figures()
@@ -63,7 +66,8 @@ class ReplayRecord:
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self._spheres = sphere_names(model.sphere_set)
         self._number = {name: number for number, name in enumerate(self._spheres)}
-        self._surfaces, self._enough = surfaces, config.control.self_margin
+        self._surfaces, self._enough, self._kept = surfaces, config.control.self_margin, kept
+        self.closest: dict[KeptMargin, tuple[float, int]] = {}
         spheres = [f"{self._spheres[a]} and {self._spheres[b]}" for a, b in model.self_pairs()]
         self._pairs = spheres if surfaces is None else surfaces.names
         self._reach, self._is_continuous = Reach.of(model), is_continuous
@@ -147,12 +151,20 @@ class ReplayRecord:
     def _look_at_self(self, part: AuditTrace) -> AuditTrace:
         """The audit with how near the links' own surfaces come to each other, where they are known: spheres that
         stick out may overlap where nothing touches, and those that leave something uncovered be apart where it does.
+        And how near the pairs came that keep less than the margin asked for.
         """
-        if self._surfaces is None:
-            return part
-        gaps = self._surfaces.gaps(part.position, self._model.sphere_centers_batch(part.position), self._enough)
-        nearest = gaps.argmin(axis=1) if gaps.size else np.full(len(gaps), -1)
-        return replace(part, self_clearance=gaps.min(axis=1, initial=np.inf), self_pair=nearest)
+        surfaces, gaps = self._surfaces, np.empty((len(part.position), 0))
+        if surfaces is not None:
+            gaps = surfaces.gaps(part.position, self._model.sphere_centers_batch(part.position), self._enough)
+            nearest = gaps.argmin(axis=1) if gaps.size else np.full(len(gaps), -1)
+            part = replace(part, self_clearance=gaps.min(axis=1, initial=np.inf), self_pair=nearest)
+        for pair in self._kept:
+            number = None if surfaces is None else surfaces.number_of(pair.links)
+            own = sphere_gaps(self._model, pair.links, part.position) if number is None else gaps[:, number]
+            at = int(own.argmin())
+            if own[at] < min(pair.apart, self.closest.get(pair, (np.inf, 0))[0]):
+                self.closest[pair] = float(own[at]), int(part.stamp_ns[at])
+        return part
 
     def _bound(self, part: AuditTrace, velocities: Float64) -> None:
         """Bounds between the states of a block, and since the last state of the one before, in this block's scene."""
