@@ -41,8 +41,8 @@ from splatctrl_cli.scene.time_steps import TimeStep
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.recording import NOISES, START_NS, Recording, RecordingOptions
-from splatctrl_cli.simulate.tabletop import WAYPOINTS
+from splatctrl_cli.simulate.recording import NOISES, START_NS, Recording, RecordingOptions, Scene
+from splatctrl_cli.simulate.tabletop import WAYPOINTS, furniture
 from splatctrl_cli.simulate.truth import distance_to
 
 EVIDENCE = "cam3"
@@ -79,32 +79,29 @@ class Trial:
     seconds: float
 
 
-class RandomRecording(Recording):
+def random_scene(options: RecordingOptions, robot: RobotModel) -> Scene:
     """Random things on the table instead of those of `tabletop`, and an arm that passes through its waypoints or near
     them, in any order; on odd seeds one more thing for a third of the time. What the arm would meet is not there:
     inside of things the field promises nothing, and the map is made of what lies outside of the robot.
     """
+    seed, span = options.seed, round(options.duration_s * 1e9)
+    rng = np.random.default_rng([seed, 7])
+    order = rng.permutation(len(WAYPOINTS)).tolist()
+    waypoints = np.array([WAYPOINTS[k] for k in (*order, order[0])])
+    waypoints = waypoints + rng.uniform(-0.15, 0.15, waypoints.shape)
+    motion = Motion(times=np.linspace(0.06, 0.94, len(waypoints)) * options.duration_s, waypoints=waypoints)
+    centers = robot.sphere_centers_batch(np.array([motion.at(t)[0] for t in np.linspace(0, options.duration_s, 200)]))
+    radii = np.broadcast_to(robot.sphere_set.radii, centers.shape[:2]).ravel()
 
-    def _scene(self) -> tuple[list[Primitive], list[Primitive], Motion]:
-        seed, span = self.options.seed, self.end_ns - self.start_ns
-        rng = np.random.default_rng([seed, 7])
-        order = rng.permutation(len(WAYPOINTS)).tolist()
-        waypoints = np.array([WAYPOINTS[k] for k in (*order, order[0])])
-        waypoints = waypoints + rng.uniform(-0.15, 0.15, waypoints.shape)
-        motion = Motion(times=np.linspace(0.06, 0.94, len(waypoints)) * self.options.duration_s, waypoints=waypoints)
-        centers = self.robot.sphere_centers_batch(
-            np.array([motion.at(t)[0] for t in np.linspace(0, self.options.duration_s, 200)])
-        )
-        radii = np.broadcast_to(self.robot.sphere_set.radii, centers.shape[:2]).ravel()
+    def is_clear(thing: Primitive) -> bool:
+        return float((distance_to([thing], centers.reshape(-1, 3), START_NS) - radii).min()) > CLEAR
 
-        def is_clear(thing: Primitive) -> bool:
-            return float((distance_to([thing], centers.reshape(-1, 3), START_NS) - radii).min()) > CLEAR
-
-        first = START_NS + int(span * rng.uniform(0.2, 0.5))
-        there = (first, first + span // 3) if seed % 2 else (START_NS - 2, START_NS - 1)
-        guest = next(thing for thing in random_things(seed + GUESTS) if is_clear(thing))
-        visiting = replace(guest, name="visitor", from_ns=there[0], to_ns=there[1])
-        return [thing for thing in random_things(seed) if is_clear(thing)], [visiting], motion
+    first = START_NS + int(span * rng.uniform(0.2, 0.5))
+    there = (first, first + span // 3) if seed % 2 else (START_NS - 2, START_NS - 1)
+    guest = next(thing for thing in random_things(seed + GUESTS) if is_clear(thing))
+    visiting = replace(guest, name="visitor", from_ns=there[0], to_ns=there[1])
+    things = [thing for thing in random_things(seed) if is_clear(thing)]
+    return Scene(primitives=(*furniture(), *things, visiting), temporary=(visiting,), motion=motion)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -159,13 +156,14 @@ def trial_of(seed: int) -> Trial | None:
     return judged(seed, measured, exact, over, config.verdict.confidence, time.process_time() - start)
 
 
-def recorded(seed: int, folder: Path) -> RandomRecording:
+def recorded(seed: int, folder: Path) -> Recording:
     """The recording of a seed, with its log and robot in a folder."""
     urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
     urdf.write_text(arm_urdf(), encoding="utf-8")
     spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
     options = RecordingOptions(duration_s=DURATION_S, fps=FPS, width=SIZE[0], height=SIZE[1], seed=seed, color_rays=0)
-    recording = RandomRecording(options, RobotModel.from_urdf(urdf, spheres))
+    robot = RobotModel.from_urdf(urdf, spheres)
+    recording = Recording(options, robot, random_scene(options, robot))
     with mcap_log(folder / "log.mcap") as log:
         log.add_transforms(recording.start_ns, recording.static_transforms(), is_static=True)
         states = list(recording.joint_states())
@@ -178,19 +176,20 @@ def recorded(seed: int, folder: Path) -> RandomRecording:
     return recording
 
 
-def frame_sets(recording: RandomRecording, cameras: tuple[str, ...]) -> Iterator[TimeStep]:
+def frame_sets(recording: Recording, cameras: tuple[str, ...]) -> Iterator[TimeStep]:
     """The frames of some cameras."""
     for index in range(int(recording.options.duration_s * recording.options.fps)):
         q = recording._motion.at(recording._offset_ns(index) / 1e9)[0]
         yield TimeStep(frames=tuple(recording.frames_at(index, q, cameras)), position=None)
 
 
-def evidence_of(recording: RandomRecording) -> tuple[list[TimeStep], list[TimeStep]]:
+def evidence_of(recording: Recording) -> tuple[list[TimeStep], list[TimeStep]]:
     """The held-out camera's frames, as measured and with exact depth."""
     noise, seed = NOISES[recording.options.noise], recording.options.seed
     assert noise is not None
     options = RecordingOptions(**{**vars(recording.options), "noise": "none"})
-    exact = list(frame_sets(RandomRecording(options, recording.robot), (EVIDENCE,)))
+    again = Recording(options, recording.robot, random_scene(options, recording.robot))
+    exact = list(frame_sets(again, (EVIDENCE,)))
     measured = []
     for index, step in enumerate(exact):
         (frame,) = step.frames
@@ -199,7 +198,7 @@ def evidence_of(recording: RandomRecording) -> tuple[list[TimeStep], list[TimeSt
     return measured, exact
 
 
-def audited(inputs: ReplayInputs, recording: RandomRecording, config: Config) -> tuple[ReplayRecord, Float64]:
+def audited(inputs: ReplayInputs, recording: Recording, config: Config) -> tuple[ReplayRecord, Float64]:
     """The audit of the logged states, and by how much (T,) [m] the map's clearance exceeds the truth at those that
     are truly near, -inf at the others.
     """

@@ -103,8 +103,11 @@ def function_of(run: str) -> Callable[..., int]:
 def _simulate(add: Options, parser: Parser) -> None:
     files = "folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml"
     add_output(add, files, default="simulated")
+    add("--urdf FILE", "another arm with collision geometry, its base on the table; spheres are fitted to it", Path)
+    add_packages(add)
     add_seed(add, "the noise and of --human-arm")
     add("--duration S", "length in seconds (default: 7, with --human-arm 24)", real(0.5, 600, "s"))
+    add("--free", "free space: floor and walls, no table and nothing on it")
     add("--person", "a walking person with masks, instead of the standing cylinder")
     shared = "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal"
     add("--human-arm", shared, ("near-pickup", "near-goal"))
@@ -235,7 +238,7 @@ def _capture_unpack(add: Options, parser: Parser) -> None:
 COMMANDS = {
     "simulate": Command(
         summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
-        examples=("simulate -o out/log", "simulate --human-arm near-goal --seed 3 -o out/shared"),
+        examples=("simulate -o out/log", "simulate --urdf fr3.urdf --packages franka_description -o out/fr3"),
         run="demo:run_simulate",
         options=_simulate,
     ),

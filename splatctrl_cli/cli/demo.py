@@ -70,13 +70,13 @@ def _show(console: Console, result: StepResult) -> int:
 
 def run_simulate(args: argparse.Namespace) -> int:
     """Record a log, and return the exit code."""
-    console, given = Console(args), {"duration_s": args.duration, "with_person": args.person}
+    console = Console(args)
+    given = {"duration_s": args.duration, "with_person": args.person, "is_free": args.free}
     if args.duration is None and args.human_arm is not None:
         given["duration_s"] = DURATION_S
     options = request_of(RecordingOptions, args, **{name: v for name, v in given.items() if v is not None})
-    result = simulate(
-        SimulateRequest(out=args.out or Path("simulated"), options=options, dtu=args.dtu, force=args.force), console
-    )
+    request = request_of(SimulateRequest, args, out=args.out or Path("simulated"), options=options)
+    result = simulate(request, console)
     return show_simulated(console, result)
 
 

@@ -162,6 +162,16 @@ GOAL_LONGEST_STEP = 0.3  # [rad] of a step, in any joint
 GOAL_SHARE = 0.1  # of the goal's tolerances that a posture keeps to
 GOAL_DISTINCT = 0.05  # [rad] that two postures differ by at least, in some joint
 
+# Simulation: how another arm is led through the scene
+SIMULATED_GUESSES = 12  # random postures that the search for a waypoint begins with
+SIMULATED_TURNS = 8  # of the tip about its own axis that are tried
+SIMULATED_POSTURES = 2  # kept of each turn
+SIMULATED_NEARER = 0.85  # of the distance from the base, where an arm does not reach a waypoint
+SIMULATED_NEARINGS = 10  # times: to a fifth of it
+SIMULATED_SAMPLES = 25  # of a leg whose clearance is looked at
+SIMULATED_CLEARANCE = 0.05  # [m] that a leg should keep: twice the margin and what a map errs by
+SIMULATED_SHORTFALL = 20.0  # [rad] longer, a leg without any clearance
+
 # Robot: its spheres, and what they leave uncovered
 DEFICIT_GAP = 1e-5  # [m] between the proven and the found deficit
 COVERED_EDGE = 2e-3  # [m] longest edge of a triangle that is counted as covered or not by its middle

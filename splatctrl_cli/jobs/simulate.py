@@ -1,29 +1,36 @@
 """A simulation from its request to its result: a recorded log of an arm at a table, with its truth."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.datasets.dtu import DtuView, write_dtu
 from splatctrl_cli.datasets.idr import write_idr
-from splatctrl_cli.files.output import Stopwatch, output_path, write_json, write_run
+from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.jobs.simulated_arm import adapted_motion, copied_arm
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
 from splatctrl_cli.simulate.primitives import luminance_std
-from splatctrl_cli.simulate.recording import Recording, RecordingOptions
+from splatctrl_cli.simulate.recording import Recording, RecordingOptions, Scene
 from splatctrl_cli.simulate.tabletop import object_mask, turntable_views
 from splatctrl_cli.simulate.truth import Truth, truth_document
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRequest:
-    """Write log.mcap, truth.json and the robot's files into the folder `out`; dtu: and a scan, in both layouts."""
+    """Write log.mcap, truth.json and the robot's files into the folder `out`; dtu: and a scan, in both layouts.
+
+    urdf: of another arm than the simulated one, its base on the table at the world's origin; packages: where its
+    meshes are looked for.
+    """
 
     out: Path
+    urdf: Path | None = None
+    packages: tuple[Path, ...] = ()
     options: RecordingOptions = field(default_factory=RecordingOptions)
     dtu: bool = False
     force: bool = False
@@ -49,7 +56,7 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
     stopwatch = Stopwatch()
     with output_path(request.out, force=request.force, is_folder=True) as folder:
         with stopwatch.stage("log"):
-            truth, num_frames = _record(folder, request.options, progress)
+            truth, num_frames = _record(folder, request, progress)
         write_json(folder / "truth.json", truth_document(truth))
         if request.dtu:
             with stopwatch.stage("dtu"):
@@ -58,7 +65,7 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
             folder,
             command="simulate",
             config=vars(request.options),
-            inputs={},
+            inputs={} if request.urdf is None else {request.urdf.name: sha256(request.urdf)},
             metrics=_metrics(truth, num_frames),
             stopwatch=stopwatch,
             seed=request.options.seed,
@@ -66,12 +73,9 @@ def simulate(request: SimulateRequest, progress: Progress = SILENT) -> SimulateR
         return SimulateResult(out=request.out, truth=truth, num_frames=num_frames, sizes=_sizes(folder))
 
 
-def _record(folder: Path, options: RecordingOptions, progress: Progress) -> tuple[Truth, dict[str, int]]:
+def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple[Truth, dict[str, int]]:
     """Write robot files and log; the truth and the number of frames by camera."""
-    urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
-    urdf.write_text(arm_urdf(), encoding="utf-8")
-    spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
-    recording = Recording(options, RobotModel.from_urdf(urdf, spheres))
+    recording = _recording(folder, request, progress)
     contrast: dict[str, float] = {}
     num_frames = {camera.name: 0 for camera in recording.cameras}
     with mcap_log(folder / "log.mcap") as log:
@@ -87,6 +91,20 @@ def _record(folder: Path, options: RecordingOptions, progress: Progress) -> tupl
             if record.camera == recording.cameras[-1].name and num_frames[record.camera] % 10 == 0:
                 progress.log(f"simulate: {(record.stamp_ns - recording.start_ns) / 1e9:.1f} s recorded")
     return _truth(folder, recording, contrast), num_frames
+
+
+def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Recording:
+    """The scene and the arm in it, whose files are written."""
+    options = request.options
+    if request.urdf is None:
+        urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
+        urdf.write_text(arm_urdf(), encoding="utf-8")
+        spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
+        return Recording(options, RobotModel.from_urdf(urdf, spheres))
+    progress.log(f"simulate: fitting spheres to {request.urdf.name}")
+    (robot, surfaces), scene = copied_arm(request.urdf, request.packages, folder), Scene.of(options)
+    progress.log("simulate: looking for a way through the scene")
+    return Recording(options, robot, replace(scene, motion=adapted_motion(scene, robot, surfaces)))
 
 
 def _truth(folder: Path, recording: Recording, contrast: Mapping[str, float]) -> Truth:

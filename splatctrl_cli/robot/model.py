@@ -128,7 +128,7 @@ class RobotModel:
             self.left_out,
             are_links_renamed=self.are_links_renamed,
             packages=self._packages,
-            held=held,
+            held={name: held[name] for name in self.joint_names if name in held},
         )
 
     def with_coverage(self, coverage: "CoverageReport | None", unknown: str = "") -> "RobotModel":

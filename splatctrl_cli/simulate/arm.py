@@ -117,6 +117,14 @@ def arm_urdf() -> str:
     return "\n".join(lines) + "\n"
 
 
+def hand_pose(q: Float64) -> Float64:
+    """T_base_hand (4, 4) at joint positions q (7,) [rad]."""
+    T = np.eye(4)
+    for (_, xyz, roll, *_), angle in zip(JOINTS, q, strict=True):
+        T = T @ _turned(0, roll, xyz) @ _turned(2, angle)
+    return T @ _turned(2, HAND_YAW, (0.0, 0.0, FLANGE))
+
+
 def arm_spheres_yaml() -> str:
     """The arm's covering spheres as YAML text, in cuRobo's layout (`collision_spheres` by link)."""
     lines = ["collision_spheres:"]
@@ -190,6 +198,15 @@ def _primitives(shapes: tuple[Capsule | Block, ...]) -> Iterator[tuple[str, str]
             if (point, shape.radius) not in balls:
                 balls.add((point, shape.radius))
                 yield f'<sphere radius="{shape.radius}"/>', f'<origin xyz="{_words(point)}" rpy="0 0 0"/>'
+
+
+def _turned(axis: int, angle: float, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float64:
+    """The pose (4, 4) at xyz [m], turned about x (0) or z (2)."""
+    T, c, s = np.eye(4), np.cos(angle), np.sin(angle)
+    i, j = ((1, 2), (2, 0), (0, 1))[axis]
+    T[i, i], T[i, j], T[j, i], T[j, j] = c, -s, s, c
+    T[:3, 3] = xyz
+    return T
 
 
 def _words(values: object) -> str:

@@ -30,6 +30,7 @@ class RecordingOptions:
 
     with_person: a walking person with masks, instead of the standing cylinder. human_arm: one of
     `shared_workspace.PLACES`, instead of both: the table shared with a person's arm, whose visit the seed draws.
+    is_free: floor and walls alone, without the table and what is on it.
     color_rays: 0 to 4 rays for a pixel's colour beside the one for its depth.
     """
 
@@ -41,6 +42,7 @@ class RecordingOptions:
     seed: int = 0
     with_person: bool = False
     human_arm: str | None = None
+    is_free: bool = False
     color_rays: int = 4
 
     def __post_init__(self) -> None:
@@ -56,34 +58,58 @@ class RecordingOptions:
         if self.human_arm is not None and (self.with_person or self.human_arm not in shared_workspace.PLACES):
             places = ", ".join(shared_workspace.PLACES)
             raise UsageError(f"--human-arm: expected one of {places}, without --person, got {self.human_arm}")
+        if self.is_free and (self.with_person or self.human_arm is not None):
+            raise UsageError("--free: expected neither --person nor --human-arm, who stand about the table")
         if self.seed < 0:
             raise UsageError(f"--seed: expected 0 or more, got {self.seed}")
 
 
-class Recording:
-    """The tabletop scene, recorded once; the same options give the same records."""
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What stands there (`primitives`, the last of them, `temporary`, for a while only), and the motion of the
+    simulated arm among it.
+    """
 
-    def __init__(self, options: RecordingOptions, robot: RobotModel) -> None:
-        self.options = options
-        self.robot = robot
-        span = round(options.duration_s * 1e9)
-        self.start_ns, self.end_ns = START_NS, START_NS + span
-        self.cameras = tabletop.cameras(options.width, options.height)
-        things, self._temporary, self._motion = self._scene()
-        self.primitives: tuple[Primitive, ...] = (*tabletop.furniture(), *things, *self._temporary)
+    primitives: tuple[Primitive, ...]
+    temporary: tuple[Primitive, ...]
+    motion: Motion
 
-    def _scene(self) -> tuple[list[Primitive], list[Primitive], Motion]:
-        """What stands on the table, what is there for a while only, and the arm's motion."""
-        options, span = self.options, self.end_ns - self.start_ns
+    @classmethod
+    def of(cls, options: RecordingOptions) -> "Scene":
+        """The scene that the options ask for."""
         if options.human_arm is not None:
             visit = shared_workspace.visit_of(options.human_arm, options.seed)
             things = shared_workspace.things(options.human_arm, options.seed)
-            arm = shared_workspace.human_arm(visit, START_NS)
-            return things, arm, shared_workspace.task_motion(visit)
+            temporary = shared_workspace.human_arm(visit, START_NS)
+            return cls._with(tabletop.furniture(), things, temporary, shared_workspace.task_motion(visit))
+        motion = tabletop.arm_motion(options.duration_s)
+        if options.is_free:
+            return cls._with([p for p in tabletop.furniture() if p.name != "table"], [], [], motion)
+        span = round(options.duration_s * 1e9)
         third = (START_NS + span // 3, START_NS + 2 * span // 3)
         num_steps = max(round(options.duration_s * options.fps / 3), 1)
         temporary = tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third)]
-        return tabletop.things(), temporary, tabletop.arm_motion(options.duration_s)
+        return cls._with(tabletop.furniture(), tabletop.things(), temporary, motion)
+
+    @classmethod
+    def _with(
+        cls, furniture: list[Primitive], things: list[Primitive], temporary: list[Primitive], motion: Motion
+    ) -> "Scene":
+        return cls(primitives=(*furniture, *things, *temporary), temporary=tuple(temporary), motion=motion)
+
+
+class Recording:
+    """A scene, recorded once; the same options and scene give the same records."""
+
+    def __init__(self, options: RecordingOptions, robot: RobotModel, scene: Scene | None = None) -> None:
+        """scene: another than that of the options, or the motion of another arm in it."""
+        self.options = options
+        self.robot = robot
+        scene = Scene.of(options) if scene is None else scene
+        self.start_ns, self.end_ns = START_NS, START_NS + round(options.duration_s * 1e9)
+        self.cameras = tabletop.cameras(options.width, options.height)
+        self.primitives, self._temporary, self._motion = scene.primitives, scene.temporary, scene.motion
+        self._meshes = tabletop.arm_meshes(robot.surface) if robot.urdf.meshes else None
 
     def joint_states(self) -> Iterator[JointState]:
         """The arm's states from start to end, 50 a second."""
@@ -100,14 +126,16 @@ class Recording:
     def frames_at(self, index: int, q: Float64, cameras: Collection[str] | None = None) -> Iterator[RgbdFrame]:
         """The images of the cameras (None: of every one) at the time of the frame `index`, with the arm at q (J,)."""
         stamp_ns = self.start_ns + self._offset_ns(index)
-        arm = tabletop.arm_solids(self.robot.urdf.shapes, self.link_poses(q))
+        poses = self.link_poses(q)
+        arm = tabletop.arm_solids(self.robot.urdf.shapes, poses)
+        meshes = None if self._meshes is None else self._meshes.at(poses)
         passing = [p.at(stamp_ns) for p in self._temporary if p.is_present(stamp_ns)]
         noise, has_masks = NOISES[self.options.noise], self.options.with_person or self.options.human_arm is not None
         for number, renderer in enumerate(self._renderers):
             if cameras is not None and renderer.camera.name not in cameras:
                 continue
-            color, depth = renderer.image([*arm, *passing])
-            human = _shown(depth, renderer.depth(arm)) if has_masks else None
+            color, depth = renderer.image([*arm, *passing], meshes)
+            human = _shown(depth, renderer.depth(arm, meshes)) if has_masks else None
             if noise is not None:
                 depth = noise.applied(depth, np.random.default_rng([self.options.seed, number, index]))
             yield RgbdFrame(
@@ -172,7 +200,7 @@ class Recording:
     @cached_property
     def _renderers(self) -> list[Renderer]:
         """One by camera, with what is always there cast."""
-        static, rays = self.primitives[: -len(self._temporary)], self.options.color_rays
+        static, rays = self.primitives[: len(self.primitives) - len(self._temporary)], self.options.color_rays
         return [Renderer(camera, static, color_rays=rays) for camera in self.cameras]
 
 

@@ -1,22 +1,24 @@
-"""Exact RGB-D images of primitives by ray casting: depth at pixel centres, colour from four rays a pixel.
+"""Exact RGB-D images of primitives and meshes by ray casting: depth at pixel centres, colour from four rays a pixel.
 
 And what an active-stereo depth camera adds to exact depth: disparity noise, holes at edges, dropouts.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.kernels.surface_image import SurfaceScene, render_surface
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, UInt8
-from splatctrl_cli.simulate.primitives import Primitive, hit, normals
+from splatctrl_cli.simulate.primitives import Primitive, Texture, hit, normals
 
 # Offsets of the rays of a pixel from its centre [px]: the centre (depth) first, then four for colour.
 OFFSETS = ((0.0, 0.0), (-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 LIGHT = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])  # direction to the light, world
 AMBIENT = 0.62
+FACES_AT_ONCE = 32_000  # of meshes: their numbers are 16 bits wide
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +29,23 @@ class Camera:
     intrinsics: Intrinsics
     T_world_camera: Float64
     is_training: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meshes:
+    """Triangles (F, 3, 3) [m], counter-clockwise seen from outside, each in the frame of one of `links`, whose number
+    is in `owners` (F,); textures by link. T_world_link (L, 4, 4): where the links are.
+    """
+
+    links: tuple[str, ...]
+    triangles: Float64
+    owners: NDArray[np.integer]
+    textures: tuple[Texture, ...]
+    T_world_link: Float64
+
+    def at(self, poses: Mapping[str, Float64]) -> "Meshes":
+        """The same with the links at poses (4, 4) by name."""
+        return replace(self, T_world_link=np.array([poses[link] for link in self.links]).reshape(-1, 4, 4))
 
 
 class Renderer:
@@ -50,18 +69,24 @@ class Renderer:
         self._color = np.zeros((*shape, 3))
         self._cast(static, self._depth, self._color)
 
-    def image(self, moving: Sequence[Primitive]) -> tuple[UInt8, Float32]:
-        """color (H, W, 3) uint8 and depth (H, W) float32 [m], 0 = nothing there, with `moving` in the scene."""
+    def image(self, moving: Sequence[Primitive], meshes: Meshes | None = None) -> tuple[UInt8, Float32]:
+        """color (H, W, 3) uint8 and depth (H, W) float32 [m], 0 = nothing there, with `moving` and `meshes` in the
+        scene.
+        """
         depth, color = self._depth.copy(), self._color.copy()
         self._cast(moving, depth, color)
+        for ray, mine, faces in self._nearest_faces(meshes, depth):
+            color[ray][mine] = self._shaded_faces(meshes, depth[ray][mine], self._directions[ray][mine], faces)
         mean = np.mean(color[1:] if len(color) > 1 else color, axis=0)
         at_center = np.where(np.isfinite(depth[0]), depth[0], 0)
         return np.rint(mean * 255).astype(np.uint8), at_center.astype(np.float32)
 
-    def depth(self, moving: Sequence[Primitive]) -> Float32:
+    def depth(self, moving: Sequence[Primitive], meshes: Meshes | None = None) -> Float32:
         """The same depth alone, without the work for colours."""
         depth = self._depth[:1].copy()
         self._nearest(moving, depth)
+        for _ in self._nearest_faces(meshes, depth):
+            pass
         return np.where(np.isfinite(depth[0]), depth[0], 0).astype(np.float32)
 
     def _cast(self, primitives: Sequence[Primitive], depth: Float64, color: Float64) -> None:
@@ -87,6 +112,50 @@ class Renderer:
             owner[window][is_nearer] = index
         return owner
 
+    def _nearest_faces(
+        self, meshes: Meshes | None, depth: Float64
+    ) -> Iterator[tuple[int, Bool, NDArray[np.integer]]]:
+        """Lower `depth` (K, H, W) of the first K rays of each pixel; of each ray the pixels (H, W) where a triangle
+        is the nearest, and its number there.
+        """
+        if meshes is None:
+            return
+        k = self.camera.intrinsics
+        T_camera = (invert_transform(self.camera.T_world_camera) @ meshes.T_world_link)[meshes.owners]
+        corners = np.einsum("fij,fkj->fki", T_camera[:, :3, :3], meshes.triangles) + T_camera[:, None, :3, 3]
+        nothing = np.zeros((k.height, k.width), np.float32)
+        for ray, (du, dv) in enumerate(OFFSETS[: len(depth)]):
+            at_ray = np.array([k.fx, k.fy, k.cx - du, k.cy - dv, k.width, k.height], np.float64)
+            for first in range(0, len(corners), FACES_AT_ONCE):
+                part = np.ascontiguousarray(corners[first : first + FACES_AT_ONCE])
+                scene = SurfaceScene(
+                    solids=np.zeros((0, 16)),
+                    solid_links=np.zeros(0, np.int16),
+                    triangles=part,
+                    triangle_links=np.arange(len(part), dtype=np.int16),
+                )
+                seen = render_surface(scene, at_ray, nothing, tolerance=0.0, quadratic=0.0)
+                mine = (seen.link >= 0) & (seen.depth < depth[ray])
+                depth[ray][mine] = seen.depth[mine]
+                yield ray, mine, first + seen.link[mine].astype(np.int64)
+
+    def _shaded_faces(
+        self, meshes: Meshes | None, depth: Float64, directions: Float64, faces: NDArray[np.integer]
+    ) -> Float64:
+        """RGB (R, 3) of points at a depth (R,) along directions (R, 3) on triangles of these numbers (R,)."""
+        assert meshes is not None
+        points_world = self.camera.T_world_camera[:3, 3] + depth[:, None] * directions
+        a, b, c = np.moveaxis(meshes.triangles[faces], 1, 0)
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        color, owners = np.zeros((len(faces), 3)), meshes.owners[faces]
+        for link in np.unique(owners):
+            mine = owners == link
+            T_link_world = invert_transform(meshes.T_world_link[link])
+            points_link = points_world[mine] @ T_link_world[:3, :3].T + T_link_world[:3, 3]
+            color[mine] = lit(meshes.textures[link], points_link, normal[mine], T_link_world)
+        return color
+
     def _window(self, primitive: Primitive) -> tuple[slice, slice, slice]:
         """The rays that could meet the primitive's bounding ball: a conservative rectangle of pixels."""
         k = self.camera.intrinsics
@@ -106,12 +175,17 @@ class Renderer:
 
 
 def shaded(primitive: Primitive, points_world: Float64) -> Float64:
-    """RGB (R, 3) in [0, 1] of surface points (R, 3): texture under one distant light, the same from every side."""
+    """RGB (R, 3) in [0, 1] of surface points (R, 3)."""
     T_shape_world = invert_transform(primitive.T_world_shape)
     points_shape = points_world @ T_shape_world[:3, :3].T + T_shape_world[:3, 3]
-    facing = normals(primitive, points_shape) @ (T_shape_world[:3, :3] @ LIGHT)
+    return lit(primitive.texture, points_shape, normals(primitive, points_shape), T_shape_world)
+
+
+def lit(texture: Texture, points_shape: Float64, normals_shape: Float64, T_shape_world: Float64) -> Float64:
+    """RGB (R, 3) in [0, 1]: a texture under one distant light, the same from every side."""
+    facing = normals_shape @ (T_shape_world[:3, :3] @ LIGHT)
     light = AMBIENT + (1 - AMBIENT) * np.maximum(facing, 0)
-    return np.asarray(primitive.texture.color(points_shape) * light[:, None])
+    return np.asarray(texture.color(points_shape) * light[:, None])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,11 @@ import numpy as np
 
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame
+from splatctrl_cli.robot.surface import RobotSurface
 from splatctrl_cli.robot.urdf import Shape
 from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import ALWAYS, Primitive, Texture
-from splatctrl_cli.simulate.render import Camera, Renderer
+from splatctrl_cli.simulate.render import Camera, Meshes, Renderer
 
 PALETTE = {
     "wood": ((0.16, 0.09, 0.05), (0.98, 0.86, 0.66)),
@@ -115,17 +116,31 @@ def arm_motion(duration_s: float) -> Motion:
 
 def arm_solids(shapes: Sequence[Shape], T_world_links: dict[str, Float64]) -> list[Primitive]:
     """The arm's shapes as solids at one posture; the pattern is fixed to each link."""
-    colors = ("shell", "ocean")
     return [
         Primitive(
             name=f"{shape.link}.{index}",
             kind=shape.kind,
             size=shape.size,
             T_world_shape=T_world_links[shape.link] @ shape.T_link_shape,
-            texture=_texture("noise", 0.05, colors[sum(shape.link.encode()) % 2], 20),
+            texture=_link_texture(shape.link),
         )
         for index, shape in enumerate(shapes)
     ]
+
+
+def arm_meshes(surface: RobotSurface) -> Meshes:
+    """The arm's meshes; the pattern is fixed to each link."""
+    return Meshes(
+        links=surface.links,
+        triangles=surface.triangles,
+        owners=surface.triangle_links,
+        textures=tuple(_link_texture(link) for link in surface.links),
+        T_world_link=np.tile(np.eye(4), (len(surface.links), 1, 1)),
+    )
+
+
+def _link_texture(link: str) -> Texture:
+    return _texture("noise", 0.05, ("shell", "ocean")[sum(link.encode()) % 2], 20)
 
 
 def _texture(pattern: str, feature: float, palette: str, seed: int) -> Texture:

@@ -123,6 +123,7 @@ def truth_mismatch(truth: Truth, states: StateColumns, model: RobotModel) -> Mis
     if tuple(truth.joint_names) != tuple(model.joint_names) or not truth.robot_spheres.is_file():
         return None  # another model on purpose: nothing to compare with
     own = RobotModel.from_urdf(truth.robot_urdf, truth.robot_spheres, T_world_base=truth.T_world_base)
+    own = own.moved_by(truth.joint_names)
     moving = np.flatnonzero(own.moving_spheres)
     worst = 0.0
     for stamp in shared[:: max(len(shared) // SAME_MOTION_STATES, 1)]:

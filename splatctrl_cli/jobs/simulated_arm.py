@@ -1,0 +1,143 @@
+"""Another arm in the simulated scene: its files, its spheres, and a motion that takes its tip where ours goes."""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.config import ControlConfig, fixed
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.planner.planned import goal_postures
+from splatctrl_cli.records import Float64
+from splatctrl_cli.robot.coverage import coverage_of_solids
+from splatctrl_cli.robot.link_gaps import SelfSurfaces
+from splatctrl_cli.robot.link_meshes import mesh_path, read_solids
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.robot.sphere_files import spheres_yaml
+from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
+from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.simulate.arm import hand_pose
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.recording import START_NS, Scene
+from splatctrl_cli.simulate.truth import distance_to
+
+REMEDY = "give the URDF of an arm whose base stands on the table's top"
+
+
+def copied_arm(urdf: Path, packages: Sequence[Path], folder: Path) -> tuple[RobotModel, SelfSurfaces]:
+    """Write ``robot.urdf``, the collision meshes that it names into ``meshes/``, and ``robot_spheres.yaml`` into a
+    folder, and read them back as the robot and the surfaces of its links.
+
+    Raises InputError for a URDF without collision geometry, or whose meshes are missing.
+    """
+    original = read_urdf(urdf)
+    solids = read_solids(original, packages)
+    copy = folder / "robot.urdf"
+    copy.write_text(_with_own_meshes(original, packages, folder), encoding="utf-8")
+    spheres = folder / "robot_spheres.yaml"
+    fitted = fit_spheres(solids, FitOptions(max_spheres=max(fixed.DEFAULT_SPHERES, len(solids))))
+    spheres.write_text(spheres_yaml(fitted, [f"Fitted to {urdf.name} by: splatctrl simulate."]), encoding="utf-8")
+    moved = [joint.name for joint in original.joints if joint.kind != "fixed" and joint.name not in original.grippers]
+    model = RobotModel.from_urdf(copy, spheres).moved_by(moved)
+    report = coverage_of_solids(model.urdf, solids, model.sphere_set, resolution=fixed.COVERED_COARSE)
+    model = model.with_coverage(report)
+    return model, SelfSurfaces(model, solids)
+
+
+def adapted_motion(scene: Scene, model: RobotModel, surfaces: SelfSurfaces) -> Motion:
+    """The scene's motion for another arm: at each waypoint its tip (the last link of its URDF, z pointing away from
+    the arm) is where the hand of the simulated arm is, as far as it reaches, and any way round.
+
+    Among the postures found, those of the shortest way that keeps clear of everything there and of the arm
+    itself. Raises InputError where none leads to a waypoint, or every way runs into something.
+    """
+    times = scene.motion.times
+    reached = [_postures(model, hand_pose(q), q) for q in scene.motion.waypoints]
+    costs, before = np.zeros(len(reached[0])), []
+    for start, (here, there) in enumerate(pairwise(reached)):
+        ways = [Motion(times=times[start : start + 2], waypoints=np.array(ends)) for ends in product(here, there)]
+        legs = np.array([_cost(scene, model, surfaces, leg) for leg in ways]).reshape(len(here), len(there))
+        before.append(np.argmin(costs[:, None] + legs, axis=0))
+        costs = np.min(costs[:, None] + legs, axis=0)
+    chosen = [int(np.argmin(costs))]
+    if not np.isfinite(costs[chosen[0]]):
+        raise InputError(f"{model.urdf.path}: expected a way between the waypoints, got none", remedy=REMEDY)
+    for choice in reversed(before):
+        chosen.insert(0, int(choice[chosen[0]]))
+    waypoints = np.array([postures[k] for postures, k in zip(reached, chosen, strict=True)])
+    return Motion(times=times, waypoints=waypoints)
+
+
+def _with_own_meshes(urdf: UrdfFile, packages: Sequence[Path], folder: Path) -> str:
+    """The URDF's text with its collision meshes copied beside it, so that the folder needs no package."""
+    text, names = urdf.text, set[str]()
+    for name in dict.fromkeys(mesh.filename for mesh in urdf.meshes):
+        source = mesh_path(urdf.path, next(mesh for mesh in urdf.meshes if mesh.filename == name), packages)
+        (folder / "meshes").mkdir(exist_ok=True)
+        copy = source.name if source.name not in names else f"{len(names)}_{source.name}"
+        names.add(copy)
+        shutil.copyfile(source, folder / "meshes" / copy)
+        for quote in ('"', "'"):
+            text = text.replace(f"{quote}{name}{quote}", f"{quote}meshes/{copy}{quote}")
+    return text
+
+
+def _postures(model: RobotModel, T_base_hand: Float64, q: Float64) -> Float64:
+    """Postures (K, J) with the tip at a pose (4, 4), or nearer to the base where it does not reach it.
+
+    q: of the simulated arm there, from which the search for an arm of as many joints begins.
+    """
+    tip = model.frame_names[-1]
+    guesses = [model.middle, *random_postures(model, fixed.SIMULATED_GUESSES, seed=0)]
+    if len(q) == model.num_joints:
+        guesses.insert(0, np.clip(q, model.lower, model.upper))
+    for nearer in fixed.SIMULATED_NEARER ** np.arange(fixed.SIMULATED_NEARINGS):
+        found = [
+            posture
+            for pose in _turns(T_base_hand, nearer)
+            for posture in goal_postures(
+                model, tip, pose, np.array(guesses), ControlConfig(), at_most=fixed.SIMULATED_POSTURES
+            )
+        ]
+        if found:
+            return np.array(found)
+    x, y, z = T_base_hand[:3, 3]
+    raise InputError(
+        f"{model.urdf.path}: expected {tip} to reach ({x:.2f}, {y:.2f}, {z:.2f}) m or nearer, "
+        "pointing down, got no posture",
+        remedy=REMEDY,
+    )
+
+
+def _turns(T_base_hand: Float64, nearer: float) -> Iterator[Float64]:
+    """The pose turned about its own z, its place that share as far from the base's axis."""
+    for angle in 2 * np.pi * np.arange(fixed.SIMULATED_TURNS) / fixed.SIMULATED_TURNS:
+        T = T_base_hand.copy()
+        c, s = np.cos(angle), np.sin(angle)
+        T[:3, :3] = T[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        T[:2, 3] *= nearer
+        yield T
+
+
+def _cost(scene: Scene, model: RobotModel, surfaces: SelfSurfaces, leg: Motion) -> float:
+    """What a leg between two postures costs: its length [rad], and more where it comes near anything; infinite where
+    it runs into something or itself, or is too fast.
+    """
+    seconds = np.linspace(leg.times[0], leg.times[-1], fixed.SIMULATED_SAMPLES)
+    states = [leg.at(second) for second in seconds]
+    if np.any(np.abs([velocity for _, velocity in states]) > model.velocity_limit):
+        return np.inf
+    positions = np.array([position for position, _ in states])
+    centers = model.sphere_centers_batch(positions)
+    moving = model.moving_spheres
+    radii, least = model.sphere_set.radii[moving], np.inf
+    for second, points in zip(seconds, centers[:, moving], strict=True):
+        gap = distance_to(scene.primitives, points, START_NS + round(second * 1e9)) - radii
+        least = min(least, float(gap.min()))
+    if least <= 0 or np.any(surfaces.gaps(positions, centers, 0.0) < 0):
+        return np.inf
+    shortfall = max(0.0, fixed.SIMULATED_CLEARANCE - least) / fixed.SIMULATED_CLEARANCE
+    return float(np.linalg.norm(leg.waypoints[1] - leg.waypoints[0])) + fixed.SIMULATED_SHORTFALL * shortfall

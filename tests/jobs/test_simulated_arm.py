@@ -1,0 +1,114 @@
+"""``simulate --urdf``: a log of an arm with meshes, whose folder needs nothing else."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from splatctrl_cli.cli.main import main
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import back_project, transform_points
+from splatctrl_cli.jobs.simulate import SimulateRequest, simulate
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.mesh_distance import MeshDistance, load_mesh
+from splatctrl_cli.records import JointState, RgbdFrame
+from splatctrl_cli.robot.coverage import coverage_deficit
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import read_urdf
+from splatctrl_cli.simulate.recording import RecordingOptions
+from splatctrl_cli.simulate.truth import distance_to, load_truth
+from splatctrl_cli.sources.source import open_source
+from tests.robot.shapes import written
+
+OPTIONS = RecordingOptions(duration_s=3.0, fps=1.0, width=64, height=48, noise="none", color_rays=0)
+FINGERS = "".join(
+    f'<link name="{side}"/><joint name="{side}_joint" type="prismatic"><parent link="hand"/><child link="{side}"/>'
+    '<axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="1" effort="1"/></joint>'
+    for side in ("left", "right")
+)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory, sample_data: Path) -> Path:
+    """The simulated arm of boxes, with other joint names, fingers that no log moves, and a mesh for its forearm."""
+    folder = tmp_path_factory.mktemp("packages") / "my_arm"
+    mesh = folder / "meshes" / "forearm.stl"
+    mesh.parent.mkdir(parents=True)
+    capsule = trimesh.creation.capsule(height=0.2, radius=0.055, count=[12, 12])
+    capsule.apply_translation([0.0, 0.01, -0.22])
+    capsule.export(mesh)
+    text = (sample_data / "tabletop" / "robot.urdf").read_text().replace('name="joint', 'name="my_joint')
+    text = re.sub(r'<cylinder radius="(\S+)" length="(\S+)"/>', r'<box size="\1 \1 \2"/>', text)
+    text = re.sub(r'<sphere radius="(\S+)"/>', r'<box size="\1 \1 \1"/>', text)
+    start = text.index('<link name="link5">')
+    end = text.index("</link>", start)
+    geometry = '<collision><geometry><mesh filename="package://my_arm/meshes/forearm.stl"/></geometry></collision>'
+    text = f'{text[:start]}<link name="link5">{geometry}{text[end:]}'
+    return written(folder, text.replace("</robot>", f"{FINGERS}</robot>"), "my_arm.urdf")
+
+
+@pytest.fixture(scope="module")
+def simulated(arm: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("simulated") / "log"
+    moved = shutil.copyfile(arm, tmp_path_factory.mktemp("elsewhere") / "arm.urdf")
+    with pytest.raises(InputError, match=r"package://my_arm/meshes/forearm\.stl was not found; .* --packages"):
+        simulate(SimulateRequest(out=out, urdf=moved, options=OPTIONS))
+    assert not out.exists()
+    simulate(SimulateRequest(out=out, urdf=moved, packages=(arm.parents[1],), options=OPTIONS))
+    return out
+
+
+def test_the_folder_holds_the_arm_with_its_meshes_and_covering_spheres(simulated: Path) -> None:
+    urdf = read_urdf(simulated / "robot.urdf")
+    assert {mesh.filename for mesh in urdf.meshes} == {"meshes/forearm.stl"}
+    model = RobotModel.from_urdf(simulated / "robot.urdf", simulated / "robot_spheres.yaml")
+    assert coverage_deficit(urdf, model.sphere_set).max_deficit == 0.0
+    truth = load_truth(simulated / "truth.json")
+    assert truth.joint_names == tuple(f"my_joint{k}" for k in range(1, 8))
+    assert truth.clearance.min() > 0.02
+
+
+def test_every_depth_of_the_log_lies_on_the_arm_or_in_the_scene(simulated: Path) -> None:
+    truth = load_truth(simulated / "truth.json")
+    source = open_source(simulated / "log.mcap", SourceOptions())
+    assert source.joint_names == truth.joint_names
+    model = RobotModel.from_urdf(simulated / "robot.urdf", simulated / "robot_spheres.yaml")
+    model = model.moved_by(source.joint_names)
+    surface, q, on_mesh = model.surface, np.zeros(7), 0
+    forearm = MeshDistance(load_mesh(simulated / "meshes" / "forearm.stl"))
+    for record in source.records():
+        if isinstance(record, JointState):
+            q = record.position
+            continue
+        assert isinstance(record, RgbdFrame)
+        points = transform_points(record.T_world_camera, back_project(record.intrinsics, record.depth))
+        points = points[record.depth > 0]
+        poses = {link: model.frame_pose(q, link) for link in surface.links}
+        to_scene = np.abs(distance_to(truth.primitives, points, record.stamp_ns))
+        to_solids = np.abs(surface.distance(surface.poses(poses), points))
+        to_mesh = np.abs(forearm.signed(transform_points(np.linalg.inv(poses["link5"]), points)))
+        assert np.min([to_scene, to_solids, to_mesh], axis=0).max() < 2e-3  # depths of the log are in millimetres
+        on_mesh += int(np.sum((to_mesh < 1e-3) & (to_scene > 0.01)))
+    assert on_mesh > 20
+
+
+def test_the_same_options_give_the_same_bytes(simulated: Path, arm: Path, tmp_path: Path) -> None:
+    simulate(SimulateRequest(out=tmp_path / "again", urdf=arm, options=OPTIONS))
+    for name in ("log.mcap", "truth.json", "robot.urdf"):
+        assert (tmp_path / "again" / name).read_bytes() == (simulated / name).read_bytes(), name
+
+
+def test_an_arm_without_geometry_is_refused_in_one_line(
+    tmp_path: Path, sample_data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (sample_data / "tabletop" / "robot.urdf").read_text()
+    while "<collision>" in text:
+        text = text[: text.index("<collision>")] + text[text.index("</collision>") + len("</collision>") :]
+    urdf = written(tmp_path, text)
+    assert main(["simulate", "--urdf", str(urdf), "-o", str(tmp_path / "out"), "-q"]) == 4
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "expected collision geometry, got none; give a URDF with <collision> elements" in line
+    assert not (tmp_path / "out").exists()

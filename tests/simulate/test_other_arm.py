@@ -1,0 +1,154 @@
+"""Another arm in the scene: its meshes as cameras see them, and its tip where the simulated arm's hand goes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import InputError, UsageError
+from splatctrl_cli.jobs.simulated_arm import adapted_motion
+from splatctrl_cli.records import Float64, SphereSet
+from splatctrl_cli.robot.link_gaps import SelfSurfaces
+from splatctrl_cli.robot.link_meshes import read_solids
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.robot.urdf import read_urdf
+from splatctrl_cli.simulate import tabletop
+from splatctrl_cli.simulate.arm import hand_pose
+from splatctrl_cli.simulate.primitives import Primitive, Texture
+from splatctrl_cli.simulate.recording import RecordingOptions, Scene
+from splatctrl_cli.simulate.render import Meshes, Renderer
+from tests.robot.shapes import arm_of, written
+from tests.robot.ur10e import JOINTS, ur10e_urdf
+
+TEXTURE = Texture(pattern="noise", feature=0.05, dark=(0.1, 0.2, 0.3), bright=(0.9, 0.8, 0.7), seed=3)
+
+
+def test_a_mesh_is_seen_as_the_solid_of_the_same_shape(tmp_path: Path) -> None:
+    camera = tabletop.cameras(160, 120)[0]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]], [0.4, 0.0, 0.2]
+    size = (0.2, 0.3, 0.25)
+    box = Primitive(name="box", kind="box", size=size, T_world_shape=T, texture=TEXTURE)
+    urdf = written(tmp_path, arm_of(f'<box size="{size[0]} {size[1]} {size[2]}"/>', '<sphere radius="0.1"/>'))
+    (solid,) = read_solids(read_urdf(urdf))["base"]
+    triangles = solid.surface.corners
+    mesh = Meshes(
+        links=("base",),
+        triangles=triangles,
+        owners=np.zeros(len(triangles), np.int16),
+        textures=(TEXTURE,),
+        T_world_link=np.eye(4)[None],
+    ).at({"base": T})
+    renderer = Renderer(camera, tabletop.furniture())
+    color, depth = renderer.image([box])
+    color_mesh, depth_mesh = renderer.image([], mesh)
+    is_box = depth != renderer.depth([])
+    assert 200 < is_box.sum() < 0.5 * is_box.size
+    np.testing.assert_array_equal(depth_mesh != renderer.depth([]), is_box)
+    np.testing.assert_allclose(depth_mesh, depth, atol=1e-5)
+    assert np.abs(color_mesh.astype(int) - color.astype(int)).max() <= 1
+    np.testing.assert_array_equal(renderer.depth([], mesh), depth_mesh)
+
+
+def test_faces_beyond_what_16_bits_number_are_seen_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    urdf = written(tmp_path, arm_of('<sphere radius="0.2"/>', '<sphere radius="0.1"/>'))
+    (ball,) = read_solids(read_urdf(urdf))["base"]
+    triangles = ball.surface.corners
+    T = np.eye(4)
+    T[:3, 3] = [0.4, 0.0, 0.2]
+    mesh = Meshes(
+        links=("base",),
+        triangles=triangles,
+        owners=np.zeros(len(triangles), np.int16),
+        textures=(TEXTURE,),
+        T_world_link=T[None],
+    )
+    renderer = Renderer(tabletop.cameras(80, 60)[1], [])
+    whole = renderer.image([], mesh)
+    monkeypatch.setattr("splatctrl_cli.simulate.render.FACES_AT_ONCE", 100)
+    parted = renderer.image([], mesh)
+    np.testing.assert_array_equal(whole[0], parted[0])
+    np.testing.assert_array_equal(whole[1], parted[1])
+
+
+def test_the_hand_is_where_the_model_of_the_arm_has_it(sample_data: Path) -> None:
+    arm = RobotModel.from_urdf(
+        sample_data / "tabletop" / "robot.urdf", sample_data / "tabletop" / "robot_spheres.yaml"
+    )
+    for q in np.random.default_rng(0).uniform(arm.lower, arm.upper, (20, 7)):
+        np.testing.assert_allclose(hand_pose(q), arm.frame_pose(q, "hand"), atol=1e-12)
+
+
+def ur10e(folder: Path, text: str = "") -> RobotModel:
+    """With a sphere at every link but the base."""
+    links = tuple(joint[1] for joint in JOINTS)
+    spheres = SphereSet(links=links, centers=np.zeros((len(links), 3)), radii=np.full(len(links), 0.06))
+    return RobotModel.from_urdf(written(folder, text or ur10e_urdf()), spheres)
+
+
+@pytest.mark.parametrize("options", [RecordingOptions(), RecordingOptions(human_arm="near-goal", duration_s=24.0)])
+def test_an_arm_of_six_joints_goes_where_ours_goes(tmp_path: Path, options: RecordingOptions) -> None:
+    model, scene = ur10e(tmp_path), Scene.of(options)
+    motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
+    np.testing.assert_array_equal(motion.times, scene.motion.times)
+    for ours, theirs in zip(scene.motion.waypoints, motion.waypoints, strict=True):
+        hand, tip = hand_pose(ours), model.frame_pose(theirs, "tool0")
+        np.testing.assert_allclose(tip[:3, 3], hand[:3, 3], atol=2e-3)
+        assert tip[:3, 2] @ hand[:3, 2] > 0.999
+    seconds = np.linspace(0, options.duration_s, 200)
+    velocity = np.array([motion.at(second)[1] for second in seconds])
+    assert np.all(np.abs(velocity) <= model.velocity_limit)
+
+
+def test_a_small_arm_goes_as_far_as_it_reaches_and_a_tiny_one_is_refused(tmp_path: Path) -> None:
+    def scaled(by: float) -> str:
+        text = ur10e_urdf()
+        for _, _, xyz, *_ in JOINTS:
+            shorter = " ".join(str(by * float(x)) for x in xyz.split())
+            text = text.replace(f'xyz="{xyz}"', f'xyz="{shorter}"')
+        return text
+
+    scene = Scene.of(RecordingOptions(is_free=True))
+    small = ur10e(tmp_path, scaled(0.45))
+    motion = adapted_motion(scene, small, SelfSurfaces(small, {}))
+    for ours, theirs in zip(scene.motion.waypoints, motion.waypoints, strict=True):
+        hand, tip = hand_pose(ours)[:3, 3], small.frame_pose(theirs, "tool0")[:3, 3]
+        assert tip[2] == pytest.approx(hand[2], abs=2e-3)
+        assert np.linalg.norm(tip[:2]) < np.linalg.norm(hand[:2]) + 1e-3
+        assert tip[0] * hand[1] - tip[1] * hand[0] == pytest.approx(0.0, abs=2e-3)
+    with pytest.raises(InputError, match=r"expected tool0 to reach .* pointing down, got no posture; give the URDF"):
+        tiny = ur10e(tmp_path, scaled(0.05))
+        adapted_motion(scene, tiny, SelfSurfaces(tiny, {}))
+
+
+def test_an_arm_goes_no_way_on_which_it_meets_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fixed, "SIMULATED_TURNS", 2)
+    model, scene = ur10e(tmp_path), Scene.of(RecordingOptions(is_free=True))
+    motion = adapted_motion(scene, model, SelfSurfaces(model, {}))
+    seconds = np.linspace(0, 7, 300)
+    passed = motion.at(3.5)[0]
+
+    class Meeting(SelfSurfaces):
+        """Links overlap in every posture within a radius [rad] of one that was passed."""
+
+        radius = 0.4
+
+        def gaps(self, q: Float64, centers: Float64, enough: float) -> Float64:
+            return np.asarray(np.linalg.norm(q - passed, axis=1, keepdims=True) - self.radius)
+
+    meeting = Meeting(model, {})
+    other = adapted_motion(scene, model, meeting)
+    gaps = meeting.gaps(np.array([other.at(second)[0] for second in seconds]), np.zeros(0), 0.0)
+    assert gaps.min() > -0.05 and not np.allclose(other.waypoints, motion.waypoints)
+    Meeting.radius = 100.0
+    with pytest.raises(InputError, match="expected a way between the waypoints, got none"):
+        adapted_motion(scene, model, meeting)
+
+
+def test_free_space_has_floor_and_walls_alone() -> None:
+    scene = Scene.of(RecordingOptions(is_free=True))
+    assert {p.name for p in scene.primitives} == {"floor", "wall_back", "wall_left", "wall_right"}
+    assert scene.temporary == ()
+    with pytest.raises(UsageError, match="--free: expected neither --person nor --human-arm"):
+        RecordingOptions(is_free=True, with_person=True)
