@@ -78,7 +78,7 @@ class ImageFolderSource:
         """What to say where depth is needed and there is none."""
         return InputError(
             f"{self._description.path}: depth is missing: none of its {len(self._views)} views has any",
-            remedy=f"{self._description.supply}; without depth work info, score, and reconstruct --points CLOUD.ply",
+            remedy=f"{self._description.supply}; info, score and reconstruct --points CLOUD.ply work without depth",
         )
 
     @property

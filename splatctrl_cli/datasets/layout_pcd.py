@@ -200,7 +200,7 @@ def _head(path: Path) -> Any:
     if said.height <= 1:
         raise InputError(
             f"{path}: not organised: {said.width} points in one row",
-            remedy="save clouds as the camera gives them, rows by columns, NaN where it saw nothing: no filters",
+            remedy="record clouds before any filter, in the rows and columns of the image, NaN where nothing is seen",
         )
     if not 0 < said.width * said.height <= MOST_PIXELS or said.points != said.width * said.height:
         raise InputError(f"{path}: {said.points} points of {said.width}x{said.height}", remedy=_AGAIN)

@@ -55,8 +55,8 @@ def open_layout(folder: Path, options: SourceOptions) -> ImageFolderSource:
 
 
 BARE_REMEDY = (
-    "describe colour, depth, intrinsics and poses in a .toml (docs/input.md); with a transforms.json (ns-process-data"
-    " writes it) info, score, and reconstruct --points CLOUD.ply work without depth"
+    "describe colour, depth, intrinsics and poses in a .toml (docs/input.md); info, score and reconstruct --points"
+    " CLOUD.ply work without depth, but not without poses: a transforms.json (ns-process-data writes it)"
 )
 
 
@@ -64,11 +64,7 @@ def bare_images(folder: Path) -> str:
     """That depth is missing, in words, of a folder that holds colour alone; empty where it holds no images."""
     num = max(len(images_of(place)) for place in (folder, *(folder / name for name in _COLORS)) if place.is_dir())
     is_colmap = any((folder / place).exists() for place in ("sparse", "images.bin", "images.txt"))
-    return (
-        f"depth is missing: {num} images{' of a COLMAP model' if is_colmap else ''} and nothing beside them"
-        if num
-        else ""
-    )
+    return f"depth is missing: images{' of a COLMAP model' if is_colmap else ''} alone ({num})" if num else ""
 
 
 def readable_in(folder: Path) -> str:

@@ -189,7 +189,7 @@ def no_camera(log: RawLog, survey: Survey) -> InputError:
     if colors and not depths:
         return InputError(
             f"{log.path}: no depth topic; colour topics there: {listed(colors)}",
-            remedy="record 16UC1, mono16 or 32FC1 depth images (info, and replay of joint states, work without)",
+            remedy="record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)",
         )
     videos = sorted(t.topic.name for t in survey.topics.values() if t.count and is_video(t.topic))
     if videos and not colors:

@@ -22,7 +22,7 @@ FORMATS = {  # the field that names the format, by the type of message
 }
 _GAP = "Frame num gap"  # FFmpeg says this of H.264 for its developers only
 KEY_FRAME = "key frame"  # in every note on what was lost
-OFTENER = "record key frames oftener (a GOP of a second), or cut the log at one"
+OFTENER = "record a key frame every second, or cut the log at one"
 _EARLY, _LATE = f"before its first {KEY_FRAME}", f"that follow missing or damaged ones, up to the next {KEY_FRAME},"
 
 

@@ -22,7 +22,7 @@ from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log
 
 ROOT = Path(__file__).parents[2]
 COLOR, DEPTH, INFO = "/cam0/color/image_raw/compressed", "/cam0/depth/image_raw", "/cam0/color/camera_info"
-NO_DEPTH = "record 16UC1, mono16 or 32FC1 depth images (info, and replay of joint states, work without)"
+NO_DEPTH = "record 16UC1, mono16 or 32FC1 depth images (info and replay of joint states work without)"
 JOINTS = "/joint_states"
 GOOD = LogRecipe(num_frames=30)
 CAMERAS_2, CAMERAS_3 = (replace(GOOD, cameras=tuple(f"cam{i}" for i in range(num))) for num in (2, 3))

@@ -145,7 +145,7 @@ def test_names_that_are_seconds_are_stamps(tmp_path: Path) -> None:
 def test_a_cloud_that_is_not_organised_is_refused(tmp_path: Path) -> None:
     row = cloud_of(0).reshape(1, -1, 3)
     (tmp_path / "a.pcd").write_bytes(pcd_bytes(row, color_of(0).reshape(1, -1, 3), POSES[0]))
-    with pytest.raises(InputError, match=r"a.pcd: not organised: 48 points in one row; save clouds as"):
+    with pytest.raises(InputError, match=r"a.pcd: not organised: 48 points in one row; record clouds"):
         open_source(tmp_path)
 
 
