@@ -17,6 +17,7 @@ from splatctrl_cli.checks.check_times import TimesWatch, time_findings
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, error, needs, note, warning
 from splatctrl_cli.checks.judge_evidence import Evidence, judged
+from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateCollector
@@ -139,6 +140,7 @@ def check_folder(
         motion=watch.motion,
         states=of_states.states,
         states_lack=of_states.lack,
+        is_guessed=isinstance(source, ImageFolderSource) and source.guess != "",
         cut="" if watch.is_whole else f"only the first {num_images} frames of a camera were read",
     )
     return judged(evidence, findings, of_states.model)

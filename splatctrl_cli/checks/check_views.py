@@ -51,10 +51,11 @@ class ViewsCheck:
     corrected: list[RgbdFrame]
 
 
-def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None]) -> ViewsCheck:
+def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None], *, is_sure: bool = True) -> ViewsCheck:
     """Compare views from different places, of one moment or a still scene.
 
-    used: metres per count of each camera's depth, None where it is stored as floats.
+    used: metres per count of each camera's depth, None where it is stored as floats. is_sure: False where something
+    speaks for another unit: then views must meet.
     """
     views = [_view(frame) for frame in _chosen(frames)]
     pairs = _pairs(views)
@@ -68,11 +69,20 @@ def check_views(frames: Sequence[RgbdFrame], used: Mapping[str, float | None]) -
             moves = wrong_poses(fitted, pairs)
         else:  # moves explain more
             scales, scaled = {}, list(frames)
-    findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs)
+    findings = _scale_findings(scales, used) if scales else _overlap_findings(views, pairs, is_sure=is_sure)
     findings += [_pose_finding(move, sorted(used)) for move in moves]
     by_camera = {move.camera: move.T_camera_corrected for move in moves}
     corrected = [replace(f, T_world_camera=f.T_world_camera @ by_camera.get(f.camera, np.eye(4))) for f in scaled]
     return ViewsCheck(findings=findings, scaled=scaled, corrected=corrected)
+
+
+def are_far(frames: Sequence[RgbdFrame]) -> bool:
+    """Whether cameras are so far apart, for what they see, that their places may be in another unit than depth."""
+    medians = [float(np.median(seen)) for frame in frames if (seen := frame.depth[frame.depth > 0]).size]
+    places = np.array([frame.T_world_camera[:3, 3] for frame in frames])
+    return bool(medians) and float(np.linalg.norm(np.ptp(places, axis=0))) > limits.VIEWS_FAR * float(
+        np.median(medians)
+    )
 
 
 def wrong_scales(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> dict[str, float]:
@@ -122,18 +132,23 @@ def wrong_poses(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> lis
     return moves
 
 
-def _overlap_findings(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> list[Finding]:
-    """Of depths that are unusual, and with which views that would meet at a tenth or at ten times do not."""
+def _overlap_findings(views: Sequence[_View], pairs: Sequence[tuple[int, int]], *, is_sure: bool) -> list[Finding]:
+    """Of depths that are unusual, and with which views that would meet at a tenth or at ten times do not; where
+    nothing is sure, at any other scale.
+    """
     low, high = limits.TABLE_DEPTH[0], limits.VIEWS_UNUSUAL * limits.TABLE_DEPTH[1]
     depths = np.concatenate([view.points[:, 2] for view in views])
-    if not len(depths) or low <= (median := float(np.median(depths))) <= high:
+    if not len(depths) or (is_sure and low <= float(np.median(depths)) <= high):
         return []
-    scale = 0.1 if median > high else 10.0
-    (_, plain), (fits, most) = (_fitting(views, pairs, [v.frame.camera for v in views], s) for s in (1.0, scale))
+    median, cameras = float(np.median(depths)), [view.frame.camera for view in views]
+    tried = (0.1 if median > high else 10.0,) if is_sure else SCALES
+    plain = _fitting(views, pairs, cameras, 1.0)[1]
+    (fits, most), scale = max((_fitting(views, pairs, cameras, s), s) for s in tried)
     if most < limits.VIEWS_LANDED or plain > limits.VIEWS_TRUSTED * most or fits < limits.VIEWS_LEAST_FIT * most:
         return []
     text = f"views hardly see each other's surfaces at a median depth of {median:.3g} m, but do at {scale:g} times it"
-    return [warning("views-scale", "cameras", text, "if so, multiply --depth-scale by it", value=scale)]
+    said = warning if is_sure else error
+    return [said("views-scale", "cameras", text, "if so, multiply --depth-scale by it", value=scale)]
 
 
 def _scaled(frames: Sequence[RgbdFrame], scales: Mapping[str, float]) -> list[RgbdFrame]:

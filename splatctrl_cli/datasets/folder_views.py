@@ -2,11 +2,13 @@
 
 import os
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_APART, UNIT_BASELINE, UNIT_DEPTH
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ImageFile, ListedView, PosesTable
 from splatctrl_cli.datasets.poses import (
     READERS,
@@ -19,9 +21,10 @@ from splatctrl_cli.datasets.poses import (
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.logs.source_options import SourceOptions, still_note
-from splatctrl_cli.records import SECOND_NS, Float64, LossReport
+from splatctrl_cli.records import MILLIMETRE, SECOND_NS, Float64, LossReport
 
 HOLDOUT = "holdout"
+UNITS = {MILLIMETRE: "millimetres", 0.01: "centimetres"}  # [m] of each, the likelier first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +45,31 @@ class View:
     lens: CameraTable
     depth_scale: float
     valid: Path | None = None
+
+    def in_unit(self, metres: float) -> "View":
+        """The same with lengths of so many metres, of pose and depth."""
+        T = self.T_world_camera.copy()
+        T[:3, 3] *= metres
+        return replace(self, T_world_camera=T, depth_scale=self.depth_scale * metres)
+
+
+def cameras_apart(views: Sequence[View]) -> float:
+    """The diagonal of the box of the cameras' places, in the unit of the poses."""
+    places = np.array([view.T_world_camera[:3, 3] for view in views])
+    return float(np.linalg.norm(np.ptp(places, axis=0)))
+
+
+def length_unit(median: float, apart: float) -> float:
+    """Metres per length of a recording whose depth has this median, and whose cameras are so far apart.
+
+    1 unless depth is too large for metres and the cameras' places have the same unit: where depth alone is too large
+    its scale is wrong, and the cameras are near each other in comparison. `reconstruct` then compares the views.
+    """
+    if median <= PLAUSIBLE_DEPTH[1] or apart < UNIT_APART * median:
+        return 1.0
+    low, high = UNIT_DEPTH
+    fits = [unit for unit in UNITS if low <= unit * median <= high and unit * apart > UNIT_BASELINE]
+    return fits[0] if fits else 1.0
 
 
 def views_of(description: Description, options: SourceOptions, loss: LossReport) -> list[View]:

@@ -11,8 +11,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatctrl_cli.config.fixed import UNIT_BASELINE
 from splatctrl_cli.datasets.folder_description import CameraTable, Description, ImageFile, read_description, read_rig
-from splatctrl_cli.datasets.folder_views import HOLDOUT, View, find_files, views_of
+from splatctrl_cli.datasets.folder_views import (
+    HOLDOUT,
+    UNITS,
+    View,
+    cameras_apart,
+    find_files,
+    length_unit,
+    views_of,
+)
 from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
@@ -60,6 +69,8 @@ class ImageFolderSource:
         self._num_invalid = 0
         self._views = views_of(self._description, options, self._loss)
         self._lenses: dict[str, _Lens] = {}
+        self.guess = "" if self.has_clock else self._in_metres()
+        """In which unit lengths look to be, in words; empty where they may be metres."""
         _check_names(path, {view.lens.name for view in self._views}, options)
         names = tuple(sorted({view.camera for view in self._views}))
         if options.cameras is not None:
@@ -97,6 +108,26 @@ class ImageFolderSource:
             invalid_depth=self._num_invalid,
             notes=[*loss.notes, *self._damaged],
         )
+
+    def _in_metres(self) -> str:
+        """Take lengths for millimetres or centimetres where depth and the cameras' places both look so; in words."""
+        apart = cameras_apart(self._views)
+        for view in self._views if apart > UNIT_BASELINE / max(UNITS) else ():
+            depth = self._depth(view, self._lens(view))
+            if depth is None or not (depth > 0).any():
+                continue
+            median = float(np.median(depth[depth > 0]))
+            unit = length_unit(median, apart)
+            if unit == 1.0:
+                return ""
+            self._views = [view.in_unit(unit) for view in self._views]
+            words = (
+                f"lengths are taken as {UNITS[unit]}: the median depth is {median:.4g}, and the cameras are up to"
+                f" {apart:.4g} apart"
+            )
+            self._loss.notes.append(words)
+            return words
+        return ""
 
     def records(self) -> Iterator[Record]:
         """Frames by stamp."""

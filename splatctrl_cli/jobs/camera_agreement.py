@@ -2,7 +2,7 @@
 
 from itertools import combinations
 
-from splatctrl_cli.checks.check_views import check_views
+from splatctrl_cli.checks.check_views import are_far, check_views
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.progress import Progress
@@ -14,12 +14,12 @@ class CameraAgreement:
     """disagreement [m]: of each pair of cameras that see enough of the same, how far apart they see it.
 
     name: of the recording. is_allowed: what does not fit is said, not refused. is_still: the scene does not move, so
-    that all views of a time step show the same.
+    that all views of a time step show the same. guess: in words, that the unit of lengths was guessed.
     """
 
-    def __init__(self, name: str, *, is_allowed: bool, is_still: bool) -> None:
+    def __init__(self, name: str, *, is_allowed: bool, is_still: bool, guess: str = "") -> None:
         self.disagreement: dict[str, float] = {}
-        self._name, self._is_allowed, self._is_still = name, is_allowed, is_still
+        self._name, self._is_allowed, self._is_still, self._guess = name, is_allowed, is_still, guess
 
     def check(self, step: TimeStep, limits: OccupancyConfig, console: Progress) -> None:
         """Compare once each pair of cameras, and of a still scene whether another depth scale would fit the views.
@@ -51,11 +51,15 @@ class CameraAgreement:
 
     def _check_scale(self, step: TimeStep, console: Progress) -> None:
         cameras = sorted({frame.camera for frame in step.frames})
-        for finding in check_views(step.frames, dict.fromkeys(cameras)).findings:
+        if self._guess:
+            console.log(f"warning: {self._name}: {self._guess}; the map is in metres")
+        found = check_views(step.frames, dict.fromkeys(cameras), is_sure=not self._guess and not are_far(step.frames))
+        for finding in found.findings:
             if finding.code == "views-scale" and not self._is_allowed:
                 raise InputError(
                     f"{self._name}: {finding.what}",
-                    remedy=f"{finding.remedy}; if it is right, give --allow-disagreement",
+                    remedy=f"multiply --depth-scale by {finding.value:.4g}, or correct the poses' unit; if both are"
+                    " right, give --allow-disagreement",
                 )
             if finding.code == "views-scale":
                 console.log(f"warning: {self._name}: {finding.what}")

@@ -6,6 +6,7 @@ from pathlib import Path
 from splatctrl_cli.captures.capture_header import is_capture
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.datasets.dtu_source import DtuSource, view_numbers
+from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.datasets.layouts import has_views
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import ScoreProtocol, Split, score_protocol
@@ -94,6 +95,11 @@ def open_held_out(
 def is_folder_of_views(path: Path) -> bool:
     """Whether a recording is images in a folder, by a TOML or in a dataset's layout; not a log, not a capture."""
     return path.suffix == ".toml" or (not is_capture(path) and has_views(path))
+
+
+def guessed_unit(source: RecordSource) -> str:
+    """In which unit other than metres a recording's lengths look to be, in words; empty for most."""
+    return source.guess if isinstance(source, ImageFolderSource) else ""
 
 
 def refuse_scan_options(recording: RecordingRequest) -> None:

@@ -10,6 +10,7 @@ from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of
+from splatctrl_cli.jobs.open_recording import guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct_verdict import GATED, Reconstructed, reconstruct_verdict
 from splatctrl_cli.jobs.reconstruction import Reconstruction, ReconstructRequest, training_cameras
@@ -143,6 +144,11 @@ def _robot(request: ReconstructRequest, progress: Progress) -> RobotModel | None
         if request.spheres is not None:
             raise UsageError(f"--spheres {request.spheres}: needs the robot", remedy="give --urdf as well")
         return None
+    if guess := guessed_unit(request.source):
+        raise InputError(
+            f"{request.source.name}: {guess}; a robot needs lengths in metres that nobody guessed",
+            remedy="write poses and depth in metres, or leave the robot out",
+        )
     try:
         model = RobotModel.from_urdf(urdf, request.spheres)
         if request.source.joint_names:

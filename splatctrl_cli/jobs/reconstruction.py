@@ -14,6 +14,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.jobs.camera_agreement import CameraAgreement
 from splatctrl_cli.jobs.correct_views import Corrections
+from splatctrl_cli.jobs.open_recording import guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
 from splatctrl_cli.robot.declared_contact import Declarations
@@ -116,9 +117,8 @@ class Reconstruction:
         self.corrected: dict[str, Any] = {}  # what was corrected of the views
         self._early: TimeStep | None = None  # the first that said nothing of the workspace
         self.depth: RecordedDepth | None = None  # by which the map's lengths were chosen
-        self.agreement = CameraAgreement(
-            self.source.name, is_allowed=request.allow_disagreement, is_still=not self.source.has_clock
-        )
+        allowed, still, guess = request.allow_disagreement, not self.source.has_clock, guessed_unit(self.source)
+        self.agreement = CameraAgreement(self.source.name, is_allowed=allowed, is_still=still, guess=guess)
         self._saved_at, self._save_time = -float("inf"), 0.0
         request.corrections.check(request.source)
         if checkpoint is not None:
@@ -170,8 +170,15 @@ class Reconstruction:
             console.log(f"time step {index} left out: no depth yet, and nothing else says where the workspace is")
             self._early = self._early or step
             return None
+        for frame in step.frames:
+            if frame.camera not in self.first_frames:
+                self.first_frames[frame.camera] = first_frame(frame).as_dict()
         if self.fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
+            frames, self.corrected = self.request.corrections.of(step.frames, self.source.name, console)
+            step = replace(step, frames=tuple(frames))
+        self.agreement.check(step, self.config.occupancy, console)
+        if self.fitter is None:
             self.fitter = self._new_fitter(self._workspace(step))
             if self.cloud is not None:
                 self.fitter.plant(self.cloud)
@@ -180,13 +187,6 @@ class Reconstruction:
                 "warning: more views than fit in one time step: the last are refined on, the others only seed splats;"
                 " leave views out, or reconstruct them in parts"
             )
-        for frame in step.frames:
-            if frame.camera not in self.first_frames:
-                self.first_frames[frame.camera] = first_frame(frame).as_dict()
-        if self.request.corrections and not self.fitter.num_steps:
-            frames, self.corrected = self.request.corrections.of(step.frames, self.source.name, console)
-            step = replace(step, frames=tuple(frames))
-        self.agreement.check(step, self.config.occupancy, console)
         if not self.source.has_clock and not self.fitter.num_steps:
             what, scene = f"fits {len(step.frames)} views, seeds first", self.config.scene
             self.fitter.descent.heard = Wait(console, what, "iterations", scene.first_iterations).announce().step

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
+from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH, UNIT_DEPTH
 from splatctrl_cli.containers.raw_log import RawMessage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.image_file import JPEG, PNG
@@ -150,7 +150,8 @@ def check_depth(depth: Float32, where: str, scale: float) -> bool:
     low, high = PLAUSIBLE_DEPTH
     if not low <= median <= high:
         counts = median / scale
-        fits = [s for s in (1e-3, 1e-4, 1.0, 1e-2, 1e-5, 1e-6) if 0.15 <= counts * s <= 8.0]
+        nearest, farthest = UNIT_DEPTH
+        fits = [s for s in (1e-3, 1e-4, 1.0, 1e-2, 1e-5, 1e-6) if nearest <= counts * s <= farthest]
         remedy = f"give --depth-scale {fits[0]:g}" if fits else "give the right --depth-scale [m per count]"
         raise InputError(
             f"{where}: median depth {median:.4g} m is implausible (expected {low:g} to {high:g} m)",

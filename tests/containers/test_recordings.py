@@ -53,7 +53,7 @@ REFUSED = {
     "rosbag2_mcap_sensor_msgs/rosbag2_2025_09_10-13_03_56_0.mcap": "no depth topic; colour topics there: /compressed",
     "rosbag2_mcap_sensor_msgs/simple-protobuf.mcap": r"no image topics; .*MouseEvent \(json\), foxglove.PoseInFrame",
     "realsense_bag/single_depth_color_640x480.bag": "no tf for frame '0'.*give --camera-pose device_0=",
-    "tabletop_d435_single": "nor laid out as TUM RGB-D.* a .toml",
+    "tabletop_d435_single": "depth is missing: images alone .* a .toml",
 }
 
 

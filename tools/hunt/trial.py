@@ -1,6 +1,6 @@
 """One run: drawn from its seed, recorded, reconstructed, replayed, and its verdict put beside the truth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,8 @@ from splatctrl_cli.jobs.replays import files, inputs
 from splatctrl_cli.jobs.replays.request import ReplayRequest
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Intrinsics, SphereSet
-from splatctrl_cli.robot.coverage import CoverageReport, coverage_deficit
+from splatctrl_cli.robot.coverage import CoverageReport, coverage_of_solids
+from splatctrl_cli.robot.link_meshes import Solid
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.urdf import UrdfFile
 from splatctrl_cli.simulate.arm import arm_spheres_yaml, arm_urdf
@@ -285,14 +286,16 @@ def _quick() -> Iterator[None]:
     """Replays without their plots, which nobody looks at, and with the coverage of a robot measured once."""
     with (
         patch.object(files, "draw_replay", lambda *args, **kwargs: None),
-        patch.object(inputs, "coverage_deficit", _coverage),
+        patch.object(inputs, "coverage_of_solids", _coverage),
     ):
         yield
 
 
-def _coverage(urdf: UrdfFile, spheres: SphereSet, **options: object) -> CoverageReport:
+def _coverage(
+    urdf: UrdfFile, solids: Mapping[str, Sequence[Solid]], spheres: SphereSet, **options: float
+) -> CoverageReport:
     key = (urdf.text, spheres.links, spheres.centers.tobytes(), spheres.radii.tobytes())
     if key not in _COVERAGES:
         _COVERAGES.clear()
-        _COVERAGES[key] = coverage_deficit(urdf, spheres, **options)  # type: ignore[arg-type]
+        _COVERAGES[key] = coverage_of_solids(urdf, solids, spheres, **options)
     return _COVERAGES[key]
