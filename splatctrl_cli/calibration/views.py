@@ -126,7 +126,7 @@ def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
     """
     is_ahead = points[:, 2] > fixed.PLAUSIBLE_DEPTH[0]
     pixels = np.round(project(view.lens, np.where(is_ahead[:, None], points, 1.0)))
-    lands = is_ahead & np.all((pixels >= 0) & (pixels < [view.lens.width, view.lens.height]), axis=1)
+    lands = is_ahead & np.all((pixels >= 0) & (pixels < view.surface.shape[1::-1]), axis=1)
     u, v = np.where(lands[:, None], pixels, 0).astype(np.int64).T
     surface = view.surface[v, u]
     return lands & (surface[:, 2] > 0), surface, view.normals[v, u]

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatctrl_cli.checks.check_arm import motion_findings
+from splatctrl_cli.checks.check_exposure import exposure_findings
 from splatctrl_cli.checks.check_images import alignment_findings
-from splatctrl_cli.checks.check_views import check_views
+from splatctrl_cli.checks.check_views import are_far, check_views
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import CheckReport, Finding, Rate, Severity, needs, note
 from splatctrl_cli.logs.state_columns import StateColumns
@@ -21,7 +22,7 @@ class Evidence:
     start_ns: None without a clock; num_frames: of the camera that has most. frames: reduced, a few of each camera
     whose poses are known; depth_units: [m] per count by camera, None where depth is stored as floats; motion: of the
     first images. states: joint states to compare, in the model's order where there is one; states_lack: what keeps
-    `replay` from them. cut: says that not all was read.
+    `replay` from them. cut: says that not all was read. is_guessed: the unit of its lengths.
     """
 
     path: Path
@@ -38,13 +39,17 @@ class Evidence:
     states: StateColumns | None
     states_lack: str
     cut: str = ""
+    is_guessed: bool = False
 
 
 def judged(evidence: Evidence, found: Sequence[Finding], model: RobotModel | None) -> CheckReport:
     """With what was found on the way, and what the frames and states say of each other."""
     findings = [*found, *alignment_findings(evidence.frames)]
-    views = check_views(usable_frames(evidence.frames, findings), evidence.depth_units)
+    frames, is_still = usable_frames(evidence.frames, findings), evidence.start_ns is None
+    is_sure = not is_still or not (evidence.is_guessed or are_far(frames))
+    views = check_views(frames, evidence.depth_units, is_sure=is_sure)
     findings += views.findings
+    findings += exposure_findings(views.corrected)
     if evidence.states is not None and not any(finding.code == "joints-degrees" for finding in findings):
         findings += motion_findings(views.corrected, evidence.motion, evidence.states, model)
     findings += [note("quick", evidence.path.name, evidence.cut)] if evidence.cut else []

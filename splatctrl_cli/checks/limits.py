@@ -98,6 +98,7 @@ VIEWS_SAME_FIT = 0.9  # of the best share of points, for another to be as good
 VIEWS_OTHER_SCALE = 0.08  # of its logarithm, that a scale must differ from 1 to be named
 VIEWS_TRUSTED = 0.2  # of the most points that land: with so many that fit, depths are taken as they are
 VIEWS_UNUSUAL = 0.75  # of the largest usual depth: beyond it views that do not meet are doubtful
+VIEWS_FAR = 10.0  # times the depth, by which cameras of a still scene may be apart
 VIEWS_BESIDE = (1 / 1.5, 1.5)  # of the best scale: where one of them fits as well, the scale is not determined
 VIEWS_MORE_FIT = 0.07  # by which more points must fit
 VIEWS_TIMES_FIT = 1.12  # times as many points must fit
@@ -128,3 +129,7 @@ PIXEL_CORRELATION = 0.3  # of motion pixel by pixel, which noise and the backgro
 OFFSET_LEAD = 0.05  # over the next best peak
 PIXEL_ERROR = 0.15  # of the time between frames: found on the simulated log, per camera (docs/replay.md)
 OFFSET_SUM_ERROR = 1.0  # likewise
+
+# Exposure: images of one camera against each other
+EXPOSURE_FRAMES = 8  # of a camera
+EXPOSURE_RATIO = 0.05  # by which one image is brighter than another, from which on that is named

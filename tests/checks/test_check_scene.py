@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.calibration.exposure import exposed
 from splatctrl_cli.checks.check_arm import motion_findings
+from splatctrl_cli.checks.check_exposure import exposure_findings
 from splatctrl_cli.checks.check_images import alignment_findings
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_states import log_states
@@ -97,6 +99,16 @@ def test_a_camera_that_stands_elsewhere_is_named_with_its_move(
     original = next(f for f in table.frames if f.camera == "cam1").T_world_camera
     corrected = next(f for f in check.corrected if f.camera == "cam1").T_world_camera
     assert np.abs(corrected - original)[:3, 3].max() < 0.005
+
+
+def test_a_camera_of_automatic_exposure_is_named_with_its_ratio(table: Table) -> None:
+    assert exposure_findings(table.few) == []
+    stamps = sorted({frame.stamp_ns for frame in table.few})
+    brighter = {stamp: 1.0 - 0.2 * k / (len(stamps) - 1) for k, stamp in enumerate(stamps)}
+    off = [exposed(f, np.full(3, brighter[f.stamp_ns])) if f.camera == "cam1" else f for f in table.few]
+    (finding,) = exposure_findings(off)
+    assert (finding.code, finding.where, finding.severity) == ("exposure", "camera cam1", Severity.NOTE)
+    assert finding.value == pytest.approx(25.0, abs=4.0)
 
 
 def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
