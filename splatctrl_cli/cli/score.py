@@ -24,6 +24,7 @@ OF_FITS: dict[str, object] = {
 COLUMNS = {
     "psnr_seen": "dB seen",
     "psnr_all": "dB all",
+    "psnr_all_corrected": "dB corrected",
     "psnr_masked": "dB mask",
     "ssim_seen": "SSIM seen",
     "ssim_all": "SSIM all",
@@ -32,6 +33,7 @@ COLUMNS = {
     "lpips_published": "LPIPS publ.",
     "depth_median_seen": "depth mm seen",
     "depth_median_all": "depth mm all",
+    "depth_median_all_corrected": "depth mm corrected",
     "in_front_seen": "in front",
     "seen_share": "seen",
     "mask_share": "mask",
@@ -114,6 +116,8 @@ def _lines_of_views(report: Mapping[str, Any]) -> list[str]:
     )
     if "chamfer" in metrics:
         lines += _cloud_lines(metrics, report["protocol"]["definitions"]["cloud"])
+    if "psnr_all_corrected" in columns:
+        lines.append("corrected: all pixels, at the pose and exposure that the view has among the training views")
     lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
     if metrics["free_mass"] is not None:
         lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")
