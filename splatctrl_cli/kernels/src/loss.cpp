@@ -13,26 +13,13 @@
 namespace splatctrl {
 namespace {
 
-constexpr int kHalf = 5;    // of the window, around its centre
+constexpr int kHalf = kHalfWindow;
 constexpr int kBand = 40;   // rows of a chunk of work: its buffers, 10 rows more, stay in a core's cache
 constexpr int kMaps = kBand + 2 * kHalf, kInputs = kBand + 4 * kHalf;  // rows that a band needs of SSIM, of the images
 constexpr int kMargin = 8;  // columns of zeros on each side of a row
-constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-constexpr float kOpaqueEnough = 0.1f;  // below this a normalised depth means nothing
 const Int8 kLane = {0, 1, 2, 3, 4, 5, 6, 7};
 
-struct Window {
-  float weight[kHalf + 1];  // by distance from the centre
-  Window() {
-    double sum = 0.0, value[kHalf + 1];
-    for (int k = 0; k <= kHalf; ++k) {
-      value[k] = std::exp(-k * k / (2.0 * 1.5 * 1.5));
-      sum += k == 0 ? value[k] : 2.0 * value[k];
-    }
-    for (int k = 0; k <= kHalf; ++k) weight[k] = static_cast<float>(value[k] / sum);
-  }
-};
-const Window kWindow;
+constexpr Window kWindow;
 
 // The window's sum along a row (step 1) or a column (step = stride of the rows), eight pixels at a time.
 inline Float8 window_sum(const float* p, std::ptrdiff_t step) {

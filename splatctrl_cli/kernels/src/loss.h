@@ -5,16 +5,9 @@
 #include <memory>
 #include <vector>
 
-namespace splatctrl {
+#include "loss_weights.h"
 
-struct LossWeights {
-  float dssim;       // lambda: share of D-SSIM in the colour loss
-  float color;       // lambda_color
-  float depth;       // lambda_depth
-  float opacity;     // lambda_opacity: of the mean transmittance where there is depth (not in the paper)
-  bool normalised;   // compare depth divided by accumulated opacity instead of eq. 3 as printed
-  float background[3];  // seen through what the splats leave transparent: C + (1 - opacity) background is compared
-};
+namespace splatctrl {
 
 struct LossTerms {
   double l1 = 0.0;     // mean |C - C_gt| over pixels and channels

@@ -1,24 +1,12 @@
-// Adam on the splats' parameters (N, 8): centre (3) [m], log radius, colour (3), logit opacity; with the chain rule
-// from image derivatives, the opacity regulariser, and the noise of 3DGS-MCMC after the update.
+// The step of splat_step.h on parameters (N, 8).
 #pragma once
 
 #include <cstdint>
 
 #include "raster.h"
+#include "splat_step.h"
 
 namespace splatctrl {
-
-constexpr int kNumParameters = 8;
-
-struct OptimiserSettings {
-  float lr_center, lr_log_radius, lr_color, lr_logit_opacity;
-  float regulariser;        // lambda_reg / N: the derivative of lambda_reg * mean |alpha|
-  float noise;              // lambda_noise
-  float min_opacity;        // centre of the noise gate
-  float min_radius, max_radius;  // [m]
-  float radius_depth;       // [m] at which a splat may be max_radius large, and in proportion elsewhere; 0: everywhere
-  std::uint64_t seed;       // of this step's noise
-};
 
 struct SplatState {
   float* parameters;        // (N, 8)

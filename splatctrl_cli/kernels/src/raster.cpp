@@ -14,7 +14,6 @@ namespace {
 
 constexpr int kProjectChunk = 512;
 constexpr int kListChunks = 16;  // of the depth order
-constexpr float kMargin = 0.01f;  // [px] more than rounding can take away from a footprint's extent
 
 // Stable, by the upper half of the keys.
 void radix_sort(std::vector<std::uint64_t>& keys, std::vector<std::uint64_t>& scratch) {
@@ -31,24 +30,6 @@ void radix_sort(std::vector<std::uint64_t>& keys, std::vector<std::uint64_t>& sc
     for (const std::uint64_t key : keys) scratch[place[pass][digit(key, pass)]++] = key;
     keys.swap(scratch);
   }
-}
-
-// The columns of tiles in which a footprint has a pixel of the rows dy in [low, high], measured from its mean;
-// exact but for the margin. An ellipse reaches furthest right at its rightmost point, or as near to it as the rows go.
-struct Columns {
-  int first, last;
-};
-
-Columns columns_of(const Footprint& f, const TileSplat& s, float low, float high, int tiles_x) {
-  const float rightmost = -f.b / f.c * f.half_width;
-  const auto half = [&s](float dy) { return std::sqrt(std::max(s.half2_level + s.half2_slope * dy * dy, 0.0f)); };
-  const float at_right = std::clamp(rightmost, low, high), at_left = std::clamp(-rightmost, low, high);
-  const float right = f.u + s.slope * at_right + half(at_right) + kMargin;
-  const float left = f.u + s.slope * at_left - half(at_left) - kMargin;
-  const auto tile = [tiles_x](float x) {
-    return static_cast<int>(std::floor(std::clamp(x / kTileWidth, -1.0f, static_cast<float>(tiles_x))));
-  };
-  return {std::max(tile(left + (-kTileWidth + 1)) + 1, 0), std::min(tile(right), tiles_x - 1)};
 }
 
 }  // namespace
@@ -107,14 +88,9 @@ void Rasteriser::list_tiles(const float* colors, int num_threads) {
       const Footprint& f = footprints_[index];
       const TileSplat& s = splats_[rank] = TileSplat(f, colors + 3 * static_cast<std::size_t>(index), index);
       const std::size_t before = tiles.size();
-      const auto band = [this](float y) {
-        return static_cast<int>(std::floor(std::clamp(y / kTileHeight, 0.0f, static_cast<float>(tiles_y_ - 1))));
-      };
-      for (int ty = band(f.v - f.half_height); ty <= band(f.v + f.half_height); ++ty) {
-        const float low = std::max(static_cast<float>(ty * kTileHeight) - f.v, -f.half_height);
-        const float high = std::min(static_cast<float>(ty * kTileHeight + kTileHeight - 1) - f.v, f.half_height);
-        if (low > high) continue;
-        const Columns columns = columns_of(f, s, low, high, tiles_x_);
+      const int last_row = tile_row(f.v + f.half_height, tiles_y_);
+      for (int ty = tile_row(f.v - f.half_height, tiles_y_); ty <= last_row; ++ty) {
+        const Columns<int> columns = tile_columns(f, s, ty, tiles_x_);
         for (int tx = columns.first; tx <= columns.last; ++tx) {
           tiles.push_back(ty * tiles_x_ + tx);
           ++counts[tiles.back()];

@@ -12,9 +12,6 @@ namespace {
 constexpr int kGroups = kTileWidth / 8, kBands = kTileHeight / 8;
 constexpr int kStrips = kGroups * kTileHeight;
 constexpr int kCheckEvery = 8;  // entries between two looks at which strips are still alive
-constexpr float kLog2E = 1.44269504f;
-constexpr float kLog2MinAlpha = -7.99435344f;    // log2(1 / 255)
-constexpr float kLog2MaxAlpha = -0.0144995697f;  // log2(0.99)
 const Float8 kLanes = {0, 1, 2, 3, 4, 5, 6, 7};
 static_assert(kStrips <= 32, "a StripMask has one bit for each strip");
 constexpr StripMask kColumn = kTileHeight == 32 ? ~0u : (1u << kTileHeight) - 1u;  // the strips of one column
@@ -41,7 +38,7 @@ StripMask reach(const TileSplat& s, const Rows& rows, int x0) {
   for (int band = 0; band < kBands; ++band) {
     const Float8 dy = load8(rows.dy + 8 * band);
     const Float8 half2 = dy * dy * s.half2_slope + s.half2_level;
-    const Float8 half = sqrt8(max8(half2, Float8{})) + 0.01f;  // [px] more than rounding can take away
+    const Float8 half = sqrt8(max8(half2, Float8{})) + kReachMargin;
     const Float8 low = dy * s.slope - half, high = dy * s.slope + half;
     for (int group = 0; group < kGroups; ++group) {
       const float first = static_cast<float>(x0 + 8 * group) - s.u;
@@ -165,12 +162,6 @@ struct StrokeGradient {
 };
 
 }  // namespace
-
-TileSplat::TileSplat(const Footprint& f, const float* color, int splat_index)
-    : u(f.u), v(f.v), xx(-0.5f * kLog2E * f.a), xy(-kLog2E * f.b), yy(-0.5f * kLog2E * f.c),
-      log2_opacity(std::log2(f.opacity)), features{color[0], color[1], color[2], f.depth}, slope(-f.b / f.a),
-      half2_level(f.level / f.a), half2_slope(f.b * f.b / (f.a * f.a) - f.c / f.a), opacity(f.opacity),
-      index(splat_index) {}
 
 void tile_forward(const TileImage& image, const TileSplat* splats, TileEntry* first, TileEntry* last,
                   float* planes) {

@@ -4,31 +4,16 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "projection.h"
+#include "tile_splat.h"
 
 namespace splatctrl {
 
-constexpr int kTileWidth = 16, kTileHeight = 16;  // [px], whole vectors of eight
-constexpr int kNumPlanes = 5;                     // red, green, blue, depth, accumulated opacity
+constexpr int kNumPlanes = 5;  // red, green, blue, depth, accumulated opacity
 
 // The derivative of a loss with respect to one splat on one image.
 struct SplatGradient {
   FootprintGradient footprint;
   float color[3];
-};
-
-// A footprint as the tiles read it: one cache line. alpha G is 2 to the power of
-// log2_opacity + xx dx^2 + xy dx dy + yy dy^2.
-struct alignas(64) TileSplat {
-  float u, v;
-  float xx, xy, yy, log2_opacity;
-  float features[4];                      // red, green, blue, depth
-  float slope, half2_level, half2_slope;  // in a row, it reaches columns slope dy +- sqrt(half2_level + half2_slope dy^2)
-  float opacity;
-  int index;                              // of the splat
-
-  TileSplat() = default;
-  TileSplat(const Footprint& footprint, const float* color, int splat_index);
 };
 
 // A tile is made of strips, eight pixels of a row each, numbered column by column: columns / 8 * kTileHeight + row.
