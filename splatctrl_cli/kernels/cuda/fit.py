@@ -1,0 +1,317 @@
+"""The fit's iterations on a device: the splats, Adam's state and the views stay there between calls.
+
+Shapes: N splats, (H, W) pixels, K tiles of 16 x 16 pixels. All sizes follow from the budget and the images; lists
+grow where they turn out too short, and the run is then repeated from where it began.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, Memory
+from splatctrl_cli.kernels.raster import (
+    Float32,
+    Float64,
+    LossTerms,
+    LossWeights,
+    Moments,
+    OptimiserSettings,
+    TargetView,
+)
+
+# As fit.h lays them out.
+CAMERA = np.dtype([("floats", "f4", 4), ("size", "i4", 2), ("T_camera_world", "f4", 12)])
+VIEW = np.dtype([("camera", CAMERA), ("per", "f4", 2), ("images", "u8", 3)])
+RUN = np.dtype(
+    [("settings", "f4", 10), ("seed", "u8"), ("weights", "f4", 4), ("normalised", "i4"), ("background", "f4", 3)]
+)
+COUNTERS = np.dtype([(n, "i4") for n in ("next", "now", "num_parts", "most_parts", "longest_list")])
+TILE, SPLAT_BYTES, NUM_SUMS, PATCH, NUM_TERMS = 16, 64, 10, 32, 5
+PROJECT_LANES = 4  # threads of a splat
+PROJECT, BLEND, LOSS, BACKWARD, STEP = 128, 128, 128, 64, 128  # threads in a block
+MOST_SPLATS = 1 << 24
+LEAST_TABLE = 1 << 16  # bytes, so that graphs outlive a longer schedule
+
+
+@dataclass(frozen=True, kw_only=True)
+class _DeviceView:
+    height: int
+    width: int
+    row: Array  # one VIEW
+    num_values: float
+    num_depths: float
+
+
+def camera_row(camera: Float64) -> Array:
+    """A `pack_camera` camera as the kernels read it."""
+    row = np.zeros((), CAMERA)
+    row["floats"], row["size"], row["T_camera_world"] = camera[:4], camera[4:6], camera[6:18]
+    return row
+
+
+class DeviceFit:
+    """The optimiser of N splats on a device."""
+
+    def __init__(self, device: Memory, num_splats: int, *, list_capacity: int = 512, part_capacity: int = 0) -> None:
+        if num_splats >= MOST_SPLATS:
+            raise DeviceError(f"num_splats: expected less than {MOST_SPLATS}, got {num_splats}")
+        self.device, self.num_splats = device, num_splats
+        self.views: list[_DeviceView] = []
+        self.list_capacity, self.part_capacity = list_capacity, part_capacity or 16 * max(num_splats, 256)
+        self._addresses: dict[str, int] = {}
+        self._sizes: dict[str, int] = {}
+        self._images: list[int] = []
+        n = num_splats
+        for name, size in {
+            "parameters": 32 * n, "first": 32 * n, "second": 32 * n, "num_steps": 4 * n, "gradients": 32 * n,
+            "splats": SPLAT_BYTES * n, "first_parts": 4 * n, "num_parts": 4 * n, "counters": COUNTERS.itemsize,
+            "run": RUN.itemsize,
+        }.items():  # fmt: skip
+            self._room(name, size)
+        for name in ("parameters", "first", "second", "num_steps"):
+            self._room(f"{name}_before", self._sizes[name])
+        self._room("parts", 4 * NUM_SUMS * self.part_capacity)
+        self._graphs: dict[tuple[int, int, str], Graph] = {}
+
+    def close(self) -> None:
+        """Give back the memory."""
+        for address in [*self._addresses.values(), *self._images]:
+            self.device.free(address)
+        self._addresses, self._images = {}, []
+
+    def put(self, parameters: Float32, moments: Moments) -> None:
+        """Splats (N, 8) and Adam's state, from the host."""
+        for name, values in self._state(parameters, moments).items():
+            self.device.write(self._addresses[name], values)
+
+    def take(self, parameters: Float32, moments: Moments) -> None:
+        """Splats (N, 8) and Adam's state, into the host's arrays."""
+        for name, values in self._state(parameters, moments).items():
+            self.device.read(self._addresses[name], values)
+
+    def add_view(self, camera: Float64, target: TargetView) -> int:
+        """A view that `run` may name by the number returned; its images stay on the device."""
+        height, width = target.depth.shape
+        num_values = 3.0 * max(int(np.count_nonzero(target.counted)), 1)
+        num_depths = int(np.count_nonzero((target.depth > 0) & (target.counted != 0)))
+        images = [self._image(values) for values in (target.color, target.depth.astype(np.float32), target.counted)]
+        row = np.zeros((), VIEW)
+        row["camera"] = camera_row(camera)
+        row["per"] = 1.0 / num_values, 1.0 / num_depths if num_depths else 0.0
+        row["images"] = images
+        view = _DeviceView(
+            height=height, width=width, row=row, num_values=num_values, num_depths=float(max(num_depths, 1))
+        )
+        self.views.append(view)
+        return len(self.views) - 1
+
+    def forget_views(self) -> None:
+        """Give back the images; numbers of views start from 0 again."""
+        for address in self._images:
+            self.device.free(address)
+        self.views, self._images = [], []
+
+    def run(
+        self, schedule: Sequence[int], weights: LossWeights, settings: OptimiserSettings, seed: int
+    ) -> dict[int, LossTerms]:
+        """An iteration on each view of the schedule; the loss of each at the last iteration that looked at it.
+
+        The noise of iteration k has seed `seed` + k.
+        """
+        if not schedule:
+            return {}
+        state = ("parameters", "first", "second", "num_steps")
+        for name in state:
+            self.device.copy(self._addresses[f"{name}_before"], self._addresses[name], self._sizes[name])
+        while True:
+            self.rewind(schedule, weights, settings, seed)
+            for size, group in groupby(schedule, lambda k: (self.views[k].height, self.views[k].width)):
+                self._graph(*size, "step").run(len(list(group)))
+            if self._fits():
+                return self._terms(schedule)
+            for name in state:
+                self.device.copy(self._addresses[name], self._addresses[f"{name}_before"], self._sizes[name])
+
+    def planes(self, view: int) -> Float32:
+        """Red, green, blue, depth and opacity (5, H, W) of a view."""
+        height, width = self.views[view].height, self.views[view].width
+        while True:
+            self.rewind([view], None, None, 0)
+            self._graph(height, width, "render").run()
+            if self._fits():
+                return self.read_image("planes", view, 5)
+
+    def gradients(self, view: int, weights: LossWeights, settings: OptimiserSettings) -> tuple[Float32, LossTerms]:
+        """The derivatives (N, 8) of the loss of a view by the parameters, which stay as they are; and the loss."""
+        height, width = self.views[view].height, self.views[view].width
+        while True:
+            self.rewind([view], weights, settings, 0)
+            self._graph(height, width, "gradients").run()
+            if self._fits():
+                out = np.empty((self.num_splats, 8), np.float32)
+                self.device.read(self._addresses["gradients"], out)
+                return out, self._terms([view])[view]
+
+    def list_lengths(self, view: int) -> NDArray[np.int32]:
+        """(K,) splats on the list of each tile, of the last launches on the view's size."""
+        height, width = self.views[view].height, self.views[view].width
+        out = np.empty(-(-height // TILE) * -(-width // TILE), np.int32)
+        self.device.read(self._addresses[f"num_entries {height} {width}"], out)
+        return out
+
+    def read_image(self, name: str, view: int, channels: int) -> Float32:
+        """What the last launch left in `planes`, `plane_gradients` or `maps` of the view's size (channels, H, W)."""
+        height, width = self.views[view].height, self.views[view].width
+        out = np.empty((channels, height, width), np.float32)
+        self.device.read(self._addresses[f"{name} {height} {width}"], out)
+        return out
+
+    def _state(self, parameters: Float32, moments: Moments) -> dict[str, Array]:
+        return {
+            "parameters": parameters, "first": moments.first, "second": moments.second,
+            "num_steps": moments.num_steps,
+        }  # fmt: skip
+
+    def _room(self, name: str, num_bytes: int) -> int:
+        """The address of a named piece of memory of at least that size; what it held is lost where it grows."""
+        if self._sizes.get(name, -1) < num_bytes:
+            if name in self._addresses:
+                self.device.free(self._addresses[name])
+            self._addresses[name] = self.device.allocate(num_bytes)
+            self._sizes[name] = num_bytes
+            self._graphs = {}
+        return self._addresses[name]
+
+    def _image(self, values: Array) -> int:
+        address = self.device.allocate(values.nbytes)
+        self.device.write(address, values)
+        self._images.append(address)
+        return address
+
+    def rewind(
+        self, schedule: Sequence[int], weights: LossWeights | None, settings: OptimiserSettings | None, seed: int = 0
+    ) -> None:
+        """Put a schedule before the next launches; without weights and settings to render only."""
+        run = np.zeros((), RUN)
+        if settings is not None and weights is not None:
+            s, w = settings, weights
+            run["settings"] = (
+                s.lr_center, s.lr_log_radius, s.lr_color, s.lr_logit_opacity, s.regulariser, s.noise, s.min_opacity,
+                s.min_radius, s.max_radius, s.radius_depth,
+            )  # fmt: skip
+            run["seed"] = seed
+            run["weights"] = w.dssim, w.color, w.depth, w.opacity
+            run["normalised"], run["background"] = w.normalised, w.background
+        views = np.array([view.row for view in self.views], VIEW)
+        for name, values in {
+            "run": run, "views": views, "schedule": np.asarray(schedule, np.int32),
+            "counters": np.zeros((), COUNTERS),
+        }.items():  # fmt: skip
+            self.device.write(self._room(name, max(values.nbytes, LEAST_TABLE)), values)
+        self._room("terms", max(8 * NUM_TERMS * len(self.views), LEAST_TABLE))
+
+    def _fits(self) -> bool:
+        """Whether every list had room; else they have more now."""
+        counters = np.zeros((), COUNTERS)
+        self.device.read(self._addresses["counters"], counters)
+        longest, most = int(counters["longest_list"]), int(counters["most_parts"])
+        if longest:
+            self.list_capacity = 1 << longest.bit_length()
+        if most:
+            self.part_capacity = most + most // 2
+            self._room("parts", 4 * NUM_SUMS * self.part_capacity)
+        if longest or most:
+            self._graphs = {}
+        return not longest and not most
+
+    def _terms(self, schedule: Sequence[int]) -> dict[int, LossTerms]:
+        sums = np.empty((len(self.views), NUM_TERMS))
+        self.device.read(self._addresses["terms"], sums)
+        terms = {}
+        for k in dict.fromkeys(schedule):
+            view, (l1, ssim, depth, transmittance, squared) = self.views[k], sums[k].tolist()
+            terms[k] = LossTerms(
+                l1=l1 / view.num_values,
+                dssim=(3.0 * view.height * view.width - ssim) / view.num_values,
+                depth=depth / view.num_depths,
+                transmittance=transmittance / view.num_depths,
+                squared=squared / view.num_values,
+            )
+        return terms
+
+    def _graph(self, height: int, width: int, what: str) -> Graph:
+        gradients = self._addresses["gradients"] if what == "gradients" else 0
+        launches = self.launches(height, width, gradients)
+        known = self._graphs.get((height, width, what))
+        if known is None:
+            known = self.device.record(launches[:2] if what == "render" else launches)
+            self._graphs[height, width, what] = known
+        return known
+
+    def launches(self, height: int, width: int, gradients: int = 0) -> list[Launch]:
+        """One iteration on a view of that size; `gradients`, if not 0, is where they go instead of a step."""
+        at: Callable[[str], int] = self._addresses.__getitem__
+        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        patches_x, patches_y = -(-width // PATCH), -(-height // PATCH)
+        tiles, patches, pixels = tiles_x * tiles_y, patches_x * patches_y, height * width
+
+        def image(name: str, num_bytes: int) -> int:
+            return self._room(f"{name} {height} {width}", num_bytes)
+
+        lengths, num_entries = image("list_lengths", 4 * tiles), image("num_entries", 4 * tiles)
+        slots = tiles * self.list_capacity
+        keys, list_parts, entries = (
+            image("keys", 8 * slots),
+            image("list_parts", 4 * slots),
+            image("entries", 8 * slots),
+        )
+        planes, plane_gradients = image("planes", 20 * pixels), image("plane_gradients", 20 * pixels)
+        maps = image("maps", 36 * pixels)
+        ssim, errors = image("patch_ssim", 12 * patches), image("patch_errors", 24 * patches)
+        depths = image("patch_depths", 8 * patches)
+        n, h, w = np.int32(self.num_splats), np.int32(height), np.int32(width)
+        capacity, most_parts = np.int32(self.list_capacity), np.int32(self.part_capacity)
+        per_patch = (patches_x, patches_y, 3)
+        now = (at("counters"), at("schedule"), at("views"))
+        run = at("run")
+        return [
+            Launch(
+                kernel="project", grid=(-(-self.num_splats * PROJECT_LANES // PROJECT), 1, 1), block=PROJECT,
+                arguments=(
+                    *now, at("parameters"), n, at("splats"), at("first_parts"), at("num_parts"), lengths, keys,
+                    list_parts, capacity, most_parts,
+                ),
+            ),
+            Launch(
+                kernel="blend", grid=(tiles, 1, 1), block=BLEND,
+                arguments=(
+                    at("counters"), at("splats"), lengths, keys, list_parts, capacity, most_parts, entries,
+                    num_entries, w, h, planes,
+                ),
+            ),
+            Launch(
+                kernel="ssim_derivatives", grid=per_patch, block=LOSS,
+                arguments=(*now, run, planes, w, h, maps, ssim),
+            ),
+            Launch(
+                kernel="loss_gradient", grid=per_patch, block=LOSS,
+                arguments=(*now, run, planes, maps, w, h, plane_gradients, errors, depths),
+            ),
+            Launch(
+                kernel="blend_backward", grid=(tiles, 1, 1), block=BACKWARD,
+                arguments=(
+                    run, at("splats"), entries, num_entries, capacity, planes, plane_gradients, w, h, at("parts"),
+                ),
+            ),
+            Launch(
+                kernel="step", grid=(-(-self.num_splats * 8 // STEP) + 1, 1, 1), block=STEP,
+                arguments=(
+                    *now, run, at("splats"), at("first_parts"), at("num_parts"), at("parts"), at("parameters"),
+                    at("first"), at("second"), at("num_steps"), n, ssim, errors, depths, np.int32(patches),
+                    at("terms"), gradients,
+                ),
+            ),
+        ]  # fmt: skip

@@ -1,0 +1,52 @@
+"""What the engine needs of a device: memory, and lists of kernel launches that are replayed as one graph."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+class DeviceError(RuntimeError):
+    """The device is not there, cannot be used, or has failed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Launch:
+    """One kernel: blocks in the grid (x, y, z), threads in a block; addresses are int, other arguments np.int32."""
+
+    kernel: str
+    grid: tuple[int, int, int]
+    block: int
+    arguments: tuple[Any, ...]
+
+
+class Graph(Protocol):
+    """Launches that run one after the other."""
+
+    def run(self, num_times: int = 1) -> None:
+        """Queue them, so many times."""
+
+
+class Memory(Protocol):
+    """What the engine needs of a device; addresses are int."""
+
+    def allocate(self, num_bytes: int) -> int:
+        """Memory of zeros."""
+
+    def free(self, address: int) -> None:
+        """Give it back."""
+
+    def write(self, address: int, values: Array) -> None:
+        """Copy an array there."""
+
+    def read(self, address: int, out: Array) -> None:
+        """Wait for what is queued, and copy from there."""
+
+    def copy(self, target: int, source: int, num_bytes: int) -> None:
+        """Copy within the device, after what is queued."""
+
+    def record(self, launches: Sequence[Launch]) -> Graph:
+        """Launches to be replayed."""

@@ -1,0 +1,49 @@
+"""Compiles the kernels at run time with NVRTC; the result is kept on disk between runs."""
+
+import hashlib
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from cuda.core import ObjectCode, Program, ProgramOptions
+from cuda.core.utils import FileStreamProgramCache, make_program_cache_key
+
+HERE = Path(__file__).parent
+FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include looks through them
+OLDEST = (7, 5)  # compute capability
+
+
+@cache
+def source_digest() -> bytes:
+    """Of every file that the kernels may include."""
+    digest = hashlib.sha256()
+    for folder in FOLDERS:
+        for path in sorted(p for p in folder.iterdir() if p.suffix in {"", ".h", ".cu", ".cuh"} and p.is_file()):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.digest()
+
+
+def compiled(capability: tuple[int, int], cache_folder: Path | None = None) -> Any:
+    """The kernels for a compute capability, as machine code; `cache_folder` is that of cuda-core unless given.
+
+    A cache that cannot be written costs the compilation only.
+    """
+    options = ProgramOptions(
+        name="fit.cu", arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
+    )
+    source = (HERE / "src" / "fit.cu").read_text()
+    key = make_program_cache_key(
+        code=source, code_type="c++", options=options, target_type="cubin", extra_digest=source_digest()
+    )
+    try:
+        store = FileStreamProgramCache(cache_folder)
+        known = store.get(key)
+    except OSError:
+        return Program(source, "c++", options).compile("cubin")
+    if known is not None:
+        return ObjectCode.from_cubin(known)
+    code = Program(source, "c++", options).compile("cubin")
+    with suppress(OSError):
+        store[key] = code
+    return code

@@ -1,0 +1,33 @@
+"""The kernels compile without a card, and what was compiled is kept."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("cuda.core", reason="needs the extra [cuda]")
+
+from splatctrl_cli.kernels.cuda import program
+
+
+@pytest.mark.parametrize("capability", [(7, 5), (8, 0), (9, 0), (12, 0)])
+def test_kernels_compile_for_every_generation(capability: tuple[int, int], tmp_path: Path) -> None:
+    assert program.compiled(capability, tmp_path).code[:4] == b"\x7fELF"
+
+
+def test_a_second_start_does_not_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = program.compiled((8, 0), tmp_path).code
+
+    def fails(*_: Any) -> None:
+        raise AssertionError("compiled again")
+
+    monkeypatch.setattr(program, "Program", fails)
+    assert program.compiled((8, 0), tmp_path).code == first
+    monkeypatch.setattr(program, "source_digest", lambda: b"changed")
+    with pytest.raises(AssertionError, match="compiled again"):
+        program.compiled((8, 0), tmp_path)
+
+
+def test_a_cache_that_cannot_be_written_costs_the_compilation_only(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert program.compiled((8, 0), tmp_path / "file").code[:4] == b"\x7fELF"
