@@ -22,7 +22,7 @@ from splatctrl_cli.records import Box
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
     if args.device == "cuda":
-        raise UsageError("--device cuda: this build has no CUDA kernels", remedy="give --device cpu")
+        raise UsageError("--device cuda: no command runs on a card yet", remedy="give --device cpu")
     config = load_config(args.config, args.set)  # refused before the source is opened
     if args.max_splats is not None:
         config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import (
     ImageLoss,
     LossTerms,
@@ -25,14 +26,23 @@ from splatctrl_cli.scene.render import BLACK, Color, Rendering, loss_weights
 class Descent:
     """The optimiser of a buffer's M splats; noise is drawn from the seed and the number of the iteration.
 
-    background: the colour behind the splats, None until it is chosen. heard: called after each iteration.
+    background: the colour behind the splats, None until it is chosen. heard: called after each iteration. device:
+    where the iterations of `run` are done, the processor if None; everything else is done on the processor.
     """
 
-    def __init__(self, config: SceneConfig, buffer: SplatBuffer, seed: int, num_threads: int) -> None:
+    def __init__(
+        self,
+        config: SceneConfig,
+        buffer: SplatBuffer,
+        seed: int,
+        num_threads: int,
+        device: DeviceFit | None = None,
+    ) -> None:
         self.num_iterations = 0
         self.background: Color | None = None
         self.heard: Callable[[], None] = lambda: None
         self._config, self._buffer, self._seed, self._num_threads = config, buffer, seed, num_threads
+        self._device = device
         self._raster = Rasteriser(num_threads)
         self._loss = ImageLoss(num_threads)
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
@@ -43,19 +53,42 @@ class Descent:
         """
         weights = self._weights()
         weights = replace(weights, depth=depth * weights.depth)
+        if self._device is not None:
+            return self._run_on(self._device, views, weights, settings)
         terms = {}
         for view in views:
             planes = self.planes(view)
             plane_gradients = np.empty_like(planes)
             terms[id(view)] = self._loss.evaluate(planes, view.target, weights, plane_gradients)
             self._raster.backward(planes, plane_gradients, self._gradients)
-            step_seed = (self._seed << 32) + self.num_iterations
             optimiser_step(
-                self._raster, self._gradients, self._buffer.parameters, self._buffer.moments, settings, step_seed
+                self._raster,
+                self._gradients,
+                self._buffer.parameters,
+                self._buffer.moments,
+                settings,
+                self._step_seed(),
             )
             self.num_iterations += 1
             self.heard()
         return terms
+
+    def _run_on(
+        self, device: DeviceFit, views: Sequence[View], weights: LossWeights, settings: OptimiserSettings
+    ) -> dict[int, LossTerms]:
+        different = {id(view): view for view in views}
+        device.forget_views()
+        numbers = {key: device.add_view(view.camera, view.target) for key, view in different.items()}
+        device.put(self._buffer.parameters, self._buffer.moments)
+        terms = device.run([numbers[id(view)] for view in views], weights, settings, self._step_seed())
+        device.take(self._buffer.parameters, self._buffer.moments)
+        for _ in views:
+            self.num_iterations += 1
+            self.heard()
+        return {key: terms[number] for key, number in numbers.items()}
+
+    def _step_seed(self) -> int:
+        return (self._seed << 32) + self.num_iterations
 
     def planes(self, view: View) -> Float32:
         """Red, green, blue, depth and opacity (5, H, W) of a view, as the rasteriser blends them."""

@@ -16,6 +16,7 @@ from splatctrl_cli.config.fixed import (
     SEED_MUCH_MORE,
 )
 from splatctrl_cli.kernels import num_threads
+from splatctrl_cli.kernels.cuda.fit import DeviceFit
 from splatctrl_cli.kernels.raster import LossTerms
 from splatctrl_cli.records import Bool, Box, Float32, Label, PointCloud, RgbdFrame, SplatSet, spread
 from splatctrl_cli.scene.audit_row import AuditRow, Refined
@@ -73,6 +74,7 @@ class SceneFitter:
         human: HumanConfig | None = None,
         seed: int = 0,
         threads: int = 0,
+        device: DeviceFit | None = None,
     ) -> None:
         check_voxel(config, occupancy)
         self.config = config
@@ -80,7 +82,7 @@ class SceneFitter:
         self.seed = seed
         self.num_threads = num_threads(threads)
         self.buffer = SplatBuffer(config.max_splats)
-        self.descent = Descent(config, self.buffer, seed, self.num_threads)
+        self.descent = Descent(config, self.buffer, seed, self.num_threads, device)
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
         self.people = PeopleMemory((human or HumanConfig()).memory)
         self.window = Window(config)

@@ -67,7 +67,7 @@ REFUSED: dict[str, list[Refusal]] = {
     ],
     "reconstruct": [
         ("", 2, "expected a SOURCE or --dtu ROOT, and not both"),
-        ("log.mcap --device cuda", 2, "--device cuda: this build has no CUDA kernels; give --device cpu"),
+        ("log.mcap --device cuda", 2, "--device cuda: no command runs on a card yet; give --device cpu"),
         ("log.mcap --spheres x.yaml", 2, "give --urdf"),
         ("log.mcap --urdf arm.urdf --spheres ball.yaml", 4, "joints not in the log: hinge; the log has: joint_a"),
         (
