@@ -24,6 +24,7 @@ CODE = re.compile(r"`([^`\n]+)`")
 PLACE = re.compile(r"([\w/]+\.(?:py|h|cpp))(?:: (.+))?")
 FOREIGN = {  # options of other programs
     "benchmarks.md": {"--demo"},
+    "gpu.md": {"--probe"},
     "reliability.md": {"--always-decode-chunk"},
 }
 EXAMPLE = ROOT / "docs" / "start.md"
