@@ -267,3 +267,52 @@ EXPORT_MIN_PSNR = 80.0  # [dB] of a format that rounds to float32 alone; measure
 EXPORT_DIFFERENCE = 3 / 255  # the last bit can take a splat across the renderer's cut-off of 1/255
 EXPORT_MAX_COLOR = 1e4  # of a sensor's 0 to 1, or of a harmonic; from 1e6 on an isotropic PLY looks otherwise
 EXPORT_VIEWS = 4  # around the scene
+
+# Calibration: cameras against each other and the robot
+STATES_CLOSE_NS = 100_000_000  # [ns] between a frame and the joint states around it
+CALIBRATION_FACING = 0.2  # cosine between a ray and the normal: more slanted surfaces are measured badly
+CALIBRATION_ALIKE = 0.5  # cosine between the normals of two views of one surface, at least
+CALIBRATION_BEND = 0.005  # of the depth, above which neighbouring pixels of a rendered link have an edge between them
+CALIBRATION_MOUNT = 2e-3  # [m], or of rotation entries, within which a camera rides on a link
+CALIBRATION_ARM_POINTS = 300  # of a frame
+CALIBRATION_PRIOR = (0.5, 0.5, 0.05, 0.5)  # [rad], [m], of depth scale and [m] of bias, [s]: very wide
+CALIBRATION_STEP = 0.2  # [rad], [m] or [s] that a round moves by, at most
+CALIBRATION_STILL = 5e-5  # [rad], [m] or [s]: a round that moves by less is the last
+CALIBRATION_ROUNDS = 30  # at most, after the widths have narrowed
+CALIBRATION_ROWS = 240  # of an image that is looked at
+CALIBRATION_ARM_ROWS = 120  # of an image in which the robot is looked for
+CALIBRATION_POINTS = (4000, 800)  # of a view of a camera that stands still, and of one that moves
+CALIBRATION_AVERAGED = 16  # frames of a still camera that err as if each for itself: more share a fixed pattern
+CALIBRATION_BASELINE = 16.0  # times a depth's noise, between the points that a normal is taken from
+CALIBRATION_ASIDE = 0.06  # [m] about the robot, that count as its own where what does not move is compared
+CALIBRATION_APART = 0.02  # [m] between two views that are laid over each other
+CALIBRATION_PAIRS = 300  # of views of moving cameras
+CALIBRATION_PROBE = (5e-4, 1e-2)  # [m] by which what is seen is moved, to see how the residuals change
+CALIBRATION_SPEED = 0.3  # [m/s] of the robot, that a clock's offset is counted with
+CALIBRATION_SIGMA = 0.02  # [m] of what is seen: a direction that is less sure is not observed
+CALIBRATION_CUT = 10.0  # sigmas that a residual counts as, at most, where starts are compared
+CALIBRATION_FEWEST = 100  # residuals that tie two cameras, or a camera and the robot
+CALIBRATION_REACHES = (0.15, 0.15, 0.15, 0.08, 0.08, 0.04, 0.04, 0.03)  # [m] of a residual that counts, by round
+CALIBRATION_ROUGH = 6  # rounds at the last reach, of a first look
+CALIBRATION_STARTS = 4  # beside that of the recording
+CALIBRATION_AROUND = (0.06, 0.05)  # [rad], [m] that they are away, at most
+CALIBRATION_TUKEY = 4.685  # sigmas from which on a residual does not count
+CALIBRATION_LEAST_SPREAD = 0.5  # of what sensors err by, that residuals are taken to err by at least
+CALIBRATION_FEW = (4, 60)  # frames of a camera, and pairs of views, of a first look
+CALIBRATION_HOLD = 0.02  # of the weight of all residuals, by which an estimate stays near its start at first
+CALIBRATION_CELL = 0.1  # of the depth, the edge of a cube in which the residuals between views err alike
+CALIBRATION_DEPTH_SURE = 5.0  # sigmas by which a scale or bias of depths must differ from 1 or 0 to be taken
+CALIBRATION_DEPTH_LEAST = 0.002  # [m] that they must change a depth by
+CALIBRATION_DEPTH_MOST = (0.3, 0.1)  # by which a scale, and [m] a bias, may differ from 1 and 0
+CALIBRATION_CLOCK = 0.02  # [s] within which a clock's offset must be known to be taken
+CALIBRATION_OTHER = (
+    0.01,
+    0.1,
+)  # [m] of what is seen that solutions differ by, and of the cost that one is better by
+CALIBRATION_RIVAL = 3.0  # times the best start's cost, up to which where another start leads is looked at, too
+CALIBRATION_FREED = (0.08, 0.08, 0.08, 0.05, 0.05, 0.05, 0.03)  # [m] the same, once depths are given a scale
+CALIBRATION_INFLATION = 1.7  # of every sigma: what errors of 28 simulated set-ups (seeds 1000 on) were of it, rms
+CALIBRATION_SCALES = (1.0, 1.1, 1 / 1.1)  # of depths, that a search begins at
+CALIBRATION_UNKNOWN = 1.0  # [m] the sigma of a direction that nothing is known of
+CALIBRATION_FRAMES = 30  # of a camera
+CALIBRATION_TRAVEL = 0.1  # [m] that some point of the robot must move, for its surface to be told from a wrong model

@@ -1,0 +1,292 @@
+"""The least squares of a calibration: distances between what cameras see, and from the robot's surface.
+
+Gauss-Newton on all of them together in float64, weighed by Tukey's biweight whose width narrows from round to round.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.calibration.evidence import Evidence
+from splatctrl_cli.calibration.unknowns import DEPTH, OF_CAMERA, POSE, Estimate, Unknowns, twist_between
+from splatctrl_cli.calibration.views import DepthView, Index, depth_sigma, landed, overlap_rows
+from splatctrl_cli.config import fixed
+from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.records import Float64, RgbdFrame
+
+ROBOT = "the robot"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """Residuals (M,) [m] of one pair of views, or of one frame and the robot, with what each may err by, sigma (M,);
+    jacobian (M, 17) by the unknowns of the two cameras and the clock, which stand in `columns` (17,). between: whose
+    they are; clusters (M,): residuals of one number, of all rows of one word `alike`, err alike; num_laid: points
+    that should lie on what the other sees, those beyond the reach included.
+    """
+
+    between: tuple[str, str]
+    alike: str
+    num_laid: int
+    residual: Float64
+    sigma: Float64
+    jacobian: Float64
+    columns: Index
+    clusters: Index
+
+
+@dataclass(frozen=True, kw_only=True)
+class Widths:
+    """How far residuals may be from 0 and count: reach [m], beyond which nothing is laid on each other, and cut, in
+    sigmas, None where the reach alone decides.
+    """
+
+    reach: float
+    cut: float | None = None
+
+
+@dataclass(kw_only=True)
+class Normal:
+    """The normal equations at an estimate: H (P, P), g (P,), and of each cluster its part of g, scores (C, P).
+
+    counts: residuals that count, by the two that they are between; spread: sigmas that the residuals err by (robust).
+    """
+
+    H: Float64
+    g: Float64
+    scores: Float64
+    counts: Mapping[tuple[str, str], int]
+    spread: float
+
+
+class Adjustment:
+    """The residuals of some evidence, and the estimate that makes them least."""
+
+    def __init__(self, evidence: Evidence, unknowns: Unknowns, basis: Float64 | None = None) -> None:
+        """basis (P, K): the directions that steps are taken in, None for all."""
+        self.evidence = evidence
+        self.unknowns = unknowns
+        self._basis = np.eye(unknowns.size) if basis is None else basis
+
+    def solved(
+        self, estimate: Estimate, schedule: Sequence[Widths], rounds: int = fixed.CALIBRATION_ROUNDS
+    ) -> Estimate:
+        """The estimate after a round of each of the widths, and as many more of the last ones at most, until it stays
+        where it is.
+        """
+        start, step = estimate, np.zeros(self.unknowns.size)
+        for number, widths in enumerate((*schedule, *(schedule[-1],) * rounds)):
+            normal = self.normal(estimate, widths)
+            step = self._step(normal, estimate, start, fixed.CALIBRATION_HOLD if number < len(schedule) - 1 else 0.0)
+            estimate = self.unknowns.moved(estimate, step)
+            if number >= len(schedule) and float(np.abs(step).max()) < fixed.CALIBRATION_STILL:
+                break
+        return estimate
+
+    def _step(self, normal: Normal, estimate: Estimate, start: Estimate, hold: float) -> Float64:
+        """Of Gauss-Newton; what nothing speaks of stays near where it began, and all else, too, by a share `hold` of
+        what the residuals weigh: while they still reach far, points laid on the wrong surface pull.
+        """
+        weight, offset = self._prior(estimate, start)
+        weight = weight + hold * float(np.trace(normal.H)) / len(weight)
+        V = self._basis
+        step = -V @ np.linalg.solve(V.T @ (normal.H + np.diag(weight)) @ V, V.T @ (normal.g + weight * offset))
+        return np.asarray(np.clip(step, -fixed.CALIBRATION_STEP, fixed.CALIBRATION_STEP))
+
+    def _prior(self, estimate: Estimate, start: Estimate) -> tuple[Float64, Float64]:
+        """Weight (P,) of a very wide prior about where the estimate began, and how far it is from there (P,)."""
+        sigma, offset = np.ones(self.unknowns.size), np.zeros(self.unknowns.size)
+        for camera in self.unknowns.cameras:
+            columns = self.unknowns.columns(camera)
+            (scale, bias), (scale_0, bias_0) = estimate.depth_of(camera), start.depth_of(camera)
+            moved = twist_between(start.corrections[camera], estimate.corrections[camera])
+            values = np.concatenate([moved, [scale - scale_0, bias - bias_0]])
+            held = columns < 0
+            sigma[columns[~held]] = np.repeat(fixed.CALIBRATION_PRIOR[:3], (3, 3, DEPTH))[~held]
+            offset[columns[~held]] = values[~held]
+        if self.unknowns.has_clock:
+            sigma[-1], offset[-1] = fixed.CALIBRATION_PRIOR[3], estimate.clock - start.clock
+        return 1 / np.square(sigma), offset
+
+    def normal(self, estimate: Estimate, widths: Widths, *, with_robot: bool = True) -> Normal:
+        """The normal equations; with_robot: also of the robot's surface."""
+        P = self.unknowns.size
+        H, g = np.zeros((P, P)), np.zeros(P)
+        scores: list[Float64] = []
+        numbers: dict[tuple[str, int], int] = {}
+        counts: dict[tuple[str, str], int] = {}
+        deviations: list[Float64] = []
+        for rows in self.rows(estimate, widths.reach, with_robot=with_robot):
+            if not len(rows.residual):
+                continue
+            deviation = np.abs(rows.residual) / rows.sigma
+            cut = widths.reach / rows.sigma
+            if widths.cut is not None:
+                cut = np.minimum(cut, widths.cut)
+            weight = np.where(deviation < cut, np.square(1 - np.square(deviation / cut)), 0.0)
+            is_free = rows.columns >= 0
+            columns, J = rows.columns[is_free], rows.jacobian[:, is_free] / rows.sigma[:, None]
+            weighed = J * weight[:, None]
+            part = np.einsum("k,kp->kp", rows.residual / rows.sigma, weighed)
+            np.add.at(H, np.ix_(columns, columns), weighed.T @ J)
+            np.add.at(g, columns, part.sum(axis=0))
+            cells, of_cell = np.unique(rows.clusters, return_inverse=True)
+            sums = np.zeros((len(cells), len(columns)))
+            np.add.at(sums, of_cell, part)
+            for cell, own in zip(cells.tolist(), sums, strict=True):
+                number = numbers.setdefault((rows.alike, cell), len(scores))
+                if number == len(scores):
+                    scores.append(np.zeros(P))
+                np.add.at(scores[number], columns, own)
+            counts[rows.between] = counts.get(rows.between, 0) + int((weight > 0).sum())
+            deviations.append(deviation)
+        every = np.concatenate(deviations) if deviations else np.zeros(0)
+        spread = 1.4826 * float(np.median(every)) if len(every) else 0.0
+        return Normal(H=H, g=g, scores=np.array(scores).reshape(-1, P), counts=counts, spread=spread)
+
+    def cost(self, estimate: Estimate, reach: float) -> tuple[float, int]:
+        """How badly the estimate fits: the mean square of residuals in sigmas, each cut at `CALIBRATION_CUT`, of
+        those between each two, and the mean of these; and how many points could be compared.
+        """
+        sums: dict[tuple[str, str], float] = {}
+        laid: dict[tuple[str, str], int] = {}
+        most = fixed.CALIBRATION_CUT**2
+        for rows in self.rows(estimate, reach):
+            own = float(np.minimum(np.square(rows.residual / rows.sigma), most).sum())
+            own += most * (rows.num_laid - len(rows.residual))
+            sums[rows.between] = sums.get(rows.between, 0.0) + own
+            laid[rows.between] = laid.get(rows.between, 0) + rows.num_laid
+        means = [sums[key] / laid[key] for key in sums if laid[key] >= fixed.CALIBRATION_FEWEST]
+        return (float(np.mean(means)) if means else most), sum(laid.values())
+
+    def distance(self, estimate: Estimate) -> float | None:
+        """How far [m] the points of a camera lie from what another, or the robot, shows there: the median of the
+        worst two, at most the first reach; None where nothing can be compared.
+        """
+        reach = fixed.CALIBRATION_REACHES[0]
+        between: dict[tuple[str, str], list[Float64]] = {}
+        for rows in self.rows(estimate, reach):
+            beyond = np.full(rows.num_laid - len(rows.residual), reach)
+            between.setdefault(rows.between, []).extend([np.abs(rows.residual), beyond])
+        laid = [np.concatenate(parts) for parts in between.values()]
+        return max((float(np.median(one)) for one in laid if len(one) >= fixed.CALIBRATION_FEWEST), default=None)
+
+    def rows(self, estimate: Estimate, reach: float, *, with_robot: bool = True) -> Iterator[Rows]:
+        """Every residual that is no larger than `reach` [m]."""
+        views = self.evidence.views
+        placed = [self._placed(view, estimate) for view in views]
+        for i, j in self.evidence.pairs:
+            yield self._overlap(views[i], views[j], *placed[i], *placed[j], estimate, reach)
+        for frame in self.evidence.frames if with_robot else ():
+            rows = self._robot(frame, estimate, reach)
+            if rows is not None:
+                yield rows
+
+    def _placed(self, item: DepthView | RgbdFrame, estimate: Estimate) -> tuple[Float64, Float64]:
+        """T_world_camera of a view or a frame, and how it moves with the clock, in the camera's frame."""
+        T, twist = self.evidence.recorded(item, estimate.clock)
+        correction = estimate.corrections[item.camera]
+        return T @ correction, _carried(twist, correction)
+
+    def _overlap(
+        self,
+        a: DepthView,
+        b: DepthView,
+        T_a: Float64,
+        twist_a: Float64,
+        T_b: Float64,
+        twist_b: Float64,
+        estimate: Estimate,
+        reach: float,
+    ) -> Rows:
+        """The points of view a from the surface of view b."""
+        (scale_a, bias_a), (scale_b, bias_b) = estimate.depth_of(a.camera), estimate.depth_of(b.camera)
+        points = a.points * (scale_a + bias_a / a.points[:, 2])[:, None]
+        T = invert_transform(T_b) @ T_a
+        there = transform_points(T, points)
+        lands, recorded, normals = landed(there, b)
+        z = np.where(lands, recorded[:, 2], 1.0)
+        surface = recorded * (scale_b + bias_b / z)[:, None]
+        behind, turned = there[:, 2] - surface[:, 2], a.point_normals @ T[:3, :3].T
+        lands &= (behind < 3 * reach) & (np.einsum("ki,ki->k", turned, there) < 0)  # else b cannot see them
+        lands &= np.any(normals != 0, axis=1)
+        num_laid = int(lands.sum())
+        lands &= (behind > -3 * reach) & (np.einsum("ki,ki->k", turned, normals) > fixed.CALIBRATION_ALIKE)
+        residual, by_a, by_b = overlap_rows(points, T, lands, surface, normals)
+        near = np.abs(residual) < reach
+        which = np.flatnonzero(lands)[near]
+        residual, by_a, by_b = residual[near], by_a[near], by_b[near]
+        own, other = a.points[which], recorded[which]
+        slope_a = np.einsum("ki,ki->k", by_a[:, 3:], own) / own[:, 2]
+        slope_b = np.einsum("ki,ki->k", by_b[:, 3:], other) / other[:, 2]
+        sigma = np.hypot(slope_a * depth_sigma(own[:, 2]), slope_b * depth_sigma(other[:, 2]))
+        return Rows(
+            between=(a.camera, b.camera),
+            alike="",
+            num_laid=num_laid,
+            residual=residual,
+            sigma=np.hypot(sigma, fixed.CALIBRATION_NOISE[0]),
+            jacobian=np.column_stack(
+                [
+                    by_a,
+                    slope_a * own[:, 2],
+                    slope_a,
+                    by_b,
+                    slope_b * other[:, 2],
+                    slope_b,
+                    by_a @ twist_a + by_b @ twist_b,
+                ]
+            ),
+            columns=np.concatenate(
+                [self.unknowns.columns(a.camera), self.unknowns.columns(b.camera), [self.unknowns.clock_column]]
+            ),
+            clusters=_cells(transform_points(T_b, there[which]), self.evidence.scale),
+        )
+
+    def _robot(self, frame: RgbdFrame, estimate: Estimate, reach: float) -> Rows | None:
+        """The points of a frame from the robot's surface."""
+        assert self.evidence.arm is not None
+        scale, bias = estimate.depth_of(frame.camera)
+        depth = np.where(frame.depth > 0, scale * frame.depth + bias, 0.0).astype(np.float32)
+        T, twist = self._placed(frame, estimate)
+        stamp_ns = frame.stamp_ns - round(estimate.clock * 1e9)
+        found = self.evidence.arm.rows(depth, frame.intrinsics, T, twist, stamp_ns, reach)
+        if found is None:
+            return None
+        some = slice(None, None, max(1, len(found.residual) // fixed.CALIBRATION_ARM_POINTS))
+        z = found.points[some, 2]
+        slope = np.einsum("ki,ki->k", found.normals[some], found.points[some]) / z
+        jacobian = np.zeros((len(z), 2 * OF_CAMERA + 1))
+        jacobian[:, :POSE] = found.jacobian[some]
+        jacobian[:, POSE], jacobian[:, POSE + 1] = slope * (z - bias) / scale, slope
+        jacobian[:, -1] = found.clock[some]
+        return Rows(
+            between=(frame.camera, ROBOT),
+            alike=frame.camera,
+            num_laid=found.num_seen * len(z) // max(len(found.residual), 1),
+            residual=found.residual[some],
+            sigma=np.hypot(slope * depth_sigma(z), fixed.CALIBRATION_NOISE[0]),
+            jacobian=jacobian,
+            columns=np.concatenate(
+                [self.unknowns.columns(frame.camera), np.full(OF_CAMERA, -1), [self.unknowns.clock_column]]
+            ),
+            clusters=found.links[some] * int(np.prod(fixed.CALIBRATION_TILES)) + found.tiles[some],
+        )
+
+
+def _cells(points_world: Float64, depth: float) -> Index:
+    """In which cube of the world each point (K, 3) lies: whatever cameras see it, they see the same errors of it.
+    depth [m]: that of most points.
+    """
+    x, y, z = np.floor(points_world / (fixed.CALIBRATION_CELL * depth)).astype(np.int64).T
+    return np.asarray((x * 1_000_003 + y) * 1_000_003 + z)
+
+
+def _carried(twist: Float64, T: Float64) -> Float64:
+    """A small motion (6,) of a frame, as that of a frame at T (4, 4) in it, in its own axes."""
+    if not twist.any():
+        return twist
+    turn, move = twist[:3], twist[3:]
+    R = T[:3, :3].T
+    return np.concatenate([R @ turn, R @ (move + np.cross(turn, T[:3, 3]))])

@@ -1,0 +1,202 @@
+"""How sure a calibration is: its covariance, and the directions that a recording says nothing of, in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.calibration.adjustment import Adjustment, Widths
+from splatctrl_cli.calibration.unknowns import POSE, Estimate, Unknowns
+from splatctrl_cli.calibration.views import DepthView
+from splatctrl_cli.config import fixed
+from splatctrl_cli.records import Float64
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Certainty:
+    """covariance (P, P) of the unknowns; reach (P, P) maps the unknowns to how far [m] what the cameras see moves."""
+
+    unknowns: Unknowns
+    covariance: Float64
+    reach: Float64
+
+    def of_camera(self, camera: str) -> Float64:
+        """Covariance (6, 6) of a camera's turn and move in its own frame; 0 of one that is held."""
+        columns = self.unknowns.columns(camera)[:POSE]
+        return np.zeros((POSE, POSE)) if columns[0] < 0 else self.covariance[np.ix_(columns, columns)]
+
+    def displacement(self, camera: str) -> Float64:
+        """The same of (turn about the middle of what it sees, as a length at its rim; move of that middle) (6, 6)."""
+        columns = self.unknowns.columns(camera)[:POSE]
+        if columns[0] < 0:
+            return np.zeros((POSE, POSE))
+        block = self.reach[np.ix_(columns, columns)]
+        return np.asarray(block @ self.of_camera(camera) @ block.T)
+
+    def sigma_depth(self, camera: str) -> tuple[float, float]:
+        """Of the scale and the bias [m] of its depths; 0 where they are held."""
+        columns = self.unknowns.columns(camera)[POSE:]
+        scale, bias = (0.0 if at < 0 else float(np.sqrt(self.covariance[at, at])) for at in columns)
+        return scale, bias
+
+    @property
+    def is_full(self) -> bool:
+        """Whether every direction of every camera is known within `CALIBRATION_SIGMA`."""
+        spreads = [np.linalg.eigvalsh(self.displacement(camera))[-1] for camera in self.unknowns.poses]
+        return max(spreads, default=0.0) <= fixed.CALIBRATION_SIGMA**2
+
+    @property
+    def sigma_clock(self) -> float:
+        """[s]; 0 where the clock is held."""
+        return float(np.sqrt(self.covariance[-1, -1])) if self.unknowns.has_clock else 0.0
+
+
+def certainty_of(adjustment: Adjustment, estimate: Estimate, widths: Widths) -> Certainty:
+    """Of an estimate that is solved.
+
+    ``A^-1 M A^-T`` (the sandwich of White, 1980): M sums the products of the gradients of clusters, whose residuals
+    err alike, so that their correlation is counted; A is how the gradient changes. Noise turns the normals of what
+    is flat, and the normal equations take that for shape; so the gradient between views is differentiated with its
+    points laid anew, where that cancels.
+    """
+    whole = adjustment.normal(estimate, widths)
+    between = adjustment.normal(estimate, widths, with_robot=False)
+    reach = _reach(adjustment, estimate)
+    back = np.linalg.inv(reach)
+    H, H_robot = back.T @ whole.H @ back, back.T @ (whole.H - between.H) @ back
+    num = len(whole.scores)
+    scores = whole.scores @ back * np.sqrt(num / max(num - len(H), 1))
+    M = scores.T @ scores
+    floor = 1e-9 * float(np.trace(H)) / len(H)
+    first = np.linalg.inv(H + floor * np.eye(len(H)))
+    variance, axes = np.linalg.eigh(first @ M @ first)
+    steps = np.clip(10 * np.sqrt(np.maximum(variance, 0.0)), *fixed.CALIBRATION_PROBE)
+    changes = []
+    for axis, step in zip(axes.T, steps, strict=True):
+        twist = back @ axis * step
+        ahead, behind = (
+            adjustment.normal(adjustment.unknowns.moved(estimate, sign * twist), widths, with_robot=False).g
+            for sign in (1.0, -1.0)
+        )
+        changes.append(back.T @ (ahead - behind) / (2 * step))
+    A = H_robot + np.column_stack(changes) @ axes.T
+    values, vectors = np.linalg.eigh(0.5 * (A + A.T))
+    error = np.sqrt(np.maximum(np.einsum("pk,pq,qk->k", vectors, M, vectors), 0.0))
+    surely = np.maximum(values, np.maximum(error / fixed.CALIBRATION_UNKNOWN, floor))
+    inverse = vectors / surely @ vectors.T
+    covariance = fixed.CALIBRATION_INFLATION**2 * back @ inverse @ M @ inverse @ back.T
+    return Certainty(
+        unknowns=adjustment.unknowns,
+        covariance=0.5 * (covariance + covariance.T),
+        reach=reach,
+    )
+
+
+def _reach(adjustment: Adjustment, estimate: Estimate) -> Float64:
+    """(P, P): the unknowns as displacements [m] of what the cameras see."""
+    unknowns = adjustment.unknowns
+    reach = np.eye(unknowns.size)
+    for camera in unknowns.cameras:
+        middle, radius = middle_of(adjustment, camera)
+        columns = unknowns.columns(camera)
+        pose, depth = columns[:POSE], columns[POSE:]
+        if pose[0] >= 0:
+            block = np.eye(POSE)
+            block[:3, :3] *= radius
+            block[3:, :3] = -_cross(middle)
+            reach[np.ix_(pose, pose)] = block
+        if depth[0] >= 0:
+            reach[depth[0], depth[0]] = np.linalg.norm(middle)
+    if unknowns.has_clock:
+        reach[-1, -1] = fixed.CALIBRATION_SPEED
+    return reach
+
+
+def middle_of(adjustment: Adjustment, camera: str) -> tuple[Float64, float]:
+    """The middle (3,) [m] of what a camera sees, in its frame, and how far [m] that reaches from there."""
+    points = [view.points for view in adjustment.evidence.views if view.camera == camera]
+    cloud = np.concatenate([*points, np.zeros((0, 3))])
+    if not len(cloud):
+        return np.array([0.0, 0.0, 1.0]), 0.3
+    middle = np.median(cloud, axis=0)
+    return middle, max(float(np.median(np.linalg.norm(cloud - middle, axis=1))), 0.05)
+
+
+def _cross(v: Float64) -> Float64:
+    """[v]x, so that ``[v]x w = v x w``."""
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plane:
+    """The largest plane that a camera sees: its unit normal (3,), world, and a name for it."""
+
+    normal: Float64
+    name: str
+
+
+def plane_of(view: DepthView, T_world_camera: Float64) -> Plane | None:
+    """That of a view; None where no direction has a quarter of its pixels."""
+    normals = view.normals.reshape(-1, 3)
+    normals = normals[np.any(normals != 0, axis=1)] @ T_world_camera[:3, :3].T
+    if len(normals) < 100:
+        return None
+    few = normals[:: max(1, len(normals) // 300)]
+    shares = np.mean(few @ normals.T > np.cos(np.radians(15)), axis=1)
+    best = int(np.argmax(shares))
+    if shares[best] < 0.25:
+        return None
+    near = normals[normals @ few[best] > np.cos(np.radians(15))]
+    normal = near.mean(axis=0) / np.linalg.norm(near.mean(axis=0))
+    return Plane(normal=normal, name="table" if abs(normal[2]) > 0.9 else "wall")
+
+
+def unobserved(certainty: Certainty, camera: str, T_world_camera: Float64, plane: Plane | None) -> tuple[str, ...]:
+    """The directions of a camera that are not known within `CALIBRATION_SIGMA`, in words."""
+    spread = certainty.displacement(camera)
+    values, vectors = np.linalg.eigh(spread)
+    unknown = vectors[:, values > fixed.CALIBRATION_SIGMA**2]
+    if not unknown.shape[1]:
+        return ()
+    names = dict.fromkeys(
+        name
+        for name, direction in _named_directions(plane)
+        if _share(unknown, np.concatenate([direction[0], direction[1]]), T_world_camera) > 0.5
+    )
+    return tuple(names) or ("a turn and a move together",)
+
+
+def _share(unknown: Float64, direction: Float64, T_world_camera: Float64) -> float:
+    """How much of a direction (turn, move) (6,), world, lies in the unknown ones (6, K), of the camera's frame."""
+    R = T_world_camera[:3, :3].T
+    own = np.concatenate([R @ direction[:3], R @ direction[3:]])
+    return float(np.sum(np.square(unknown.T @ own)))
+
+
+def _named_directions(plane: Plane | None) -> Sequence[tuple[str, tuple[Float64, Float64]]]:
+    """Turns and moves, world, with their names: along a plane's normal and in it, or along the axes of the world."""
+    zero = np.zeros(3)
+    if plane is None:
+        return [
+            *(
+                (f"translation along {name} of the world", (zero, axis))
+                for name, axis in zip(AXES, np.eye(3), strict=True)
+            ),
+            *(
+                (f"rotation about {name} of the world", (axis, zero))
+                for name, axis in zip(AXES, np.eye(3), strict=True)
+            ),
+        ]
+    normal = plane.normal
+    first = np.eye(3)[int(np.argmin(np.abs(normal)))]
+    first = first - normal * (first @ normal)
+    first /= np.linalg.norm(first)
+    within = (first, np.cross(normal, first))
+    return [
+        (f"translation along the {plane.name}'s normal", (zero, normal)),
+        *((f"translation in the {plane.name}'s plane", (zero, axis)) for axis in within),
+        (f"rotation about the {plane.name}'s normal", (normal, zero)),
+        *((f"rotation about axes in the {plane.name}'s plane", (axis, zero)) for axis in within),
+    ]

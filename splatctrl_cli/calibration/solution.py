@@ -1,0 +1,207 @@
+"""From evidence to a calibration: where to start, what to solve for, and whether one solution stands out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from splatctrl_cli.calibration.adjustment import ROBOT, Adjustment, Widths
+from splatctrl_cli.calibration.certainty import Certainty, certainty_of, middle_of
+from splatctrl_cli.calibration.evidence import Evidence
+from splatctrl_cli.calibration.unknowns import POSE, Estimate, Unknowns, twist_between
+from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import NotEvaluableError
+
+WIDE = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_REACHES)
+FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """The estimate, how sure it is, and the residuals that it makes least, within `widths`."""
+
+    estimate: Estimate
+    certainty: Certainty
+    adjustment: Adjustment
+    widths: Widths
+
+    def within_observed(self, start: Estimate) -> "Solution":
+        """Solved anew from a start in the directions alone that are known within `CALIBRATION_SIGMA`."""
+        adjustment, reach = self.adjustment, self.certainty.reach
+        values, vectors = np.linalg.eigh(reach @ self.certainty.covariance @ reach.T)
+        known = vectors[:, values <= fixed.CALIBRATION_SIGMA**2]
+        some = Adjustment(adjustment.evidence, adjustment.unknowns, np.linalg.solve(reach, known))
+        near = some.solved(replace(start, depth=self.estimate.depth, clock=self.estimate.clock), WIDE)
+        solution = _solution(some, some.solved(near, [narrow(some, near)]))
+        within = np.linalg.solve(reach, known @ known.T @ reach)
+        covariance = within @ solution.certainty.covariance @ within.T
+        return replace(solution, certainty=replace(solution.certainty, covariance=covariance))
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Cameras whose pose was taken as it is."""
+        unknowns = self.adjustment.unknowns
+        return tuple(camera for camera in unknowns.cameras if camera not in unknowns.poses)
+
+
+def solved(evidence: Evidence, start: Estimate, held: Sequence[str]) -> Solution:
+    """The calibration of all cameras but those that are held.
+
+    Raises NotEvaluableError where cameras cannot be tied to each other, and where two solutions fit alike.
+    """
+    cameras = evidence.cameras
+    free = [camera for camera in cameras if camera not in held]
+    adjustment = Adjustment(evidence, Unknowns(cameras=cameras, poses=free, has_clock=evidence.arm is not None))
+    few = Adjustment(evidence.thinned(), adjustment.unknowns)
+    rough = [few.solved(begin, WIDE, rounds=fixed.CALIBRATION_ROUGH) for begin in _starts(adjustment.unknowns, start)]
+    costs = _costs(few, rough)
+    order = np.argsort(costs, kind="stable").tolist()
+    _check_ties(adjustment, rough[order[0]])
+    best = _whole(adjustment, rough[order[0]], start)
+    near = [rough[i] for i in order[1:] if costs[i] < fixed.CALIBRATION_RIVAL * costs[order[0]]]
+    others = [one for one in near if _apart(best, one) > fixed.CALIBRATION_OTHER[0]]
+    if not others or not best.certainty.is_full:  # what is not observed is not told from another place
+        return best
+    other = _whole(adjustment, others[0], start)
+    return best if _apart(best, other.estimate) < fixed.CALIBRATION_OTHER[0] else _better(best, other)
+
+
+def _whole(adjustment: Adjustment, rough: Estimate, start: Estimate) -> Solution:
+    """The solution near a rough one, with all that the evidence shows to be needed."""
+    near = adjustment.solved(rough, [WIDE[-1]], rounds=2)
+    solution = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
+    unknowns = adjustment.unknowns
+    if unknowns.has_clock and solution.certainty.sigma_clock > fixed.CALIBRATION_CLOCK:
+        held = replace(solution.estimate, clock=start.clock)
+        still = Adjustment(adjustment.evidence, replace(unknowns, has_clock=False))
+        solution = _solution(still, still.solved(held, [solution.widths]))
+    return _with_depths(solution)
+
+
+def _costs(adjustment: Adjustment, estimates: Sequence[Estimate]) -> list[float]:
+    """How badly each estimate fits; where little can be compared, a good fit says nothing."""
+    fits = [adjustment.cost(one, WIDE[-1].reach) for one in estimates]
+    most = max(num for _, num in fits)
+    return [cost if 2 * num >= most else np.inf for cost, num in fits]
+
+
+def _better(a: Solution, b: Solution) -> Solution:
+    """Of two solutions that differ. Raises NotEvaluableError where they fit alike."""
+    (cost_a, num_a), (cost_b, num_b) = (one.adjustment.cost(one.estimate, WIDE[-1].reach) for one in (a, b))
+    if 2 * num_a < num_b or 2 * num_b < num_a:
+        return a if num_a > num_b else b
+    if abs(cost_a - cost_b) < fixed.CALIBRATION_OTHER[1] * min(cost_a, cost_b):
+        apart = 1e3 * _apart(a, b.estimate)
+        raise NotEvaluableError(
+            f"calibrate: two solutions that place what is seen {apart:.0f} mm apart fit alike",
+            remedy="put things of other shapes in view of all cameras, or give a start nearer to the truth"
+            " (--camera-pose)",
+        )
+    return a if cost_a < cost_b else b
+
+
+def _solution(adjustment: Adjustment, estimate: Estimate) -> Solution:
+    widths = narrow(adjustment, estimate)
+    certainty = certainty_of(adjustment, estimate, widths)
+    return Solution(estimate=estimate, certainty=certainty, adjustment=adjustment, widths=widths)
+
+
+def narrow(adjustment: Adjustment, estimate: Estimate) -> Widths:
+    """The last widths: Tukey's, in what the residuals really err by."""
+    spread = adjustment.normal(estimate, WIDE[-1]).spread
+    return Widths(reach=WIDE[-1].reach, cut=fixed.CALIBRATION_TUKEY * max(spread, fixed.CALIBRATION_LEAST_SPREAD))
+
+
+def _starts(unknowns: Unknowns, start: Estimate) -> list[Estimate]:
+    """The start, and others about it."""
+    rng = np.random.default_rng(0)
+    starts, num = [start], POSE * len(unknowns.poses)
+    for _ in range(fixed.CALIBRATION_STARTS if num else 0):
+        step = np.zeros(unknowns.size)
+        step[:num] = np.tile(np.repeat(fixed.CALIBRATION_AROUND, 3), num // POSE) * rng.uniform(-1, 1, num)
+        starts.append(unknowns.moved(start, step))
+    return starts
+
+
+def _apart(solution: Solution, other: Estimate) -> float:
+    """How far [m] another estimate places what a camera sees, in the middle and at the rim of it, the largest."""
+    apart = [0.0]
+    for camera in solution.adjustment.unknowns.poses:
+        middle, radius = middle_of(solution.adjustment, camera)
+        twist = twist_between(solution.estimate.corrections[camera], other.corrections[camera])
+        apart += [
+            float(np.linalg.norm(twist[3:] + np.cross(twist[:3], middle))),
+            radius * float(np.linalg.norm(twist[:3])),
+        ]
+    return max(apart)
+
+
+def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
+    """Raise NotEvaluableError naming cameras between which, and the robot, no surfaces are shared."""
+    evidence = adjustment.evidence
+    group = {name: {name} for name in (*evidence.cameras, ROBOT)}
+    for (a, b), count in adjustment.normal(estimate, WIDE[-1]).counts.items():
+        if count >= fixed.CALIBRATION_FEWEST and group[a] is not group[b]:
+            group[a] |= group[b]
+            for name in group[b]:
+                group[name] = group[a]
+    anchored = group[ROBOT] | {name for camera in evidence.moving for name in group[camera]}
+    parts = list({id(part): part for name, part in group.items() if name != ROBOT}.values())
+    loose = [part for part in parts if not part & anchored]
+    if len(loose) + bool(anchored - {ROBOT}) < 2:
+        return
+    names = " | ".join(sorted(", ".join(sorted(part - {ROBOT})) for part in parts))
+    robot = "" if evidence.arm is None else ", nor the robot"
+    raise NotEvaluableError(
+        f"calibrate: cameras that cannot be tied together: {names}: they see no surface in common{robot}",
+        remedy="record a scene that neighbouring cameras both see"
+        + (", or a robot that all see, with --urdf" if evidence.arm is None else "")
+        + ", or keep some with --cameras",
+    )
+
+
+def _with_depths(solution: Solution) -> Solution:
+    """With a scale for the depths of those cameras that show clearly that they need one, and then with a bias."""
+    for kind in ("scales", "biases"):
+        unknowns = solution.adjustment.unknowns
+        tried = _freed(solution, _with(unknowns, kind, unknowns.poses))
+        needed = [camera for camera in unknowns.poses if _needs(tried, camera, kind)]
+        if len(needed) == len(unknowns.poses):
+            solution = tried
+        elif needed:
+            solution = _freed(solution, _with(unknowns, kind, needed))
+    return solution
+
+
+def _with(unknowns: Unknowns, kind: str, cameras: Sequence[str]) -> Unknowns:
+    return replace(unknowns, scales=cameras) if kind == "scales" else replace(unknowns, biases=cameras)
+
+
+def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
+    """Solved anew with scales or biases, from the best of what several scales lead to at a first look."""
+    evidence = solution.adjustment.evidence
+    adjustment, few = Adjustment(evidence, unknowns), Adjustment(evidence.thinned(), unknowns)
+    estimates = []
+    for scale in fixed.CALIBRATION_SCALES if not unknowns.biases else (1.0,):
+        depth = {camera: (scale * solution.estimate.depth_of(camera)[0], 0.0) for camera in unknowns.scales}
+        begin = replace(solution.estimate, depth=depth)
+        estimates.append(few.solved(begin, FREED, rounds=fixed.CALIBRATION_ROUGH))
+    near = estimates[int(np.argmin(_costs(few, estimates)))]
+    return _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
+
+
+def _needs(tried: Solution, camera: str, kind: str) -> bool:
+    """Whether a scale or a bias is surely not 1 or 0, changes the depths, and is not absurd."""
+    (scale, bias), sigmas = tried.estimate.depth_of(camera), tried.certainty.sigma_depth(camera)
+    if abs(scale - 1) > fixed.CALIBRATION_DEPTH_MOST[0] or abs(bias) > fixed.CALIBRATION_DEPTH_MOST[1]:
+        return False
+    off, sigma = (scale - 1, sigmas[0]) if kind == "scales" else (bias, sigmas[1])
+    change = off * _far(tried, camera) if kind == "scales" else off
+    return abs(off) > fixed.CALIBRATION_DEPTH_SURE * sigma and abs(change) > fixed.CALIBRATION_DEPTH_LEAST
+
+
+def _far(solution: Solution, camera: str) -> float:
+    """The depth [m] that nine of ten points of a camera are nearer than; 0 where it has none."""
+    seen = [view.points[:, 2] for view in solution.adjustment.evidence.views if view.camera == camera]
+    depths = np.concatenate(seen)
+    return float(np.percentile(depths, 90)) if len(depths) else 0.0
