@@ -63,6 +63,7 @@ class CaptureSource:
         header = read_capture_header(path)
         self.world_frame = str(header["world_frame"])
         self.has_clock = bool(header["has_clock"])
+        self.made_of = frozenset(header["sources"].values())  # sha256
         self.joint_names = tuple(header["joint_names"])
         self._cameras: dict[str, dict[str, Any]] = header["cameras"]
         self.cameras = tuple(self._cameras) if options.cameras is None else options.cameras

@@ -28,6 +28,7 @@ from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.state_messages import STATE_TYPES
 from splatctrl_cli.logs.survey import Survey, survey
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.sources.calibrated import correction_of
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
 SAID = (" are never closer than ", " images as ", "distortion model ")  # lacks that other findings name
@@ -62,6 +63,11 @@ def check_log(
     findings += [error("missing", log.path.name, *_parted(lack)) for lack in lacks]
     checked = [checked_camera(t, c, watch.images, found.tf, options) for t, c in rig if c is not None]
     of_states = log_states(found, options, model)
+    correction = correction_of(options, log.path.name)
+    if correction is not None:
+        checked = [replace(c, frames=tuple(map(correction.frame, c.frames))) for c in checked]
+        if of_states.states is not None:
+            of_states = replace(of_states, states=correction.states(of_states.states))
     first, last = _span(found)
     evidence = Evidence(
         path=log.path,

@@ -81,6 +81,7 @@ def add_source(add: Options) -> None:
     add("--world-frame FRAME", "tf frame of poses (default: root of the tf tree)")
     add("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m"))
     add("--pairing-tolerance S", "colour to depth, seconds", real(0, 3600, "s"), 0.02)
+    add("--calibration FILE.toml", "what calibrate wrote: poses, depths and clock of this recording", Path)
     add("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header")
     add("--joint-topic TOPIC", "JointState topic (default: /joint_states)")
     add("--root DIR", "folder of the images that a .toml describes", Path)

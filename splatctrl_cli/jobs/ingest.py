@@ -20,6 +20,7 @@ from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.resume import check_same_run, told_how_to_go_on
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.sources.calibrated import CalibratedSource
 from splatctrl_cli.sources.source import logged_descriptions, open_session
 
 
@@ -88,7 +89,9 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
     out = request.out or Path(request.paths[0].stem + ".capture")
     with stopwatch.stage("survey"):
         source = open_session(request.paths, options)
-        topics = source.joint_topics if isinstance(source, RosLogSource | CaptureSource) else None
+        topics = None
+        if isinstance(source, RosLogSource | CaptureSource | CalibratedSource):
+            topics = source.joint_topics
     if set(source.cameras) == {HOLDOUT}:
         given = ",".join(options.cameras or ())
         raise UsageError(f"--cameras {given}: leaves no camera to train with", remedy="name another, or leave it out")

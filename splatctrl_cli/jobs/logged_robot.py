@@ -11,6 +11,7 @@ from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.model_difference import model_difference
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
+from splatctrl_cli.sources.calibrated import CalibratedSource
 from splatctrl_cli.sources.source import logged_descriptions
 from splatctrl_cli.states.state_source import StateSource
 
@@ -42,7 +43,8 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
     """In words, that the poses of a log or capture are in another frame than the robot's root; empty where not."""
-    if not isinstance(source, RosLogSource | CaptureSource) or source.world_frame == file.root:
+    logged = RosLogSource | CaptureSource | CalibratedSource
+    if not isinstance(source, logged) or source.world_frame == file.root:
         return ""
     return f"the poses are in the frame '{source.world_frame}', not in that of its root '{file.root}'"
 

@@ -36,7 +36,8 @@ class SourceOptions:
     has none. human_topics: image topics by camera name, not 0 where a
     pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, instead of those recorded. depth_scale:
     [m per count] of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an
-    image folder that become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging.
+    image folder that become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging. calibration:
+    what `calibrate` wrote of the recording.
     """
 
     world_frame: str | None = None
@@ -53,6 +54,7 @@ class SourceOptions:
     root: Path | None = None
     holdout: tuple[str, ...] | None = None
     stamps: str = "header"
+    calibration: Path | None = None
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
         """Raise InputError where a person gave an option that means nothing for this kind of input."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from splatctrl_cli.calibration.calibration_file import describe_calibration, is_calibration
 from splatctrl_cli.captures.capture_header import is_capture, read_capture_header
 from splatctrl_cli.captures.capture_journal import check_not_partial
 from splatctrl_cli.config import OccupancyConfig
@@ -40,6 +41,8 @@ def describe(path: Path, options: SourceOptions | None = None) -> Summary:
         start = stream.read(16)
     if start.startswith(tuple(kind.magic for kind in CONTAINERS)) or path.suffix in (*SUFFIXES, *VIDEOS):
         return describe_log(open_log(path), options)
+    if path.suffix == ".toml" and is_calibration(path):
+        return describe_calibration(path)
     if path.suffix == ".toml":
         return _describe_images(path, open_image_folder(path, options), "image folder")
     if (layout := layout_of(path)) is not None:

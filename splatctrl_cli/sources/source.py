@@ -16,6 +16,7 @@ from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.logs.video_file import open_log
+from splatctrl_cli.sources.calibrated import calibrated
 
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]
 
@@ -29,6 +30,11 @@ def open_source(path: Path, options: SourceOptions | None = None, *, needs_depth
     options = options or SourceOptions()
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", remedy="check the path")
+    return calibrated(_opened(path, options, needs_depth=needs_depth), options)
+
+
+def _opened(path: Path, options: SourceOptions, *, needs_depth: bool) -> FrameSource:
+    """As recorded."""
     if path.suffix == ".toml" or (not is_capture(path) and has_views(path)):
         source = open_image_folder(path, options) if path.suffix == ".toml" else open_layout(path, options)
         if needs_depth and (refusal := lacks_depth(source)) is not None:
@@ -50,7 +56,8 @@ def open_session(paths: Sequence[Path], options: SourceOptions | None = None) ->
     Raises InputError as `open_source`, and where one of several is not a log.
     """
     log = open_logs(paths)
-    return open_source(paths[0], options) if log is None else RosLogSource(log, options or SourceOptions())
+    options = options or SourceOptions()
+    return open_source(paths[0], options) if log is None else calibrated(RosLogSource(log, options), options)
 
 
 def logged_descriptions(paths: Sequence[Path]) -> list[tuple[Path, RobotDescription]]:

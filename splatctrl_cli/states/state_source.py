@@ -20,6 +20,7 @@ from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.logs.survey import survey
 from splatctrl_cli.logs.video_file import open_log
 from splatctrl_cli.records import LossReport, Record
+from splatctrl_cli.sources.calibrated import calibrated
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.lerobot import is_lerobot
 from splatctrl_cli.states.state_csv import is_libfranka, libfranka_track, read_csv
@@ -27,7 +28,7 @@ from splatctrl_cli.states.state_table import ARRAY_FILES, dataset_track, describ
 
 _FOR_CAMERAS = (
     *("cameras", "camera_topics", "camera_poses", "camera_pose_topics"),
-    *("human_topics", "depth_scale", "world_frame"),
+    *("human_topics", "depth_scale", "world_frame", "calibration"),
 )
 _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 
@@ -85,17 +86,17 @@ def open_states(path: Path, options: SourceOptions, joints: Sequence[str]) -> Fr
         raw, file = dataset_track(path)
         return _of_table(path, (file,), raw, LossReport(notes=["times are seconds from the episode's begin"]))
     if is_capture(path):
-        return CaptureSource(path, options, joints)
+        return calibrated(CaptureSource(path, options, joints), options)
     if path.suffix == ".toml" or has_views(path):
         return open_source(path, options)
     return _of_log(path, open_log(path), options, joints)
 
 
-def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> RosLogSource | StateSource:
+def _of_log(path: Path, log: RawLog, options: SourceOptions, joints: Sequence[str]) -> FrameSource | StateSource:
     """With frames where the log's cameras can be used; else the states alone, with a note that says why."""
     default = SourceOptions()
     try:
-        return RosLogSource(log, options, joints)
+        return calibrated(RosLogSource(log, options, joints), options)
     except InputError as error:
         if any(getattr(options, name) != getattr(default, name) for name in _FOR_CAMERAS):
             raise  # somebody asked for these cameras

@@ -35,6 +35,7 @@ from splatctrl_cli.records import Float64, RecordSource, RgbdFrame, UInt8
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
+from splatctrl_cli.sources.calibrated import CalibratedSource
 from splatctrl_cli.splat_files.splats import read_ply
 from splatctrl_cli.states.state_source import open_states
 
@@ -250,6 +251,6 @@ def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSo
         )
     if request.evidence in source.cameras:
         source = open_states(request.log, training_options(request, source.cameras), model.joint_names)
-    if not isinstance(source, RosLogSource | CaptureSource):
+    if not isinstance(source, RosLogSource | CaptureSource | CalibratedSource):
         raise UsageError(f"{request.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
     return source

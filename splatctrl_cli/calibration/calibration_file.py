@@ -1,0 +1,216 @@
+"""``calibration.toml``: where cameras stand, what their depths and clocks are off by, and how sure that is."""
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.summary import Grid, Summary
+from splatctrl_cli.geometry import quat_from_rotation, transform_from
+from splatctrl_cli.records import Float64
+
+FORMAT, VERSION = "splatctrl-calibration", 1
+AGAIN = "write it again with `splatctrl calibrate`"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibratedCamera:
+    """One camera of a rig.
+
+    T (4, 4): T_world_camera of one that stands still, T_recorded_camera of one that moves; recorded (4, 4):
+    T_world_camera as the calibrated recording has it, None of one that moves. scale, bias [m]: the true depth is
+    ``scale depth + bias``. sigma_position (3,) [m], sigma_rotation (3,) [rad]: along and about the
+    axes of the world, of a moving camera its own; sigma_depth: of scale and bias. held: what was taken as it is;
+    unobserved: directions that the recording said nothing of, and that stayed as recorded.
+    """
+
+    T: Float64
+    recorded: Float64 | None
+    scale: float = 1.0
+    bias: float = 0.0
+    sigma_position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    sigma_rotation: tuple[float, ...] = (0.0, 0.0, 0.0)
+    sigma_depth: tuple[float, ...] = (0.0, 0.0)
+    covariance: Float64 = field(default_factory=lambda: np.zeros((6, 6)))
+    held: tuple[str, ...] = ()
+    unobserved: tuple[str, ...] = ()
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moves."""
+        return self.recorded is None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """What was found of a recording; clock [s]: a frame's stamp less that of the joint state at that instant, None
+    where it was not looked for; digests: sha256 of the recording's files, by name.
+    """
+
+    recording: str
+    world_frame: str
+    digests: Mapping[str, str]
+    cameras: Mapping[str, CalibratedCamera]
+    held: tuple[str, ...] = ()
+    clock: float | None = None
+    sigma_clock: float = 0.0
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """The TOML file of a calibration."""
+    lines = [
+        f"format = {_text(FORMAT)}",
+        f"version = {VERSION}",
+        f"recording = {_text(calibration.recording)}",
+        f"world_frame = {_text(calibration.world_frame)}",
+        f"held = {_list(map(_text, calibration.held))}  # taken as recorded",
+    ]
+    if calibration.clock is not None:
+        meaning = "# [s] a frame's stamp less that of the joint state at that instant"
+        lines += ["", "[clock]", f"offset = {calibration.clock!r}  {meaning}", f"sigma = {calibration.sigma_clock!r}"]
+    for name, camera in calibration.cameras.items():
+        where = "T_recorded_camera" if camera.moves else "T_world_camera"
+        axes = "its own" if camera.moves else "the world's"
+        lines += [
+            "",
+            f"[cameras.{_text(name)}]",
+            f"{'mount' if camera.moves else 'pose'} = {_pose_text(camera.T)}  # {where}: x, y, z [m], qx, qy, qz, qw",
+            *([] if camera.recorded is None else [f"recorded = {_pose_text(camera.recorded)}"]),
+            f"depth_scale = {float(camera.scale)!r}",
+            f"depth_bias = {float(camera.bias)!r}  # [m]",
+            f"sigma_position = {_numbers(camera.sigma_position)}  # [m], along {axes} axes",
+            f"sigma_rotation = {_numbers(camera.sigma_rotation)}  # [rad], about {axes} axes",
+            f"sigma_depth = {_numbers(camera.sigma_depth)}  # of depth_scale and depth_bias [m]",
+            f"held = {_list(map(_text, camera.held))}",
+            f"unobserved = {_list(map(_text, camera.unobserved))}",
+            f"covariance = {_list(_numbers(row) for row in camera.covariance)}  # of position, rotation",
+        ]
+    lines += [
+        "",
+        "[digests]  # sha256 of the recording",
+        *(f"{_text(k)} = {_text(v)}" for k, v in calibration.digests.items()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def read_calibration(path: Path) -> Calibration:
+    """The calibration in a file. Raises InputError where it is none, or damaged."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}", remedy="give what calibrate wrote") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not TOML: {error}", remedy=AGAIN) from None
+    if content.get("format") != FORMAT:
+        raise InputError(f"{path}: expected a calibration, got another file", remedy="give what calibrate wrote")
+    if content.get("version") != VERSION:
+        found = content.get("version")
+        raise InputError(f"{path}: expected version {VERSION}, got {found}", remedy="use a newer splatctrl")
+    try:
+        return _calibration(content)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: damaged: {type(error).__name__}: {error}", remedy=AGAIN) from None
+
+
+def is_calibration(path: Path) -> bool:
+    """Whether a TOML file is one."""
+    with path.open("rb") as stream:
+        return stream.read(64).startswith(f"format = {_text(FORMAT)}".encode())
+
+
+def describe_calibration(path: Path) -> Summary:
+    """What a file holds."""
+    calibration = read_calibration(path)
+    rows = [
+        [
+            name,
+            "moves" if camera.moves else "stands still",
+            f"{1e3 * max(camera.sigma_position):.2f}",
+            f"{np.degrees(max(camera.sigma_rotation)):.3f}",
+            f"{camera.scale:.5g}",
+            f"{1e3 * camera.bias:.1f}",
+            "; ".join((*camera.held, *(f"not observed: {text}" for text in camera.unobserved))) or "-",
+        ]
+        for name, camera in calibration.cameras.items()
+    ]
+    header = ("camera", "", "sigma mm", "sigma deg", "depth scale", "depth bias mm", "held")
+    facts: dict[str, object] = {
+        "recording": calibration.recording,
+        "world_frame": calibration.world_frame,
+        "held": list(calibration.held),
+        "clock_offset_s": calibration.clock,
+    }
+    return Summary(
+        path=str(path), kind="calibration", facts=facts, grids=(Grid(name="cameras", header=header, rows=rows),)
+    )
+
+
+def _calibration(content: Mapping[str, Any]) -> Calibration:
+    clock = content.get("clock")
+    return Calibration(
+        recording=str(content["recording"]),
+        world_frame=str(content["world_frame"]),
+        digests={str(name): str(value) for name, value in content["digests"].items()},
+        cameras={str(name): _camera(entry) for name, entry in content["cameras"].items()},
+        held=tuple(map(str, content["held"])),
+        clock=None if clock is None else _finite([clock["offset"]], 1)[0],
+        sigma_clock=0.0 if clock is None else _finite([clock["sigma"]], 1)[0],
+    )
+
+
+def _camera(entry: Mapping[str, Any]) -> CalibratedCamera:
+    moves = "mount" in entry
+    scale, bias = _finite([entry["depth_scale"], entry["depth_bias"]], 2)
+    if not 0.01 < scale < 100:
+        raise ValueError(f"depth_scale: {scale}")
+    covariance = np.array([_finite(row, 6) for row in entry["covariance"]])
+    if covariance.shape != (6, 6):
+        raise ValueError("covariance: expected 6 rows")
+    return CalibratedCamera(
+        T=_pose(entry["mount" if moves else "pose"]),
+        recorded=None if moves else _pose(entry["recorded"]),
+        scale=scale,
+        bias=bias,
+        sigma_position=_finite(entry["sigma_position"], 3),
+        sigma_rotation=_finite(entry["sigma_rotation"], 3),
+        sigma_depth=_finite(entry["sigma_depth"], 2),
+        covariance=covariance,
+        held=tuple(map(str, entry["held"])),
+        unobserved=tuple(map(str, entry["unobserved"])),
+    )
+
+
+def _finite(values: Sequence[Any], count: int) -> tuple[float, ...]:
+    numbers = tuple(float(value) for value in values)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise ValueError(f"expected {count} finite numbers, got {list(values)}")
+    return numbers
+
+
+def _pose(values: Sequence[Any]) -> Float64:
+    numbers = _finite(values, 7)
+    if abs(np.linalg.norm(numbers[3:]) - 1) > 1e-3:
+        raise ValueError(f"expected a unit quaternion, got {list(numbers[3:])}")
+    return transform_from(numbers[:3], numbers[3:])
+
+
+def _pose_text(T: Float64) -> str:
+    return _numbers([*T[:3, 3], *quat_from_rotation(T[:3, :3])])
+
+
+def _numbers(values: Any) -> str:
+    return _list(repr(float(value)) for value in values)
+
+
+def _list(texts: Any) -> str:
+    return f"[{', '.join(texts)}]"
+
+
+def _text(text: str) -> str:
+    """A basic string of TOML, whose escapes are those of JSON."""
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,224 @@
+"""A recording with the poses, depths and clock that a calibration says it should have."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from splatctrl_cli.calibration.calibration_file import CalibratedCamera, Calibration, read_calibration
+from splatctrl_cli.captures.capture import CaptureSource
+from splatctrl_cli.config import fixed
+from splatctrl_cli.datasets.folder_views import HOLDOUT
+from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.output import sha256
+from splatctrl_cli.geometry import interpolate_transform, invert_transform
+from splatctrl_cli.logs.joint_topics import JointTopics
+from splatctrl_cli.logs.messages import metres
+from splatctrl_cli.logs.ros_log import RosLogSource
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, decoded
+from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, RgbdFrame, by_stamp
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correction:
+    """A calibration as it is applied to the recording `where`."""
+
+    file: Path
+    calibration: Calibration
+    where: str
+
+    @property
+    def clock_ns(self) -> int:
+        """By how much the stamps of joint states are late against those of frames [ns], to be added to them."""
+        return round((self.calibration.clock or 0.0) * 1e9)
+
+    def camera(self, name: str) -> CalibratedCamera:
+        """A camera of the recording. Raises InputError for one that was not calibrated."""
+        cameras = self.calibration.cameras
+        if name == HOLDOUT and len(cameras) == 1:  # views of the one camera, held out
+            return next(iter(cameras.values()))
+        if name not in cameras:
+            raise InputError(
+                f"{self.where}: camera {name} is not in {self.file}, which has {', '.join(cameras)}",
+                remedy=f"calibrate it too, or leave it out with --cameras {','.join(cameras)}",
+            )
+        return cameras[name]
+
+    def pose(self, name: str, T_recorded: Float64) -> Float64:
+        """T_world_camera (4, 4) of what is recorded as such. Raises InputError where the calibration is not of it."""
+        camera = self.camera(name)
+        if camera.recorded is None:
+            return T_recorded @ camera.T
+        if _same(T_recorded, camera.recorded):
+            return camera.T
+        if _same(T_recorded, camera.T):
+            raise InputError(
+                f"{self.where}: camera {name} is already where {self.file} puts it", remedy="leave --calibration out"
+            )
+        off = 1e3 * float(np.linalg.norm(T_recorded[:3, 3] - camera.recorded[:3, 3]))
+        raise InputError(
+            f"{self.where}: camera {name} is not recorded where {self.calibration.recording}, which was calibrated,"
+            f" has it ({off:.1f} mm apart)",
+            remedy="calibrate this recording: the camera was moved, or its pose was set anew",
+        )
+
+    def depth(self, name: str, depth: Float32) -> Float32:
+        """A depth image [m] as it should be."""
+        camera = self.camera(name)
+        if (camera.scale, camera.bias) == (1.0, 0.0):
+            return depth
+        true = np.where(depth > 0, camera.scale * depth + camera.bias, 0.0)
+        return np.maximum(true, 0.0).astype(np.float32)
+
+    def states(self, states: StateColumns) -> StateColumns:
+        """Joint states on the clock of the frames."""
+        return replace(states, stamp_ns=states.stamp_ns + self.clock_ns) if self.clock_ns else states
+
+    def frame(self, frame: RgbdFrame) -> RgbdFrame:
+        """A frame whose pose is already that of its own time by the robot's clock."""
+        T = self.pose(frame.camera, frame.T_world_camera)
+        return replace(frame, T_world_camera=T, depth=self.depth(frame.camera, frame.depth))
+
+    def notes(self, digests: Sequence[str]) -> list[str]:
+        """What a report says of it; digests: sha256 of the recording's files."""
+        text = f"poses, depths and clock are those of {self.file.name}"
+        if set(digests) == set(self.calibration.digests.values()):
+            return [text]
+        return [f"{text}, which was found of another recording ({self.calibration.recording})"]
+
+
+def correction_of(options: SourceOptions, where: str) -> Correction | None:
+    """What the options' calibration comes to; None where there is none. Raises InputError for a file that is none."""
+    if options.calibration is None:
+        return None
+    return Correction(file=options.calibration, calibration=read_calibration(options.calibration), where=where)
+
+
+def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
+    """The source, corrected where the options have a calibration. Raises InputError where that is not of it."""
+    correction = correction_of(options, source.name)
+    return source if correction is None else CalibratedSource(source, correction)
+
+
+class CalibratedSource:
+    """Records of another source as a calibration corrects them.
+
+    Joint states are moved to the clock of the frames. A moving camera is where the recording has it at the time of
+    its frame by the robot's clock, between its recorded poses.
+    """
+
+    def __init__(self, source: FrameSource, correction: Correction) -> None:
+        self.inner = source
+        self._correction = correction
+        if isinstance(source, CaptureSource) and sha256(correction.file) in source.made_of:
+            raise InputError(
+                f"{source.name}: was ingested with {correction.file}", remedy="leave --calibration out: it is applied"
+            )
+        for camera in source.cameras:
+            correction.camera(camera)
+        self.name, self.cameras, self.joint_names = source.name, source.cameras, source.joint_names
+        self.has_clock, self.world_frame = source.has_clock, source.world_frame
+        self.states = correction.states(source.states)
+        for _, camera, T in self._first_poses():
+            correction.pose(camera, T)
+
+    @property
+    def joint_topics(self) -> JointTopics | None:
+        """The topics of the joint states, None where they are on another clock."""
+        if self._correction.clock_ns or not isinstance(self.inner, RosLogSource | CaptureSource):
+            return None
+        return self.inner.joint_topics
+
+    @property
+    def loss(self) -> LossReport:
+        """That of the source, with a note."""
+        loss = self.inner.loss
+        notes = self._correction.notes(list(self.inner.digests().values()))
+        return replace(loss, notes=[*loss.notes, *notes])
+
+    def records(self) -> Iterator[Record]:
+        """Joint states and frames by stamp."""
+        return decoded(self.stored())
+
+    def stored(self) -> Iterator[StoredFrame | JointState]:
+        """Joint states and stored frames by stamp."""
+        return by_stamp(self.states, self._frames())
+
+    def poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
+        return ((stamp, camera, self._pose(stamp, camera, T)) for stamp, camera, T in self.inner.poses())
+
+    def digests(self) -> dict[str, str]:
+        """sha256 of the source's files, and of the calibration."""
+        return {**self.inner.digests(), self._correction.file.name: sha256(self._correction.file)}
+
+    def _frames(self) -> Iterator[StoredFrame]:
+        for item in self.inner.stored():
+            if isinstance(item, StoredFrame):
+                yield self._corrected(item)
+
+    def _corrected(self, stored: StoredFrame) -> StoredFrame:
+        T = self._pose(stored.stamp_ns, stored.camera, stored.T_world_camera)
+        camera = self._correction.camera(stored.camera)
+        if (camera.scale, camera.bias) == (1.0, 0.0):
+            return replace(stored, T_world_camera=T)
+        unit = stored.depth_unit
+        if unit is None or camera.bias:
+            return replace(
+                stored,
+                T_world_camera=T,
+                read_depth=lambda: self._correction.depth(stored.camera, stored.depth),
+                depth_unit=None,
+                depth_file=None,
+            )
+        scaled = unit * camera.scale
+
+        def counted() -> Float32:
+            return metres(np.rint(stored.depth / np.float32(unit)).astype(np.uint16), scaled)
+
+        return replace(stored, T_world_camera=T, read_depth=counted, depth_unit=scaled)
+
+    def _pose(self, stamp_ns: int, camera: str, T_recorded: Float64) -> Float64:
+        if self._correction.clock_ns and self._correction.camera(camera).moves:
+            T_recorded = _between(*self._paths[camera], stamp_ns - self._correction.clock_ns)
+        return self._correction.pose(camera, T_recorded)
+
+    @cached_property
+    def _paths(self) -> dict[str, tuple[list[int], list[Float64]]]:
+        """Stamps [ns] and recorded poses by camera."""
+        paths: dict[str, tuple[list[int], list[Float64]]] = {}
+        for stamp, camera, T in self.inner.poses():
+            stamps, poses = paths.setdefault(camera, ([], []))
+            stamps.append(stamp)
+            poses.append(T)
+        return paths
+
+    def _first_poses(self) -> Iterator[tuple[int, str, Float64]]:
+        """Of each camera."""
+        seen: set[str] = set()
+        for stamp, camera, T in self.inner.poses():
+            if camera not in seen:
+                seen.add(camera)
+                yield stamp, camera, T
+                if len(seen) == len(self.cameras):
+                    return
+
+
+def _between(stamps: list[int], poses: list[Float64], stamp_ns: int) -> Float64:
+    """The pose (4, 4) at a time between those of a path, its end beyond it."""
+    after = int(np.searchsorted(stamps, stamp_ns))
+    if after in (0, len(stamps)):
+        return poses[min(after, len(stamps) - 1)]
+    share = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+    return interpolate_transform(poses[after - 1], poses[after], share)
+
+
+def _same(T_a: Float64, T_b: Float64) -> bool:
+    T = invert_transform(T_a) @ T_b
+    cosine = float(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))
+    is_near = float(np.linalg.norm(T[:3, 3])) < fixed.SAME_POSE_METRES
+    return is_near and float(np.degrees(np.arccos(cosine))) < fixed.SAME_POSE_DEGREES
