@@ -155,6 +155,24 @@ def _check(add: Options, parser: Parser) -> None:
     add_source(add)
 
 
+def _calibrate(add: Options, parser: Parser) -> None:
+    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, capture, folder of a dataset, or .toml of an image folder"
+    add("SOURCE", f"the recording to calibrate: {kinds}; {SEVERAL_LOGS}", Path, nargs="+")
+    add_output(add, "TOML file that commands take as --calibration", default="calibration.toml")
+    add("--urdf FILE", "place the cameras by this robot's surface, where its joint states have it", Path)
+    add(
+        "--hold CAMERA",
+        "what stays as recorded (default: the robot's base, without --urdf the first camera)",
+    )
+    add("--allow-unobserved", "write what the recording says, although not all can be told from it")
+    more = add.group("robot")
+    more("--spheres FILE", "its spheres (default: those of the URDF), for links without geometry", Path)
+    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
+    add_packages(more)
+    add_lock(more)
+    add_source(add)
+
+
 def _num_images(text: str) -> int:
     try:
         return int(text)
@@ -260,6 +278,12 @@ COMMANDS = {
         run="check:run",
         judges=True,
         options=_check,
+    ),
+    "calibrate": Command(
+        summary="place cameras against each other and the robot, from what they recorded",
+        examples=(f"calibrate {LOG} {ROBOT}", "calibrate two_cameras.toml --hold front -o rig.toml"),
+        run="calibrate:run",
+        options=_calibrate,
     ),
     "reconstruct": Command(
         summary="fit splats to a log, a capture or a DTU scan",

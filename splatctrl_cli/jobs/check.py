@@ -1,7 +1,7 @@
 """A check from its request to its result: what is wrong with a recording, before it costs an hour."""
 
 import statistics
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -57,7 +57,8 @@ def check(request: CheckRequest) -> CheckResult:
     """
     if request.num_images is not None and request.num_images < 1:
         raise UsageError(f"--quick {request.num_images}: expected 1 or more")
-    model, log = _robot(request), open_logs(request.paths)
+    model = posed_robot(request.paths, request.urdf, request.spheres, base=request.base, locked=request.locked)
+    log = open_logs(request.paths)
     other = "" if request.urdf is None or model is None else differs(model.urdf, request.paths)
     if log is None:
         report = check_folder(request.paths[0], request.options, model=model, num_images=request.num_images)
@@ -69,18 +70,30 @@ def check(request: CheckRequest) -> CheckResult:
     return CheckResult(report=report, verdict=verdict, exit_code=0 if request.fail_on == NEVER else verdict.exit_code)
 
 
-def _robot(request: CheckRequest) -> RobotModel | None:
-    urdf = None if request.urdf is None else read_urdf(request.urdf)
-    if urdf is None and request.spheres is not None:  # without spheres it is often none that can be used
-        urdf = logged_urdf(request.paths)
-    if urdf is None:
-        given = {"spheres": request.spheres, "base": request.base, "lock": request.locked or None}
+def posed_robot(
+    paths: Sequence[Path],
+    urdf: Path | None,
+    spheres: Path | None,
+    *,
+    base: tuple[float, ...] | None,
+    locked: Mapping[str, float],
+    packages: Sequence[Path] = (),
+) -> RobotModel | None:
+    """The robot of a URDF, with `spheres` alone the one that the recording describes; None without either.
+
+    base: its pose in world as x, y, z, qx, qy, qz, qw. Raises UsageError for what belongs to a robot, without one.
+    """
+    file = None if urdf is None else read_urdf(urdf)
+    if file is None and spheres is not None:  # without spheres it is often none that can be used
+        file = logged_urdf(paths)
+    if file is None:
+        given = {"spheres": spheres, "base": base, "lock": locked or None, "packages": packages or None}
         for name, value in given.items():
             if value is not None:
                 raise UsageError(f"--{name}: expected --urdf beside it")
         return None
-    T_world_base = None if request.base is None else transform_from(request.base[:3], request.base[3:])
-    return RobotModel.from_urdf(urdf, request.spheres, T_world_base=T_world_base, locked=request.locked)
+    T_world_base = None if base is None else transform_from(base[:3], base[3:])
+    return RobotModel.from_urdf(file, spheres, T_world_base=T_world_base, locked=locked, packages=packages)
 
 
 def _agreement(report: CheckReport) -> Iterator[Finding]:

@@ -1,0 +1,247 @@
+"""Truth against what `calibrate` finds on simulated set-ups: cameras about an arm at a table, wrongly recorded.
+
+    python -m benchmarks.calibration --setups 50 --csv bench_output/calibration.csv
+
+Each set-up is a log of 30 frames a camera. Its seed draws cameras, things, motion, how far the recorded poses are
+off, the clock of the joint states and, in every second one, the depth scale of one camera. A row of the CSV is one
+unknown.
+"""
+
+import argparse
+import csv
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.random_tabletop import random_things
+from benchmarks.scenes import SAMPLE, sample_robot
+from splatctrl_cli.calibration.unknowns import transform_of, twist_between
+from splatctrl_cli.cli.common import table
+from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.geometry import invert_transform, look_at
+from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
+from splatctrl_cli.logs.mcap_writer import mcap_log
+from splatctrl_cli.records import Float64, JointState, Record, RgbdFrame, by_stamp
+from splatctrl_cli.simulate import tabletop
+from splatctrl_cli.simulate.arm import HAND
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.recording import (
+    JOINT_RATE,
+    NOISES,
+    OPTICAL_FROM_LINK,
+    START_NS,
+    Recording,
+    RecordingOptions,
+    Scene,
+    Transform,
+)
+from splatctrl_cli.simulate.render import Renderer
+
+OPTIONS = RecordingOptions(duration_s=6.0, fps=5.0, color_rays=0)
+OFF = (np.radians(1.5), 0.02)  # [rad], [m]: standard deviations of recorded poses, about and along each axis
+CLOCK = 0.06  # [s] at most
+SCALE = 0.03  # of depths, at most
+POSTURES = 0.25  # [rad] about the sample's waypoints
+EYES = ((0.75, 0.6), (1.05, 1.0))  # [m] from the middle of the table, and above it
+TARGETS = ((0.30, -0.10, 0.0), (0.45, 0.10, 0.15))  # [m] that cameras look at
+WRIST = "wrist"
+T_HAND_WRIST = np.array([[0, -1, 0, 0.08], [1, 0, 0, 0], [0, 0, 1, 0.02], [0, 0, 0, 1.0]]) @ transform_of(
+    np.array([0.0, -0.25, 0.0, 0.0, 0.0, 0.0])
+)
+KINDS = ("robot", "cameras alone", "wrist")
+UNITS = {"position": ("mm", 1e3), "rotation": ("deg", 180 / np.pi), "clock": ("ms", 1e3), "depth scale": ("%", 1e2)}
+
+
+class SetUp(Recording):
+    """What a seed draws: three cameras that stand still; with `has_wrist` one of them, and one on the arm's hand."""
+
+    def __init__(self, seed: int, options: RecordingOptions = OPTIONS, *, has_wrist: bool = False) -> None:
+        self._rng = rng = np.random.default_rng([seed, 1])
+        super().__init__(replace(options, seed=seed), sample_robot(), self._scene(seed, options))
+        first = rng.uniform(0, 2 * np.pi)
+        self.cameras = tuple(
+            replace(camera, T_world_camera=_view(first + 2 * np.pi / 3 * number + rng.uniform(-0.4, 0.4), rng))
+            for number, camera in enumerate(self.cameras[: 1 if has_wrist else 3])
+        )
+        self.has_wrist = has_wrist
+        self.names = (*(camera.name for camera in self.cameras), *((WRIST,) if has_wrist else ()))
+        self.off = {name: transform_of(rng.normal(0, np.repeat(OFF, 3))) for name in self.names}
+        self.clock = float(rng.uniform(-CLOCK, CLOCK))
+        self.scale = float(1 + rng.uniform(-SCALE, SCALE)) if seed % 2 else 1.0
+
+    def _scene(self, seed: int, options: RecordingOptions) -> Scene:
+        waypoints = np.array(tabletop.WAYPOINTS) + self._rng.uniform(-POSTURES, POSTURES, (3, 7))
+        motion = Motion(times=np.array([0.06, 0.5, 0.94]) * options.duration_s, waypoints=waypoints)
+        third = round(options.duration_s * 1e9) // 3
+        visitor = tabletop.visitor(START_NS + third, START_NS + 2 * third)
+        things = (*tabletop.furniture(), *random_things(seed), visitor)
+        return Scene(primitives=things, temporary=(visitor,), motion=motion)
+
+    def joint_states(self) -> Iterator[JointState]:
+        """From before the first frame to after the last, by the robot's clock."""
+        for index in range(-10, int(self.options.duration_s * JOINT_RATE) + 10):
+            position, velocity = self._motion.at(index / JOINT_RATE)
+            stamp_ns = self.start_ns + index * 10**9 // JOINT_RATE - round(self.clock * 1e9)
+            yield JointState(stamp_ns=stamp_ns, position=position, velocity=velocity)
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        """Of cameras that stand still, the first of which measures depths wrongly, and of the one that moves."""
+        for frame in super().frames():
+            is_first = frame.camera == self.names[0]
+            yield replace(frame, depth=frame.depth / np.float32(self.scale)) if is_first else frame
+            if self.has_wrist:
+                yield self._from_hand(frame.stamp_ns)
+
+    def _from_hand(self, stamp_ns: int) -> RgbdFrame:
+        poses = self.link_poses(self._motion.at((stamp_ns - self.start_ns) * 1e-9)[0])
+        camera = replace(self.cameras[0], name=WRIST, T_world_camera=poses[HAND] @ T_HAND_WRIST)
+        arm = tabletop.arm_solids(self.robot.urdf.shapes, poses)
+        depth = Renderer(camera, [*self.primitives[:-1], *arm], color_rays=0).depth([])
+        noise = NOISES[self.options.noise]
+        if noise is not None:
+            depth = noise.applied(depth, np.random.default_rng([self.options.seed, stamp_ns]))
+        return RgbdFrame(
+            stamp_ns=stamp_ns,
+            camera=WRIST,
+            color=np.zeros((*depth.shape, 3), np.uint8),
+            depth=depth,
+            intrinsics=camera.intrinsics,
+            T_world_camera=camera.T_world_camera,
+        )
+
+    def records(self) -> Iterator[Record]:
+        """By stamp."""
+        return by_stamp(self.joint_states(), self.frames())
+
+    def static_transforms(self) -> list[Transform]:
+        """The cameras where they are taken to be."""
+        transforms: list[Transform] = [("world", self.robot.urdf.links[0], self.robot.T_world_base)]
+        mounts = [("world", camera.name, camera.T_world_camera) for camera in self.cameras]
+        for parent, name, T in [*mounts, *([(HAND, WRIST, T_HAND_WRIST)] if self.has_wrist else [])]:
+            transforms.append((parent, f"{name}_link", T @ self.off[name] @ OPTICAL_FROM_LINK.T))
+            transforms.append((f"{name}_link", f"{name}_optical_frame", OPTICAL_FROM_LINK))
+        return transforms
+
+
+def write_log(setup: SetUp, path: Path) -> None:
+    """Its log."""
+    with mcap_log(path) as log:
+        log.add_transforms(setup.start_ns, setup.static_transforms(), is_static=True)
+        for record in setup.records():
+            if isinstance(record, JointState):
+                log.add_joint_state(record, setup.robot.joint_names)
+                if setup.has_wrist:
+                    log.add_transforms(record.stamp_ns, setup.link_transforms(record.position), is_static=False)
+            else:
+                log.add_frame(record)
+
+
+def _view(angle: float, rng: np.random.Generator) -> Float64:
+    """T_world_camera (4, 4) from an angle [rad] about the table's middle."""
+    distance, height = rng.uniform(*EYES)
+    eye = [0.38 + distance * np.cos(angle), distance * np.sin(angle), height]
+    return look_at(eye, rng.uniform(*TARGETS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Error:
+    """One axis of an unknown, or one number: its error and its stated sigma [m, rad, s or of 1]."""
+
+    kind: str
+    seed: int
+    camera: str
+    unknown: str
+    axis: int
+    error: float
+    sigma: float
+
+
+def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
+    """Of each unknown: along and about the axes that the file states its sigmas for."""
+    named = {"kind": kind, "seed": setup.options.seed}
+    cameras = {camera.name: camera.T_world_camera for camera in setup.cameras}
+    for name, found in result.calibration.cameras.items():
+        truth = invert_transform(setup.off[name]) if found.moves else cameras[name]
+        twist = twist_between(truth, found.T)
+        R = np.eye(3) if found.moves else truth[:3, :3]
+        if "pose" not in found.held:
+            for unknown, error, sigma in (
+                ("position", R @ twist[3:], found.sigma_position),
+                ("rotation", R @ twist[:3], found.sigma_rotation),
+            ):
+                for axis in range(3):
+                    yield Error(
+                        **named, camera=name, unknown=unknown, axis=axis, error=float(error[axis]), sigma=sigma[axis]
+                    )
+        if "depth scale" not in found.held:
+            error = found.scale - (setup.scale if name == setup.names[0] else 1.0)
+            yield Error(**named, camera=name, unknown="depth scale", axis=0, error=error, sigma=found.sigma_depth[0])
+    if result.calibration.clock is not None:
+        error, sigma = result.calibration.clock - setup.clock, result.calibration.sigma_clock
+        yield Error(**named, camera="", unknown="clock", axis=0, error=error, sigma=sigma)
+
+
+def trial(kind: str, seed: int, folder: Path) -> list[Error]:
+    """One set-up of a kind. Raises NotEvaluableError where `calibrate` refuses."""
+    setup = SetUp(seed, has_wrist=kind == "wrist")
+    if kind == "cameras alone":
+        setup.off[setup.names[0]] = np.eye(4)
+        setup.scale = 1.0  # of the camera that is held, nothing else tells it
+    log = folder / "log.mcap"
+    write_log(setup, log)
+    robot = (
+        {} if kind == "cameras alone" else {"urdf": SAMPLE / "robot.urdf", "spheres": SAMPLE / "robot_spheres.yaml"}
+    )
+    result = calibrate(CalibrateRequest(paths=(log,), out=folder / "calibration.toml", force=True, **robot))
+    return list(errors(kind, setup, result))
+
+
+def lines(rows: Sequence[Error]) -> Iterator[str]:
+    """A table: errors by kind and unknown, per camera as lengths, and how many axes lie within two sigma."""
+    header = ("set-up", "error of", "", "median", "95 %", "largest", "stated sigma", "within 2 sigma")
+    shown = []
+    for kind in KINDS:
+        for unknown, (unit, factor) in UNITS.items():
+            some = [row for row in rows if (row.kind, row.unknown) == (kind, unknown)]
+            if not some:
+                continue
+            error, sigma = (factor * np.array([getattr(row, name) for row in some]) for name in ("error", "sigma"))
+            length = np.linalg.norm(error.reshape(-1, 3 if unknown in ("position", "rotation") else 1), axis=1)
+            figures = (np.median(length), np.percentile(length, 95), length.max(), np.median(sigma))
+            within = int((np.abs(error) <= 2 * sigma).sum())
+            share = f"{within} of {len(some)} ({within / len(some):.1%})"
+            shown.append([kind, unknown, unit, *(f"{value:.3f}" for value in figures), share])
+    yield from table(header, shown)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Calibrate every set-up, print the table and write the rows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--setups", type=int, default=50)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--csv", type=Path, default=Path("bench_output/calibration.csv"))
+    args = parser.parse_args(argv)
+    args.csv.parent.mkdir(parents=True, exist_ok=True)
+    rows: list[Error] = []
+    refused: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for seed, kind in ((seed, kind) for seed in range(args.setups) for kind in args.kinds):
+            try:
+                rows += trial(kind, seed, Path(folder))
+            except NotEvaluableError as refusal:
+                refused.append(f"{kind}, seed {seed}: {refusal.message}")
+            with args.csv.open("w", newline="", encoding="utf-8") as stream:
+                writer = csv.DictWriter(stream, fieldnames=list(Error.__dataclass_fields__), lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(asdict(row) for row in rows)
+    print("\n".join(lines(rows)))
+    print(f"refused: {len(refused)} of {args.setups * len(args.kinds)}")
+    print("\n".join(refused))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,311 @@
+"""A calibration from its request to its result: cameras against each other and the robot, from what they recorded."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatctrl_cli.calibration.arm import Arm
+from splatctrl_cli.calibration.calibration_file import CalibratedCamera, Calibration, calibration_text
+from splatctrl_cli.calibration.certainty import plane_of, unobserved
+from splatctrl_cli.calibration.evidence import Evidence, evidence_of
+from splatctrl_cli.calibration.solution import Solution, solved
+from splatctrl_cli.calibration.unknowns import Estimate, twist_of
+from splatctrl_cli.checks.limits import VIEWS_RANGE
+from splatctrl_cli.config import fixed
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.files.output import output_path
+from splatctrl_cli.jobs.check import posed_robot
+from splatctrl_cli.jobs.progress import SILENT, Progress
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
+from splatctrl_cli.records import RgbdFrame, spread
+from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.sources.source import open_session
+
+BASE = "the robot's base"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateRequest:
+    """Calibrate the cameras of a recording, `paths` of which are several only where they are logs of one session.
+
+    out: the TOML file (None: calibration.toml here). urdf: a robot whose joint states are recorded, from whose
+    surface the cameras are placed; its spheres, base, locked joints and packages as `replay` takes them. hold: the
+    camera that stays where it is recorded where there is no robot (None: the first). allow_unobserved: write what
+    could be found where not all could.
+    """
+
+    paths: tuple[Path, ...]
+    out: Path | None = None
+    options: SourceOptions = field(default_factory=SourceOptions)
+    urdf: Path | None = None
+    spheres: Path | None = None
+    packages: tuple[Path, ...] = ()
+    base: tuple[float, ...] | None = None
+    locked: Mapping[str, float] = field(default_factory=dict)
+    hold: str | None = None
+    allow_unobserved: bool = False
+    force: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraChange:
+    """What became of a camera: how far it was moved [m] and turned [deg], and the largest sigma of each."""
+
+    camera: str
+    distance: float
+    angle: float
+    sigma_position: float
+    sigma_rotation: float
+    scale: float
+    bias: float
+    is_held: bool
+    unobserved: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateResult:
+    """The file, what stands in it, and how far [m] points lie from what another camera or the robot shows there,
+    before and after (`Adjustment.distance`).
+    """
+
+    out: Path
+    calibration: Calibration
+    changes: tuple[CameraChange, ...]
+    before: float | None
+    after: float | None
+    num_frames: int
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """Plain values."""
+        clock = self.calibration.clock
+        return {
+            "frames": self.num_frames,
+            "distance_before_mm": None if self.before is None else round(1e3 * self.before, 2),
+            "distance_after_mm": None if self.after is None else round(1e3 * self.after, 2),
+            "clock_offset_ms": None if clock is None else round(1e3 * clock, 3),
+            "sigma_clock_ms": None if clock is None else round(1e3 * self.calibration.sigma_clock, 3),
+            "cameras": {
+                change.camera: {
+                    "moved_mm": round(1e3 * change.distance, 3),
+                    "turned_deg": round(change.angle, 4),
+                    "sigma_mm": round(1e3 * change.sigma_position, 3),
+                    "sigma_deg": round(change.sigma_rotation, 4),
+                    "depth_scale": change.scale,
+                    "depth_bias_mm": round(1e3 * change.bias, 3),
+                    "held": change.is_held,
+                    "unobserved": list(change.unobserved),
+                }
+                for change in self.changes
+            },
+        }
+
+
+def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> CalibrateResult:
+    """Find the calibration and write it.
+
+    Raises UsageError for options that contradict each other, InputError for a recording that cannot be read, and
+    NotEvaluableError where it does not say where the cameras are: then no file is written.
+    """
+    out = request.out or Path("calibration.toml")
+    if request.options.calibration is not None:
+        raise UsageError("--calibration: what is calibrated is the recording as it is", remedy="leave it out")
+    model = posed_robot(
+        request.paths,
+        request.urdf,
+        request.spheres,
+        base=request.base,
+        locked=request.locked,
+        packages=request.packages,
+    )
+    source = open_session(request.paths, request.options)
+    arm = None if model is None else _arm(model, source)
+    with output_path(out, force=request.force, is_folder=False) as partial:
+        frames = _frames(source, progress)
+        if arm is not None:
+            _check_travel(arm, frames)
+        evidence = evidence_of(frames, arm)
+        held = _held(request, evidence)
+        progress.log(f"calibrate: {len(frames)} frames of {', '.join(evidence.cameras)}")
+        start = Estimate(corrections={camera: np.eye(4) for camera in evidence.cameras})
+        solution = solved(evidence, start, held)
+        unknown = _unobserved(solution)
+        if any(unknown.values()):
+            if not request.allow_unobserved:
+                raise _refusal(unknown, evidence)
+            solution = solution.within_observed(start)
+        calibration = _calibration(source, solution, unknown)
+        partial.write_text(calibration_text(calibration), encoding="utf-8")
+    before, after = (solution.adjustment.distance(estimate) for estimate in (start, solution.estimate))
+    return CalibrateResult(
+        out=out,
+        calibration=calibration,
+        changes=tuple(_change(calibration, solution, camera) for camera in evidence.cameras),
+        before=before,
+        after=after,
+        num_frames=len(frames),
+    )
+
+
+def _arm(model: RobotModel, source: FrameSource) -> Arm:
+    if not len(source.states):
+        raise InputError(
+            f"{source.name}: --urdf: expected joint states, got none",
+            remedy="record /joint_states, or leave --urdf out to place the cameras against each other",
+        )
+    if len(model.surface.vague) == len(model.surface.links):
+        raise InputError(
+            f"{model.urdf.path}: expected collision geometry, got spheres alone, which enclose the surface",
+            remedy="give the URDF with its meshes (--packages DIR where they are in packages)",
+        )
+    return Arm(model, source.states.of_joints(model.joint_order(source.joint_names)))
+
+
+def _frames(source: FrameSource, progress: Progress) -> list[RgbdFrame]:
+    """Up to `CALIBRATION_FRAMES` of each camera by stamp, taken at the same moments, without colour."""
+    stamps: dict[str, list[int]] = {}
+    for stamp, camera, _ in source.poses():
+        stamps.setdefault(camera, []).append(stamp)
+    if not stamps:
+        raise InputError(f"{source.name}: no frame could be read", remedy="see `splatctrl info`")
+    moments = spread(min(stamps.values(), key=len), fixed.CALIBRATION_FRAMES)
+    chosen = {
+        (camera, its[int(np.argmin(np.abs(np.array(its) - moment)))])
+        for camera, its in stamps.items()
+        for moment in moments
+    }
+    frames = []
+    for item in source.stored():
+        if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen:
+            frames.append(_without_color(item))
+            if len(frames) % 30 == 0:
+                progress.log(f"calibrate: {len(frames)} of {len(chosen)} frames read")
+    return frames
+
+
+def _without_color(stored: StoredFrame) -> RgbdFrame:
+    """A frame's depth within `VIEWS_RANGE`, of what is no person."""
+    low, high = VIEWS_RANGE
+    is_used = (stored.depth >= low) & (stored.depth <= high)
+    if stored.human is not None:
+        is_used &= stored.human == 0
+    return RgbdFrame(
+        stamp_ns=stored.stamp_ns,
+        camera=stored.camera,
+        color=np.zeros((1, 1, 3), np.uint8),
+        depth=np.where(is_used, stored.depth, np.float32(0.0)),
+        intrinsics=stored.intrinsics,
+        T_world_camera=stored.T_world_camera,
+    )
+
+
+def _check_travel(arm: Arm, frames: Sequence[RgbdFrame]) -> None:
+    """Raise NotEvaluableError for a robot that hardly moves, whose one posture any wrong model explains."""
+    travel = arm.travel(sorted({frame.stamp_ns for frame in frames}))
+    if travel < fixed.CALIBRATION_TRAVEL:
+        raise NotEvaluableError(
+            f"calibrate: the robot hardly moves: {1e3 * travel:.0f} mm at most (expected"
+            f" {1e3 * fixed.CALIBRATION_TRAVEL:.0f})",
+            remedy="record it moving through the space that the cameras see, or leave --urdf out to place the cameras"
+            " against each other",
+        )
+
+
+def _held(request: CalibrateRequest, evidence: Evidence) -> tuple[str, ...]:
+    """The cameras that stay: with a robot none, else one, where none moves with it."""
+    if request.hold is not None and request.hold not in evidence.cameras:
+        raise UsageError(
+            f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(evidence.cameras)}"
+        )
+    if request.hold is not None:
+        return (request.hold,)
+    if evidence.arm is not None or evidence.moving:
+        return ()
+    if len(evidence.cameras) < 2:
+        raise NotEvaluableError(
+            f"calibrate: one camera that stands still, {evidence.cameras[0]}, and no robot to place it against",
+            remedy="give --urdf of a robot that it sees, or a recording of several cameras",
+        )
+    return evidence.cameras[:1]
+
+
+def _unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
+    """The directions that each camera's pose is not known in."""
+    evidence = solution.adjustment.evidence
+    found = {}
+    for camera in solution.adjustment.unknowns.poses:
+        view = next((view for view in evidence.views if view.camera == camera), None)
+        T = np.eye(4) if view is None else view.T_world_camera @ solution.estimate.corrections[camera]
+        found[camera] = unobserved(solution.certainty, camera, T, None if view is None else plane_of(view, T))
+    return found
+
+
+def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotEvaluableError:
+    told = "; ".join(f"{', '.join(names)} of {camera}" for camera, names in unknown.items() if names)
+    remedy = "put things of different shapes where all cameras see them"
+    if evidence.moving:
+        remedy += ", turn the moving camera about two axes"
+    if evidence.arm is None:
+        remedy += ", or give --urdf of a robot in view"
+    return NotEvaluableError(
+        f"calibrate: the recording does not say all: not observed: {told}",
+        remedy=f"{remedy}; --allow-unobserved writes the rest, with these as recorded",
+    )
+
+
+def _calibration(source: FrameSource, solution: Solution, unknown: Mapping[str, tuple[str, ...]]) -> Calibration:
+    evidence, estimate, certainty = solution.adjustment.evidence, solution.estimate, solution.certainty
+    cameras = {}
+    for camera in evidence.cameras:
+        recorded = next(view.T_world_camera for view in evidence.views if view.camera == camera)
+        moves = camera in evidence.moving
+        T = estimate.corrections[camera] if moves else recorded @ estimate.corrections[camera]
+        R = np.eye(3) if moves else T[:3, :3]
+        to_axes = np.zeros((6, 6))
+        to_axes[:3, 3:], to_axes[3:, :3] = R, R
+        covariance = to_axes @ certainty.of_camera(camera) @ to_axes.T
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        scale, bias = estimate.depth_of(camera)
+        unknowns = solution.adjustment.unknowns
+        found = {"pose": unknowns.poses, "depth scale": unknowns.scales, "depth bias": unknowns.biases}
+        cameras[camera] = CalibratedCamera(
+            T=T,
+            recorded=None if moves else recorded,
+            scale=float(scale),
+            bias=float(bias),
+            sigma_position=tuple(map(float, sigma[:3])),
+            sigma_rotation=tuple(map(float, sigma[3:])),
+            sigma_depth=certainty.sigma_depth(camera),
+            covariance=covariance,
+            held=tuple(name for name, of_cameras in found.items() if camera not in of_cameras),
+            unobserved=unknown.get(camera, ()),
+        )
+    return Calibration(
+        recording=source.name,
+        world_frame=source.world_frame,
+        digests=source.digests(),
+        cameras=cameras,
+        held=(*((BASE,) if evidence.arm is not None else ()), *(f"camera {camera}" for camera in solution.held)),
+        clock=float(estimate.clock) if solution.adjustment.unknowns.has_clock else None,
+        sigma_clock=certainty.sigma_clock,
+    )
+
+
+def _change(calibration: Calibration, solution: Solution, camera: str) -> CameraChange:
+    twist = twist_of(solution.estimate.corrections[camera])
+    entry = calibration.cameras[camera]
+    return CameraChange(
+        camera=camera,
+        distance=float(np.linalg.norm(twist[3:])),
+        angle=float(np.degrees(np.linalg.norm(twist[:3]))),
+        sigma_position=max(entry.sigma_position),
+        sigma_rotation=float(np.degrees(max(entry.sigma_rotation))),
+        scale=entry.scale,
+        bias=entry.bias,
+        is_held=camera in solution.held,
+        unobserved=entry.unobserved,
+    )

@@ -1,0 +1,182 @@
+"""`calibrate` on simulated arms whose cameras are recorded wrongly, and what it refuses to tell."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.calibration import SetUp, errors, write_log
+from splatctrl_cli.calibration.calibration_file import read_calibration
+from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
+from splatctrl_cli.geometry import look_at
+from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
+from splatctrl_cli.jobs.ingest import IngestRequest, ingest
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.simulate.recording import RecordingOptions, Scene
+from splatctrl_cli.sources.source import open_source
+from splatctrl_cli.states.state_source import open_states
+
+SMALL = RecordingOptions(duration_s=3.0, fps=2.0, width=160, height=120, color_rays=0)
+
+
+def largest(setup: SetUp, result: CalibrateResult, unknown: str) -> float:
+    return max(abs(row.error) for row in errors("", setup, result) if row.unknown == unknown)
+
+
+@pytest.fixture(scope="module")
+def setup() -> SetUp:
+    return SetUp(1, SMALL)
+
+
+@pytest.fixture(scope="module")
+def log(setup: SetUp, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("setup") / "log.mcap"
+    write_log(setup, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(log: Path, sample_data: Path) -> CalibrateResult:
+    robot = sample_data / "tabletop"
+    return calibrate(
+        CalibrateRequest(
+            paths=(log,),
+            out=log.with_name("rig.toml"),
+            urdf=robot / "robot.urdf",
+            spheres=robot / "robot_spheres.yaml",
+        )
+    )
+
+
+def test_three_cameras_about_an_arm_are_found_without_a_marker(setup: SetUp, result: CalibrateResult) -> None:
+    assert largest(setup, result, "position") < 0.002
+    assert largest(setup, result, "rotation") < np.radians(0.2)
+    assert largest(setup, result, "clock") < 0.003
+    assert result.calibration.cameras["cam0"].scale == pytest.approx(setup.scale, abs=0.002)
+    assert result.before is not None and result.after is not None
+    assert result.before > 0.008 > 4 * result.after
+
+
+def test_commands_open_the_recording_with_the_calibrated_poses_depths_and_clock(
+    setup: SetUp, log: Path, result: CalibrateResult
+) -> None:
+    plain, source = open_source(log), open_source(log, SourceOptions(calibration=result.out))
+    frames = [{r.camera: r for r in s.records() if isinstance(r, RgbdFrame)} for s in (plain, source)]
+    for camera in setup.cameras:
+        np.testing.assert_allclose(frames[1][camera.name].T_world_camera, camera.T_world_camera, atol=0.003)
+        assert np.abs(frames[0][camera.name].T_world_camera - camera.T_world_camera).max() > 0.005
+    seen = frames[0]["cam0"].depth > 0
+    ratio = frames[1]["cam0"].depth[seen] / frames[0]["cam0"].depth[seen]
+    np.testing.assert_allclose(ratio, setup.scale, atol=0.002)
+    shift = (source.states.stamp_ns - plain.states.stamp_ns) * 1e-9
+    np.testing.assert_allclose(shift, setup.clock, atol=0.003)
+    assert result.out.name in source.digests()
+    assert any(result.out.name in note for note in source.loss.notes)
+
+
+def test_states_are_opened_with_the_same_calibration(setup: SetUp, log: Path, result: CalibrateResult) -> None:
+    source = open_states(log, SourceOptions(calibration=result.out), setup.robot.joint_names)
+    first = open_states(log, SourceOptions(), setup.robot.joint_names).states.stamp_ns[0]
+    assert (source.states.stamp_ns[0] - first) * 1e-9 == pytest.approx(setup.clock, abs=0.003)
+
+
+def test_a_capture_keeps_the_calibration_and_refuses_it_twice(log: Path, result: CalibrateResult) -> None:
+    out = log.with_name("calibrated.capture")
+    options = SourceOptions(calibration=result.out)
+    ingest(IngestRequest(paths=(log,), out=out, options=options))
+    poses = {camera: T for _, camera, T in open_source(out).poses()}
+    for name, camera in read_calibration(result.out).cameras.items():
+        np.testing.assert_allclose(poses[name], camera.T, atol=1e-6)
+    with pytest.raises(InputError, match="was ingested with"):
+        open_source(out, options)
+
+
+def test_a_calibration_of_other_cameras_is_refused(
+    log: Path, result: CalibrateResult, sample_data: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="not recorded where"):
+        open_source(sample_data / "tabletop" / "log.mcap", SourceOptions(calibration=result.out, cameras=("cam0",)))
+    with pytest.raises(InputError, match="camera cam3 is not in"):
+        open_source(sample_data / "tabletop" / "log.mcap", SourceOptions(calibration=result.out, cameras=("cam3",)))
+    other = tmp_path / "other.toml"
+    other.write_text(result.out.read_text().replace("cam1", "side"))
+    with pytest.raises(InputError, match="camera cam1 is not in"):
+        open_source(log, SourceOptions(calibration=other))
+
+
+def test_what_is_calibrated_is_the_recording_as_it_is(log: Path, result: CalibrateResult) -> None:
+    with pytest.raises(UsageError, match="--calibration"):
+        calibrate(CalibrateRequest(paths=(log,), options=SourceOptions(calibration=result.out)))
+
+
+def refused(setup: SetUp, folder: Path, **request: object) -> str:
+    """The refusal of a set-up, which leaves no file."""
+    log, out = folder / "log.mcap", folder / "rig.toml"
+    write_log(setup, log)
+    with pytest.raises(NotEvaluableError) as refusal:
+        calibrate(replace(CalibrateRequest(paths=(log,), out=out), **request))
+    assert not list(folder.glob("rig.toml*"))
+    return str(refusal.value)
+
+
+def test_cameras_that_see_nothing_in_common_are_named(tmp_path: Path) -> None:
+    setup = SetUp(2, SMALL)
+    away = look_at([0.3, 0.0, 0.6], [1.2, 1.3, 0.2])  # along the table to the wall behind it
+    back = look_at([0.3, 0.0, 0.6], [-0.4, -1.3, 0.2])
+    setup.cameras = tuple(
+        replace(camera, T_world_camera=T) for camera, T in zip(setup.cameras[:2], (away, back), strict=True)
+    )
+    told = refused(setup, tmp_path)
+    assert "cannot be tied together: cam0 | cam1" in told
+    assert "record a scene that neighbouring cameras both see" in told
+
+
+class Still(SetUp):
+    """An arm that hardly moves."""
+
+    def _scene(self, seed: int, options: RecordingOptions) -> Scene:
+        scene = super()._scene(seed, options)
+        start = scene.motion.waypoints[0]
+        waypoints = start + 0.02 * (scene.motion.waypoints - start)
+        return replace(scene, motion=replace(scene.motion, waypoints=waypoints))
+
+
+def test_a_robot_that_hardly_moves_is_refused(tmp_path: Path, sample_data: Path) -> None:
+    robot = sample_data / "tabletop"
+    told = refused(Still(2, SMALL), tmp_path, urdf=robot / "robot.urdf", spheres=robot / "robot_spheres.yaml")
+    assert "the robot hardly moves" in told
+    assert "record it moving" in told
+
+
+def test_one_camera_without_a_robot_has_nothing_to_be_placed_against(tmp_path: Path) -> None:
+    assert "no robot to place it against" in refused(
+        SetUp(2, SMALL), tmp_path, options=SourceOptions(cameras=("cam0",))
+    )
+
+
+class Bare(SetUp):
+    """Three cameras over a table, close enough to see nothing else."""
+
+    def __init__(self, seed: int, options: RecordingOptions) -> None:
+        super().__init__(seed, options)
+        places = ((0.55, -0.05), (0.65, 0.05))
+        self.cameras = tuple(
+            replace(camera, T_world_camera=look_at([x, y, 0.55], [0.6, 0.0, 0.0]))
+            for camera, (x, y) in zip(self.cameras[:2], places, strict=True)
+        )
+        self.primitives = (*self.primitives[:1], self.primitives[-1])
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        for frame in super().frames():
+            height = frame.T_world_camera[2, 3]
+            yield replace(frame, depth=np.where(frame.depth > 0.9 * height, frame.depth, 0).astype(np.float32))
+
+
+def test_directions_that_a_table_does_not_show_are_named(tmp_path: Path) -> None:
+    told = refused(Bare(2, SMALL), tmp_path)
+    assert "not observed: " in told and "of cam1" in told
+    assert "translation in the table's plane" in told
+    assert "put things of different shapes" in told
