@@ -175,13 +175,13 @@ def _scale_findings(scales: Mapping[str, float], used: Mapping[str, float | None
 def _pose_finding(move: Move, cameras: Sequence[str]) -> Finding:
     by = f"{1e3 * move.distance:.0f} mm and {move.angle:.1f} deg"
     where, what = f"camera {move.camera}", f"its views fit those of the other cameras where it is moved by {by}"
-    remedy = "calibrate this camera's pose again (hand-eye), or leave it out with --cameras"
+    remedy = "calibrate this camera's pose again (splatctrl calibrate), or leave it out with --cameras"
     if len(cameras) == 1:
         what = f"its views fit together where the camera is moved on its mount by {by}"
-        remedy = "calibrate the camera on its mount again (hand-eye)"
+        remedy = "calibrate the camera on its mount again (splatctrl calibrate)"
     elif len(cameras) == 2:
         where, what = f"cameras {' and '.join(cameras)}", f"their views fit where {move.camera} is moved by {by}"
-        remedy = "calibrate both cameras' poses again (hand-eye): two do not tell which of them is wrong"
+        remedy = "calibrate both cameras' poses again (splatctrl calibrate): two do not tell which of them is wrong"
     falls = f"points then lie {1e3 * move.after:.1f} mm off surfaces instead of {1e3 * move.before:.1f}"
     text = f"{what}: {falls} (mean, each counted as {1e3 * limits.MOVE_CUT:.0f} mm at most)"
     return warning("views-pose", where, text, remedy, value=round(1e3 * move.distance, 1), unit="mm")

@@ -43,7 +43,7 @@ class CameraAgreement:
             )
             if not self._is_allowed:
                 others = f" keep one with --cameras {pair.cameras[0]}," if len(set(pair.cameras)) > 1 else ""
-                refine = " (--refine-poses)" if self._is_still else ""
+                refine = " (--refine-poses)" if self._is_still else " (splatctrl calibrate)"
                 raise InputError(
                     line, remedy=f"{CAUSES}: correct poses or depth{refine},{others} or give --allow-disagreement"
                 )

@@ -107,7 +107,7 @@ def _agreement(report: CheckReport) -> Iterator[Finding]:
         where = f"camera {both[0]}" if len(both) == 1 else f"cameras {both[0]} and {both[1]}"
         text = f"depths differ by {1e3 * pair.median:.1f} mm (median of {pair.num_pixels} pixels that two views see)"
         text = f"{text}; expected at most {1e3 * pair.limit:.0f} mm"
-        remedy = f"{CAUSES}: calibrate the cameras' poses again (hand-eye), or widen the range of depth"
+        remedy = f"{CAUSES}: calibrate the cameras' poses again (splatctrl calibrate), or widen the range of depth"
         remedy += f", or keep one with --cameras {both[0]}" if len(both) > 1 else ": is it the pose of another frame?"
         yield error("agreement", where, text, remedy, value=round(1e3 * pair.median, 2), unit="mm")
     if good:

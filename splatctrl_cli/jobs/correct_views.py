@@ -38,7 +38,7 @@ class Corrections:
         if self and source.has_clock:
             raise UsageError(
                 f"{self.options}: {source.name} is recorded over time; only views of a still scene are corrected",
-                remedy="leave it out, and see 'splatctrl check' for cameras that stand wrong",
+                remedy="leave it out; 'splatctrl calibrate' places the cameras of a log",
             )
 
     def of(self, frames: Sequence[RgbdFrame], name: str, console: Progress) -> tuple[list[RgbdFrame], dict[str, Any]]:
