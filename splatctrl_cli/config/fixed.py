@@ -305,10 +305,7 @@ CALIBRATION_DEPTH_SURE = 5.0  # sigmas by which a scale or bias of depths must d
 CALIBRATION_DEPTH_LEAST = 0.002  # [m] that they must change a depth by
 CALIBRATION_DEPTH_MOST = (0.3, 0.1)  # by which a scale, and [m] a bias, may differ from 1 and 0
 CALIBRATION_CLOCK = 0.02  # [s] within which a clock's offset must be known to be taken
-CALIBRATION_OTHER = (
-    0.01,
-    0.1,
-)  # [m] of what is seen that solutions differ by, and of the cost that one is better by
+CALIBRATION_OTHER = (0.01, 0.1)  # [m] of what is seen that solutions differ by; of the cost that one is better by
 CALIBRATION_RIVAL = 3.0  # times the best start's cost, up to which where another start leads is looked at, too
 CALIBRATION_FREED = (0.08, 0.08, 0.08, 0.05, 0.05, 0.05, 0.03)  # [m] the same, once depths are given a scale
 CALIBRATION_INFLATION = 1.7  # of every sigma: what errors of 28 simulated set-ups (seeds 1000 on) were of it, rms

@@ -61,6 +61,7 @@ class Work:
             "simulate": ["--duration", "1", "--width", "64", "--height", "48"],
             "ingest": [self.log],
             "reconstruct": [self.log, "--cameras", "cam0", *QUICK],
+            "calibrate": [self.log, "--allow-unobserved"],
             "export": [scene],
             "sdf-bake": [scene, "--voxel", "0.5", "--set", "field.max_loss=1"],
             "query": [scene, self.folder / "points.csv"],
@@ -166,7 +167,8 @@ def test_an_unknown_option_is_exit_2_and_named(work: Work, tmp_path: Path, comma
 
 
 @pytest.mark.parametrize(
-    "command", ["ingest", "info", "check", "reconstruct", "export", "sdf-bake", "query", "score", "replay", "demo"]
+    "command",
+    ["ingest", "info", "check", "calibrate", "reconstruct", "export", "sdf-bake", "query", "score", "replay", "demo"],
 )
 def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command: str) -> None:
     absent = tmp_path / "absent"
@@ -181,7 +183,7 @@ def test_a_missing_input_is_exit_4_and_named(work: Work, tmp_path: Path, command
     assert not list(tmp_path.iterdir())
 
 
-FILE_WRITERS = ("export", "query", "report", "view", "robot", "capture")  # the others write a folder
+FILE_WRITERS = ("calibrate", "export", "query", "report", "view", "robot", "capture")  # the others write a folder
 
 
 @pytest.mark.parametrize("command", WRITERS)
