@@ -85,6 +85,13 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
     return T
 
 
+def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:
+    """The camera of every `stride`-th pixel: pixel (0, 0) stays where it was."""
+    fx, fy, cx, cy = (value / stride for value in (lens.fx, lens.fy, lens.cx, lens.cy))
+    width, height = -(-lens.width // stride), -(-lens.height // stride)
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
 def project(intrinsics: Intrinsics, points_camera: NDArray[np.floating]) -> Float64:
     """Pixels (..., 2) of camera-frame points (..., 3) with z > 0."""
     z = points_camera[..., 2]

@@ -213,10 +213,10 @@ class Adjustment:
         lands &= np.any(normals != 0, axis=1)
         num_laid = int(lands.sum())
         lands &= (behind > -3 * reach) & (np.einsum("ki,ki->k", turned, normals) > fixed.CALIBRATION_ALIKE)
-        residual, by_a, by_b = overlap_rows(points, T, lands, surface, normals)
+        residual, derivatives = overlap_rows(points, T, lands, surface, normals)
         near = np.abs(residual) < reach
         which = np.flatnonzero(lands)[near]
-        residual, by_a, by_b = residual[near], by_a[near], by_b[near]
+        residual, (by_a, by_b) = residual[near], np.hsplit(derivatives[near], 2)
         own, other = a.points[which], recorded[which]
         slope_a = np.einsum("ki,ki->k", by_a[:, 3:], own) / own[:, 2]
         slope_b = np.einsum("ki,ki->k", by_b[:, 3:], other) / other[:, 2]

@@ -1,6 +1,5 @@
 """The robot as the cameras see it: where its links are at a time, and how far depth lies from their surface."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,30 +14,8 @@ from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics
 from splatctrl_cli.robot.model import RobotModel
 
-Posture = Callable[[int], Float64 | None]
 REMEMBERED = 1024  # times, at which the links' poses are kept: the rounds after the clock is found ask for the same
 STEP_NS = 10_000_000  # [ns] before and after, from which a velocity is taken: less than the time between two states
-
-
-def posture_at(states: StateColumns) -> Posture:
-    """Joint positions (J,) at a time [ns], linearly between states; None where they are too far away."""
-
-    def posture(stamp_ns: int) -> Float64 | None:
-        after = int(np.searchsorted(states.stamp_ns, stamp_ns))
-        near = [
-            i
-            for i in (after - 1, after)
-            if 0 <= i < len(states) and abs(int(states.stamp_ns[i]) - stamp_ns) <= fixed.STATES_CLOSE_NS
-        ]
-        if not near:
-            return None
-        if len(near) == 1:
-            return states[near[0]].position
-        before, later = states[near[0]], states[near[1]]
-        share = (stamp_ns - before.stamp_ns) / max(later.stamp_ns - before.stamp_ns, 1)
-        return np.asarray((1 - share) * before.position + share * later.position)
-
-    return posture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +41,7 @@ class Arm:
     def __init__(self, model: RobotModel, states: StateColumns) -> None:
         self.model = model
         self.surface = model.surface
-        self._posture = posture_at(states)
+        self._posture = states.postures(fixed.STATES_CLOSE_NS)
         self._vague = np.array(sorted(self.surface.vague), dtype=np.int64)
         self.surface_poses = lru_cache(maxsize=REMEMBERED)(self._surface_poses)
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.calibration.views import DepthView, depth_sigma, landed, strided_lens
+from splatctrl_cli.calibration.unknowns import POSE, transform_of, twist_between
+from splatctrl_cli.calibration.views import DepthView, by_twists, depth_sigma, landed
 from splatctrl_cli.config import fixed
-from splatctrl_cli.geometry import invert_transform, project, transform_points
+from splatctrl_cli.geometry import invert_transform, project, strided_lens, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 
-POSE = 6  # a turn and a move in the camera's own frame
 EVERY = slice(None)
 
 
@@ -159,7 +159,7 @@ def _solved(
         width = fixed.REFINE_WIDTHS[min(number, len(fixed.REFINE_WIDTHS) - 1)]
         H, g = np.diag(prior), np.zeros(size)
         for k, i in enumerate(free):
-            g[POSE * k : POSE * (k + 1)] = _twist(invert_transform(recorded[i]) @ poses[i])
+            g[POSE * k : POSE * (k + 1)] = twist_between(recorded[i], poses[i])
         g *= prior
         for i, j in pairs:
             J, r = _rows(views[i], views[j], invert_transform(poses[j]) @ poses[i], width)
@@ -170,7 +170,7 @@ def _solved(
             g[columns] += J.T @ r
         step = -np.linalg.solve(H, g).reshape(-1, POSE)
         for k, i in enumerate(free):
-            poses[i] = poses[i] @ _motion(step[k])
+            poses[i] = poses[i] @ transform_of(step[k])
         if number >= len(fixed.REFINE_WIDTHS) and np.abs(step).max() < fixed.REFINE_STILL:
             break
     return poses
@@ -187,7 +187,7 @@ def _rows(a: GrayView, b: GrayView, T: Float64, width: float) -> tuple[Float64, 
     own, there, normals, surface = points[lands], there[lands], normals[lands], surface[lands]
     sigma, distance = sigma[lands], distance[lands]
     weight = (1 - np.square(distance / (width * sigma))) / sigma
-    J, r = _by_twists(own, there, normals, T) * weight[:, None], distance * weight
+    J, r = by_twists(own, there, normals, T) * weight[:, None], distance * weight
     if width > fixed.REFINE_COLOR_FROM or len(own) < fixed.REFINE_FEWEST:
         return J, r
     z = there[:, 2]
@@ -203,7 +203,7 @@ def _rows(a: GrayView, b: GrayView, T: Float64, width: float) -> tuple[Float64, 
     counts = np.abs(deviation) < fixed.REFINE_CUT
     weight = np.where(counts, 1 - np.square(deviation / fixed.REFINE_CUT), 0.0) / fixed.REFINE_COLOR
     return (
-        np.vstack([J, _by_twists(own, there, gradient, T) * weight[:, None]]),
+        np.vstack([J, by_twists(own, there, gradient, T) * weight[:, None]]),
         np.concatenate([r, difference * weight]),
     )
 
@@ -218,14 +218,6 @@ def on_surface(
     lands, surface, normals = landed(there, b.depth)
     lands &= np.einsum("ki,ki->k", a.depth.point_normals[which] @ T[:3, :3].T, normals) > fixed.REFINE_ALIKE
     return there, lands, surface, normals, np.asarray(np.einsum("ki,ki->k", there - surface, normals))
-
-
-def _by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
-    """(K, 12): how a value with a gradient (K, 3) by the point `there` (K, 3) changes with a small turn and move of
-    the camera that has the point at `own` (K, 3), and of the one it is seen from, each in its own frame.
-    """
-    along = gradient @ T[:3, :3]
-    return np.hstack([np.cross(own, along), along, -np.cross(there, gradient), -gradient])
 
 
 def _alike(value: Float64, other: Float64) -> Float64:
@@ -256,15 +248,5 @@ def _distances(
 
 def _motions(before: Sequence[Float64], after: Sequence[Float64]) -> tuple[Float64, Float64]:
     """How far [m] and by what angle [deg] each pose (4, 4) was moved (N,)."""
-    twists = np.array([_twist(invert_transform(a) @ b) for a, b in zip(before, after, strict=True)]).reshape(-1, POSE)
+    twists = np.array([twist_between(a, b) for a, b in zip(before, after, strict=True)]).reshape(-1, POSE)
     return np.linalg.norm(twists[:, 3:], axis=1), np.degrees(np.linalg.norm(twists[:, :3], axis=1))
-
-
-def _motion(twist: Float64) -> Float64:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(twist[:3])[0], twist[3:]
-    return T
-
-
-def _twist(T: Float64) -> Float64:
-    return np.concatenate([cv2.Rodrigues(T[:3, :3])[0].ravel(), T[:3, 3]])

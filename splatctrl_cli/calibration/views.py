@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.config import fixed
-from splatctrl_cli.geometry import back_project, project, transform_points
+from splatctrl_cli.geometry import back_project, project, strided_lens, transform_points
 from splatctrl_cli.records import Bool, Float32, Float64, Intrinsics, RgbdFrame
 
 Index = NDArray[np.int64]
@@ -84,13 +85,6 @@ def strided(frame: RgbdFrame, rows: int) -> RgbdFrame:
     return replace(frame, depth=depth, color=color, intrinsics=lens, human=human, valid=None)
 
 
-def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:
-    """The camera of every `stride`-th pixel: pixel (0, 0) stays where it was."""
-    fx, fy, cx, cy = (value / stride for value in (lens.fx, lens.fy, lens.cx, lens.cy))
-    width, height = -(-lens.width // stride), -(-lens.height // stride)
-    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-
-
 def surface_normals(surface: Float64, step: int = 1) -> Float64:
     """Unit normals (h, w, 3) of a surface (h, w, 3) in a camera's frame, towards the camera, from the points `step`
     pixels away on either side; 0 along edges and where depth is missing.
@@ -120,7 +114,18 @@ def bend(depth: Float32, step: int = 1) -> Float64:
     return np.asarray(0.5 * bent)
 
 
-def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
+class Surface(Protocol):
+    """What points are laid on: surface and normals (h, w, 3) of a lens."""
+
+    @property
+    def lens(self) -> Intrinsics: ...
+    @property
+    def surface(self) -> Float64: ...
+    @property
+    def normals(self) -> Float64: ...
+
+
+def landed(points: Float64, view: Surface) -> tuple[Bool, Float64, Float64]:
     """Of points (K, 3) in a view's camera frame: which land on a depth of it (K,), and its surface and normals (K, 3)
     there.
     """
@@ -132,21 +137,26 @@ def landed(points: Float64, view: DepthView) -> tuple[Bool, Float64, Float64]:
     return lands & (surface[:, 2] > 0), surface, view.normals[v, u]
 
 
+def by_twists(own: Float64, there: Float64, gradient: Float64, T: Float64) -> Float64:
+    """(K, 12): how a value with a gradient (K, 3) by the point `there` (K, 3) changes with a small turn and move of
+    the camera that has the point at `own` (K, 3), at T (4, 4), and of the one it is seen from, each in its own frame.
+
+    T exp(x) moves points by ``x[:3] x p + x[3:]``, so that ``g . T exp(x) p`` changes by ``(p x R^T g) . x[:3] +
+    R^T g . x[3:]``; the other camera's move does the reverse.
+    """
+    along = gradient @ T[:3, :3]
+    return np.hstack([np.cross(own, along), along, -np.cross(there, gradient), -gradient])
+
+
 def overlap_rows(
     points: Float64, T: Float64, which: Bool, surface: Float64, normals: Float64
-) -> tuple[Float64, Float64, Float64]:
+) -> tuple[Float64, Float64]:
     """Of points (K, 3) of another view that land (`landed`) on a view at T (4, 4) from there, those of `which` (K,):
-    the residual, their distance (M,) [m] from the plane of its surface, and its derivatives (M, 6) by a small turn
-    and move of the points' camera, and of the view's, each in its own frame.
-
-    T exp(x) moves points by ``x[:3] x p + x[3:]``, so that ``n . (T exp(x) p - s)`` changes by ``(p x R^T n) . x[:3]
-    + R^T n . x[3:]``; the other camera's move does the reverse to them.
+    the residual, their distance (M,) [m] from the plane of its surface, and its derivatives (M, 12), `by_twists`.
     """
-    own, there = points[which], transform_points(T, points[which])
-    normal = normals[which]
-    along = normal @ T[:3, :3]
+    there, normal = transform_points(T, points[which]), normals[which]
     residual = np.einsum("ki,ki->k", there - surface[which], normal)
-    return residual, np.hstack([np.cross(own, along), along]), -np.hstack([np.cross(there, normal), normal])
+    return residual, by_twists(points[which], there, normal, T)
 
 
 def still_frame(frames: Sequence[RgbdFrame]) -> RgbdFrame:
@@ -177,13 +187,6 @@ def depth_sigma(depth: NDArray[np.floating]) -> Float64:
     square, and what every sensor has. The solution's own residuals say how much it really is.
     """
     return np.asarray(fixed.CALIBRATION_NOISE[0] + fixed.CALIBRATION_NOISE[1] * np.square(depth), np.float64)
-
-
-def without_people(frame: RgbdFrame) -> RgbdFrame:
-    """The frame without the depth of pixels that show a person."""
-    if frame.human is None:
-        return frame
-    return replace(frame, depth=np.where(frame.human > 0, np.float32(0.0), frame.depth))
 
 
 def tiles_of(pixels: Index, shape: tuple[int, ...]) -> Index:

@@ -3,21 +3,20 @@
 Depth images show the arm where forward kinematics puts it, at the time of the joint states, or with two exchanged.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.check_images import strided_lens
 from splatctrl_cli.checks.clock_offset import ClockOffset, ImageMotion, estimate_clock_offset, states_asked
 from splatctrl_cli.checks.finding import Finding, note, warning
-from splatctrl_cli.logs.state_columns import StateColumns
+from splatctrl_cli.geometry import strided_lens
+from splatctrl_cli.logs.state_columns import Posture, StateColumns
 from splatctrl_cli.records import Float64, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 
-Posture = Callable[[int], Float64 | None]
 LATE = "synchronise the clocks, or shift the stamps: robot labels and replay come too {}"
 
 
@@ -54,27 +53,6 @@ class ArmTiming:
     camera: str
     offset_s: float
     misfit: float
-
-
-def posture_at(states: StateColumns) -> Posture:
-    """Joint positions at a time [ns], linearly between states; None where they are too far away."""
-
-    def posture(stamp_ns: int) -> Float64 | None:
-        after = int(np.searchsorted(states.stamp_ns, stamp_ns))
-        near = [
-            i
-            for i in (after - 1, after)
-            if 0 <= i < len(states) and abs(int(states.stamp_ns[i]) - stamp_ns) <= limits.ARM_CLOSE_NS
-        ]
-        if not near:
-            return None
-        if len(near) == 1:
-            return states[near[0]].position
-        before, later = states[near[0]], states[near[1]]
-        share = (stamp_ns - before.stamp_ns) / max(later.stamp_ns - before.stamp_ns, 1)
-        return np.asarray((1 - share) * before.position + share * later.position)
-
-    return posture
 
 
 def reduced(frames: Sequence[RgbdFrame]) -> list[RgbdFrame]:
@@ -220,7 +198,7 @@ def motion_findings(
 def _arm_findings(
     model: RobotModel, frames: Sequence[RgbdFrame], states: StateColumns
 ) -> tuple[list[ArmTiming], list[Finding]]:
-    posture = posture_at(states)
+    posture = states.postures(limits.ARM_CLOSE_NS)
     found: list[Finding] = []
     timings: list[ArmTiming] = []
     bad: dict[str, ArmAgreement] = {}

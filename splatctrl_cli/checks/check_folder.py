@@ -10,7 +10,6 @@ from splatctrl_cli.checks.check_images import (
     ImageWatch,
     depth_findings,
     sample_findings,
-    strided_lens,
 )
 from splatctrl_cli.checks.check_states import RobotStates, robot_states
 from splatctrl_cli.checks.check_times import TimesWatch, time_findings
@@ -19,6 +18,7 @@ from splatctrl_cli.checks.finding import CheckReport, Finding, damage_findings, 
 from splatctrl_cli.checks.judge_evidence import Evidence, judged
 from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateCollector
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame

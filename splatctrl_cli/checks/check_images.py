@@ -154,13 +154,6 @@ def thumbnail_lens(lens: Intrinsics) -> Intrinsics:
     return Intrinsics(fx=lens.fx * across, fy=lens.fy * down, cx=cx, cy=cy, width=width, height=height)
 
 
-def strided_lens(lens: Intrinsics, stride: int) -> Intrinsics:
-    """The camera of every `stride`-th pixel: pixel (0, 0) stays where it was."""
-    fx, fy, cx, cy = (value / stride for value in (lens.fx, lens.fy, lens.cx, lens.cy))
-    width, height = -(-lens.width // stride), -(-lens.height // stride)
-    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-
-
 def image_findings(images: ImageWatch) -> list[Finding]:
     """What is wrong with the images, depth apart."""
     where, found = images.where, []

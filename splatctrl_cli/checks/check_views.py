@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from splatctrl_cli.calibration.unknowns import transform_of
+from splatctrl_cli.calibration.views import landed, overlap_rows, surface_normals
 from splatctrl_cli.checks import limits
-from splatctrl_cli.checks.check_images import strided_lens
 from splatctrl_cli.checks.finding import Finding, error, warning
 from splatctrl_cli.config.fixed import PLAUSIBLE_DEPTH
-from splatctrl_cli.geometry import back_project, invert_transform, project, transform_points
-from splatctrl_cli.records import Bool, Float64, RgbdFrame, spread
+from splatctrl_cli.geometry import back_project, invert_transform, strided_lens, transform_points
+from splatctrl_cli.records import Bool, Float64, Intrinsics, RgbdFrame, spread
 
 SCALES = (0.001, 0.01, 0.1, 0.2, 0.25, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 1.0)
 SCALES = (*SCALES, *(1 / s for s in reversed(SCALES[:-1])))
@@ -26,6 +27,11 @@ class _View:
     surface: Float64
     normals: Float64
     points: Float64
+
+    @property
+    def lens(self) -> Intrinsics:
+        """The reduced camera."""
+        return self.frame.intrinsics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,7 +226,7 @@ def _view(frame: RgbdFrame) -> _View:
     depth = cv2.medianBlur(np.ascontiguousarray(frame.depth), 3)[::stride, ::stride]
     lens = strided_lens(frame.intrinsics, stride)
     surface = back_project(lens, depth)
-    normals = _normals(surface)
+    normals = surface_normals(surface)
     points = surface[np.any(normals != 0, axis=-1)]
     if len(points) > limits.VIEWS_POINTS:
         points = points[np.linspace(0, len(points) - 1, limits.VIEWS_POINTS).astype(int)]
@@ -228,33 +234,18 @@ def _view(frame: RgbdFrame) -> _View:
     return _View(frame=replace(reduced, intrinsics=lens), surface=surface, normals=normals, points=points)
 
 
-def _normals(surface: Float64) -> Float64:
-    """(h, w, 3), 0 along edges and where depth is missing."""
-    normals = np.zeros_like(surface)
-    across, down = surface[1:-1, 2:] - surface[1:-1, :-2], surface[2:, 1:-1] - surface[:-2, 1:-1]
-    z = surface[..., 2]
-    around = np.stack([z[1:-1, 1:-1], z[1:-1, 2:], z[1:-1, :-2], z[2:, 1:-1], z[:-2, 1:-1]])
-    cross = np.cross(across, down)
-    length = np.linalg.norm(cross, axis=-1)
-    is_smooth = np.ptp(around, axis=0) < 0.1 * around[0]
-    is_known = (around > 0).all(axis=0) & is_smooth & (length > 0)
-    normals[1:-1, 1:-1][is_known] = cross[is_known] / length[is_known][:, None]
-    return normals
-
-
 def _landed(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Bool, Float64, Float64]:
     """Points (K, 3) of view a in b's camera frame, which of them land on a depth of b (K,), and b's surface and
     normals (K, 3) there.
     """
-    T = invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera
-    points = transform_points(T, a.points * scale_a)
-    lens = b.frame.intrinsics
-    is_ahead = points[:, 2] > PLAUSIBLE_DEPTH[0]
-    pixels = np.round(project(lens, np.where(is_ahead[:, None], points, 1.0)))
-    lands = is_ahead & np.all((pixels >= 0) & (pixels < [lens.width, lens.height]), axis=1)
-    u, v = np.where(lands[:, None], pixels, 0).astype(np.int64).T
-    surface = b.surface[v, u] * scale_b
-    return points, lands & (surface[:, 2] > 0), surface, b.normals[v, u]
+    points = transform_points(_transform(a, b), a.points * scale_a)
+    lands, surface, normals = landed(points, b)
+    return points, lands, surface * scale_b, normals
+
+
+def _transform(a: _View, b: _View) -> Float64:
+    """T_b_a (4, 4), from camera a to camera b."""
+    return invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera
 
 
 def _distances(a: _View, b: _View, scale_a: float = 1.0, scale_b: float = 1.0) -> tuple[Float64, Float64]:
@@ -335,9 +326,7 @@ def _descended(
         values, vectors = np.linalg.eigh(H / total)
         inverse = np.where(values > limits.MOVE_FLAT, 1 / np.maximum(values, limits.MOVE_FLAT), 0.0)
         step = -vectors @ (inverse * (vectors.T @ (g / total)))
-        change = np.eye(4)
-        change[:3, :3], change[:3, 3] = cv2.Rodrigues(step[:3])[0], step[3:]
-        T = T @ change
+        T = T @ transform_of(step)
     return T
 
 
@@ -347,15 +336,9 @@ def _rows(a: _View, b: _View, camera: str) -> tuple[Float64, Float64]:
     """
     points, lands, surface, normals = _landed(a, b)
     lands &= np.any(normals != 0, axis=1) & (np.abs(points[:, 2] - surface[:, 2]) < 3 * limits.MOVE_WIDE[0])
-    points, surface, normals = points[lands], surface[lands], normals[lands]
-    rows = np.zeros((len(points), 6))
-    if a.frame.camera == camera:
-        R = (invert_transform(b.frame.T_world_camera) @ a.frame.T_world_camera)[:3, :3]
-        along = normals @ R
-        rows += np.hstack([np.cross(a.points[lands], along), along])
-    if b.frame.camera == camera:
-        rows -= np.hstack([np.cross(points, normals), normals])
-    return rows, np.einsum("ki,ki->k", points - surface, normals)
+    residual, derivatives = overlap_rows(a.points, _transform(a, b), lands, surface, normals)
+    of_a, of_b = np.hsplit(derivatives, 2)
+    return (a.frame.camera == camera) * of_a + (b.frame.camera == camera) * of_b, residual
 
 
 def _cost(views: Sequence[_View], pairs: Sequence[tuple[int, int]]) -> tuple[float, float]:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.checks.check_images import ImageWatch, Kept, strided_lens, thumbnail_lens
+from splatctrl_cli.checks.check_images import ImageWatch, Kept, thumbnail_lens
 from splatctrl_cli.checks.check_times import TimesWatch
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.containers.raw_log import Damage, RawLog, RawMessage, Topic
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.logs.decoder import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from splatctrl_cli.errors import InputError
 
+CALIBRATION = "--calibration "  # begins the name of a calibration among the files that were read
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTopics:

@@ -14,6 +14,7 @@ from splatctrl_cli.files.spilled_rows import BLOCK, RowFile, Rows, Table, of_col
 from splatctrl_cli.records import Float64, JointState, Stamps
 
 OF_JOINTS = ("position", "velocity", "commanded_velocity")
+Posture = Callable[[int], Float64 | None]  # joint positions (J,) at a time [ns]; None where there are none
 COLUMNS = (*OF_JOINTS, "T_base_ee", "T_world_ee")
 
 
@@ -51,6 +52,26 @@ class StateColumns(Sequence[JointState]):
     def __iter__(self) -> Iterator[JointState]:
         for first, last in ranges(len(self)):
             yield from self.states(first, last)
+
+    def postures(self, within_ns: int) -> Posture:
+        """Joint positions at any time, linearly between the states around it that are at most `within_ns` away."""
+
+        def posture(stamp_ns: int) -> Float64 | None:
+            after = int(np.searchsorted(self.stamp_ns, stamp_ns))
+            near = [
+                i
+                for i in (after - 1, after)
+                if 0 <= i < len(self) and abs(int(self.stamp_ns[i]) - stamp_ns) <= within_ns
+            ]
+            if not near:
+                return None
+            if len(near) == 1:
+                return self[near[0]].position
+            before, later = self[near[0]], self[near[1]]
+            share = (stamp_ns - before.stamp_ns) / max(later.stamp_ns - before.stamp_ns, 1)
+            return np.asarray((1 - share) * before.position + share * later.position)
+
+        return posture
 
     def states(self, first: int, last: int) -> list[JointState]:
         """The states of a range."""

@@ -17,7 +17,7 @@ from splatctrl_cli.geometry import interpolate_transform, invert_transform
 from splatctrl_cli.logs.joint_topics import JointTopics
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.ros_log import RosLogSource
-from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.logs.source_options import CALIBRATION, SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, decoded
 from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, RgbdFrame, by_stamp
@@ -154,7 +154,7 @@ class CalibratedSource:
 
     def digests(self) -> dict[str, str]:
         """sha256 of the source's files, and of the calibration."""
-        return {**self.inner.digests(), self._correction.file.name: sha256(self._correction.file)}
+        return {**self.inner.digests(), f"{CALIBRATION}{self._correction.file.name}": sha256(self._correction.file)}
 
     def _frames(self) -> Iterator[StoredFrame]:
         for item in self.inner.stored():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.calibration.pose_refinement import _motion
+from splatctrl_cli.calibration.unknowns import transform_of
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.records import Float64, RgbdFrame
 
@@ -25,7 +25,7 @@ def disturbed(views: Sequence[RgbdFrame], millimetres: float, degrees: float) ->
         turn, move = rng.normal(size=(2, 3))
         turn, move = (axis / np.linalg.norm(axis) for axis in (turn, move))
         twist = np.concatenate([np.radians(degrees) * turn, 1e-3 * millimetres * move])
-        found.append(replace(view, T_world_camera=view.T_world_camera @ _motion(twist)))
+        found.append(replace(view, T_world_camera=view.T_world_camera @ transform_of(twist)))
     return found
 
 

@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.calibration.pose_refinement import _by_twists, _motion, refined_poses
+from splatctrl_cli.calibration.pose_refinement import refined_poses
+from splatctrl_cli.calibration.unknowns import transform_of
+from splatctrl_cli.calibration.views import by_twists
 from splatctrl_cli.geometry import invert_transform, transform_from, transform_points
 from splatctrl_cli.jobs.correct_views import Corrections, corrected_among
 from splatctrl_cli.jobs.progress import SILENT
@@ -36,14 +38,14 @@ def errors(poses: Sequence[Float64], truth: Sequence[RgbdFrame]) -> tuple[float,
 
 def test_a_distance_changes_with_both_twists_as_the_derivative_says() -> None:
     rng = np.random.default_rng(0)
-    T = _motion(rng.normal(size=6) * 0.3)
+    T = transform_of(rng.normal(size=6) * 0.3)
     own, gradient = rng.normal(size=(5, 3)) + np.array([0, 0, 3]), rng.normal(size=(5, 3))
-    by = _by_twists(own, transform_points(T, own), gradient, T)
+    by = by_twists(own, transform_points(T, own), gradient, T)
     for k in range(6):
         twist = np.zeros(6)
         twist[k] = 1e-6
-        of_a = transform_points(T @ _motion(twist), own) - transform_points(T @ _motion(-twist), own)
-        of_b = transform_points(_motion(-twist) @ T, own) - transform_points(_motion(twist) @ T, own)
+        of_a = transform_points(T @ transform_of(twist), own) - transform_points(T @ transform_of(-twist), own)
+        of_b = transform_points(transform_of(-twist) @ T, own) - transform_points(transform_of(twist) @ T, own)
         assert np.einsum("ki,ki->k", gradient, of_a) / 2e-6 == pytest.approx(by[:, k], abs=1e-7)
         assert np.einsum("ki,ki->k", gradient, of_b) / 2e-6 == pytest.approx(by[:, 6 + k], abs=1e-7)
 

@@ -73,7 +73,7 @@ def test_commands_open_the_recording_with_the_calibrated_poses_depths_and_clock(
     np.testing.assert_allclose(ratio, setup.scale, atol=0.002)
     shift = (source.states.stamp_ns - plain.states.stamp_ns) * 1e-9
     np.testing.assert_allclose(shift, setup.clock, atol=0.003)
-    assert result.out.name in source.digests()
+    assert f"--calibration {result.out.name}" in source.digests()
     assert any(result.out.name in note for note in source.loss.notes)
 
 
@@ -87,7 +87,10 @@ def test_a_capture_keeps_the_calibration_and_refuses_it_twice(log: Path, result:
     out = log.with_name("calibrated.capture")
     options = SourceOptions(calibration=result.out)
     ingest(IngestRequest(paths=(log,), out=out, options=options))
-    poses = {camera: T for _, camera, T in open_source(out).poses()}
+    capture = open_source(out)
+    key = f"--calibration {result.out.name}"
+    assert capture.digests()[key] == open_source(log, options).digests()[key]
+    poses = {camera: T for _, camera, T in capture.poses()}
     for name, camera in read_calibration(result.out).cameras.items():
         np.testing.assert_allclose(poses[name], camera.T, atol=1e-6)
     with pytest.raises(InputError, match="was ingested with"):

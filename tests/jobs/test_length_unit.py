@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splatctrl_cli.checks.check_images import strided_lens
 from splatctrl_cli.config import Config, SceneConfig
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.geometry import strided_lens
 from splatctrl_cli.jobs.check import CheckRequest, check
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.progress import Progress

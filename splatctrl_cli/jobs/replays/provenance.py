@@ -9,6 +9,7 @@ import numpy as np
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import CLOCK_MIXED, RECORDINGS_APART_NS, SAME_CLEARANCE, SAME_MOTION_STATES
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
+from splatctrl_cli.logs.source_options import CALIBRATION
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource, Stamps
 from splatctrl_cli.robot.model import RobotModel
@@ -43,7 +44,9 @@ def scene_mismatches(
         )
     other = changed_files(run.get("inputs", {}), source.digests())
     recorded = run.get("metrics", {}).get("first_frames")
-    if not other and recorded and source.cameras:
+    calibrations = list(_calibration_mismatches(scene, source.digests()))
+    yield from calibrations
+    if not other and not calibrations and recorded and source.cameras:
         other = differences(recorded, source.records())
     if other:
         yield Mismatch(
@@ -67,6 +70,21 @@ def scene_mismatches(
             sentence=f"{scene.path} was told apart from another robot, with joints {', '.join(joints)}",
             remedy="reconstruct with this --urdf",
         )
+
+
+def _calibration_mismatches(scene: SceneFolder, digests: Mapping[str, str]) -> Iterator[Mismatch]:
+    """A log with digests of which poses, depths or clock are corrected otherwise than a scene's were."""
+    theirs, ours = (
+        {digest: name.removeprefix(CALIBRATION) for name, digest in files.items() if name.startswith(CALIBRATION)}
+        for files in (scene.run.get("inputs", {}), digests)
+    )
+    if theirs.keys() == ours.keys():
+        return
+    made, given = (f"with {', '.join(names.values())}" if names else "without one" for names in (theirs, ours))
+    yield Mismatch(
+        sentence=f"calibration: {scene.path} was made {made}, this log is read {given}",
+        remedy="give the --calibration that it was made with, or reconstruct",
+    )
 
 
 def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
