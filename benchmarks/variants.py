@@ -19,7 +19,7 @@ from benchmarks.measure import ROOT
 
 HEADER = (
     *("variant", "splats", "fit [s]", "training dB", "held-out dB seen / all", "SSIM seen / all"),
-    *("median depth error seen / all [mm]", "in front seen [%]"),
+    *("median depth error seen / all [mm]", "in front seen [%]", "at corrected poses: dB, SSIM, mm, all"),
 )
 NOT_OF_SCORE = ("--max-splats", "--points")  # options of reconstruct, with one value, that score does not know
 
@@ -56,6 +56,10 @@ def row(recording: list[str], name: str, words: list[str]) -> list[str]:
         pair(scores, "ssim", 3),
         pair(scores, "depth_median", 1, 1e3),
         figure(scores["in_front_seen"], 1, 100.0),
+        ", ".join(
+            figure(scores.get(f"{name}_all_corrected"), digits, factor)
+            for name, digits, factor in (("psnr", 2, 1.0), ("ssim", 2, 1.0), ("depth_median", 1, 1e3))
+        ),
     ]
 
 

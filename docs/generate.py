@@ -171,7 +171,7 @@ def config_page() -> str:
         "default without a decimal point or exponent is an integer.",
         "",
         "`splatctrl config` prints every value that a run would use, as TOML, with a comment where one comes from a",
-        "file, `--set` or `control.preset` (which replay applies). `splatctrl config FILE.toml` checks a file, and",
+        "preset, file or `--set`. `splatctrl config FILE.toml` checks a file, and",
         "`splatctrl config --template` prints one to begin with.",
         "",
         "```toml",

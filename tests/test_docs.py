@@ -13,7 +13,7 @@ import pytest
 
 from splatctrl_cli.cli.commands import COMMANDS, build_parser
 from splatctrl_cli.cli.main import main
-from splatctrl_cli.config import load_config
+from splatctrl_cli.config import PRESETS, load_config
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines
@@ -161,6 +161,19 @@ def test_every_setting_that_the_paper_page_names_can_be_given() -> None:
         assert key in load_config(None, []).as_dict()[section], match[1]
         if match[2]:
             load_config(None, [f"{match[1]}={match[2]}"])
+
+
+def test_the_preset_of_the_paper_is_what_the_page_of_departures_says() -> None:
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    departures = re.sub(
+        r"### The baseline.*?(?=^### )", "", text.split("## Departures")[1], flags=re.DOTALL | re.MULTILINE
+    )
+    columns = [cells[2] for line in departures.splitlines() if len(cells := line.split(" | ")) > 3]
+    codes = [code for column in columns for code in CODE.findall(column)]
+    said = {match[1]: match[2] for code in codes if (match := SETTING.fullmatch(code)) and match[2]}
+    preset = load_config(None, ["preset=paper"])
+    assert load_config(None, [f"{key}={value}" for key, value in said.items()]) == preset
+    assert {f"{section}.{key}" for section, values in PRESETS["paper"].items() for key in values} <= said.keys()
 
 
 def without_code(text: str) -> str:

@@ -19,6 +19,7 @@ from splatctrl_cli.cli.options import (
     add_output,
     add_packages,
     add_seed,
+    add_settings,
     add_source,
     add_threads,
     pose,
@@ -183,7 +184,7 @@ def _num_images(text: str) -> int:
 
 def _config(add: Options, parser: Parser) -> None:
     add("FILE", "a TOML file as --config takes it; one with a wrong key or value is refused", Path, nargs="?")
-    add("--set SECTION.KEY=VALUE ...", "one setting")
+    add_settings(add)
     add("--template", "print a file to begin with: every default, commented out, with its meaning and range")
     add("--schema", "print the JSON Schema of what every command prints with --json")
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatctrl_cli.cli.parser import Options, Parser, real, several, whole
+from splatctrl_cli.config import PRESETS
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.config.ranges import MAX_PLACE, MAX_SEED, shown
 from splatctrl_cli.errors import UsageError
@@ -43,11 +44,29 @@ def add_junit(parser: Parser) -> None:
 
 
 def add_config(add: Options, parser: Parser) -> None:
-    """``--config``, ``--set``, and among the options of a run ``--seed``, ``--threads``."""
+    """`add_settings`, and among the options of a run ``--seed``, ``--threads``."""
     add("--config FILE.toml", "configuration, see docs/config.md", Path)
-    add("--set SECTION.KEY=VALUE ...", "one setting")
+    add_settings(add)
     add_seed(Options(parser.run_group), "everything random")
     add_threads(parser)
+
+
+def add_settings(add: Options, example: str = "") -> None:
+    """``--set`` and ``--preset``, which is the first of the settings."""
+    add("--set SECTION.KEY=VALUE ...", f"one setting{example}")
+    add(
+        "--preset NAME",
+        "paper: as printed, where docs/paper.md departs from it",
+        _preset,
+        dest="set",
+        action="append",
+    )
+
+
+def _preset(text: str) -> str:
+    if text not in PRESETS:
+        raise argparse.ArgumentTypeError(f"expected {' or '.join(PRESETS)}, got {shown(text)}")
+    return f"preset={text}"
 
 
 def add_seed(add: Options, what: str) -> None:

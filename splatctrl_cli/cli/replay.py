@@ -8,7 +8,6 @@ from splatctrl_cli.cli.common import Console, long_table, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.control.preconditions import StaticViolation
-from splatctrl_cli.control.printed_program import with_preset
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.compare import MOTION, PLAN, figures_of
 from splatctrl_cli.jobs.replays.files import chunks_of, when_and_why
@@ -29,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
         ReplayRequest,
         args,
         out=args.out or Path("replay"),
-        config=with_preset(load_config(args.config, args.set)),
+        config=load_config(args.config, args.set),
         options=source_options(args),
         locked=locked_joints(args),
     )

@@ -12,6 +12,7 @@ from splatctrl_cli.cli.options import (
     add_gates,
     add_output,
     add_scan,
+    add_settings,
     add_source,
     add_threads,
 )
@@ -133,7 +134,7 @@ def query_options(add: Options, parser: Parser) -> None:
     add("--at SECONDS", later, real(-MAX_SECONDS, MAX_SECONDS, "s"))
     add("--include NAME,...", "of a scene: labels that count beside object: robot, human, or none", str, "human")
     add("--config FILE.toml", "configuration, see docs/config.md", Path)
-    add("--set SECTION.KEY=VALUE ...", "one setting, such as field.distance=hard")
+    add_settings(add, ", such as field.distance=hard")
     add_threads(parser)
 
 

@@ -1,10 +1,11 @@
 """Every number of the method, by section of the paper. The paper's value is the default where it gives one."""
 
-from splatctrl_cli.config.load import Config, check_voxel, load_config, sources_of
+from splatctrl_cli.config.load import PRESETS, Config, check_voxel, load_config, sources_of
 from splatctrl_cli.config.map import FieldConfig, GaussianConfig, HumanConfig, OccupancyConfig, SceneConfig
 from splatctrl_cli.config.motion import ControlConfig, PlannerConfig, VerdictConfig
 
 __all__ = [
+    "PRESETS",
     "Config",
     "ControlConfig",
     "FieldConfig",

@@ -49,6 +49,35 @@ class Config:
         return asdict(self)
 
 
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "paper": {  # the printed form of each departure that docs/paper.md has a setting for
+        "scene": {
+            "scale": 1.0,
+            "lambda_reg": 0.02,
+            "lambda_opacity": 0.0,
+            "depth_loss": "printed",
+            "background": "black",
+            "hole_opacity": 0.0,
+            "min_depth_error": 0.0,
+            "max_depth_error": 1e9,
+            "max_gap": 1e9,
+            "when_idle": "clone",
+            "refine_iterations": 0,
+            "refine_depth": 1.0,
+        },
+        "occupancy": {"rule": "literal", "min_range": 0.0, "see_through": 1e9},
+        "field": {"distance": "gpdf", "probability": "paper"},
+        "control": {
+            "program": "printed",
+            "barrier_gain": 1.0,
+            "posture_weight": 1e-9,
+            "max_cuts": 0,
+            "distance_rate": "none",
+        },
+    }
+}
+
+
 def check_voxel(scene: SceneConfig, occupancy: OccupancyConfig) -> None:
     """Raise UsageError for voxels smaller than the largest splat, which III-C excludes."""
     least = scene.max_radius
@@ -56,7 +85,7 @@ def check_voxel(scene: SceneConfig, occupancy: OccupancyConfig) -> None:
 
 
 def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
-    """Defaults, then the TOML file, then each ``section.key=value``.
+    """Defaults, then a preset (``preset=NAME`` among the assignments), the TOML file, each ``section.key=value``.
 
     Raises UsageError for an unknown section or key (naming the nearest), a value of the wrong type or out of range,
     values that contradict each other, or TOML that does not parse; InputError for a file that is not there.
@@ -69,7 +98,7 @@ def load_config(path: Path | None, assignments: Sequence[str]) -> Config:
 
 
 def sources_of(path: Path | None, assignments: Sequence[str]) -> dict[str, str]:
-    """Which of the file and ``--set`` gives each ``section.key`` that either gives. Raises as `load_config`."""
+    """Which of preset, file and ``--set`` gives each ``section.key`` that one gives. Raises as `load_config`."""
     return {
         f"{section}.{key}": "--set" if where.startswith("--set ") else where
         for where, section, values in _tables(path, assignments)
@@ -79,12 +108,19 @@ def sources_of(path: Path | None, assignments: Sequence[str]) -> dict[str, str]:
 
 def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Where it is given, the section, and values by key."""
+    presets = [text.partition("=")[2].strip() for text in assignments if _is_preset(text)]
+    for name in presets:
+        _check_known(name, PRESETS, "--preset", "")
+        for section, values in PRESETS[name].items():
+            yield f"--preset {name}", section, values
     for section, values in ({} if path is None else _read_toml(path)).items():
         _check_known(section, [field.name for field in fields(Config)], str(path), "")
         if not isinstance(values, dict):
             raise UsageError(f"{path}: {section}: expected a table, got {shown(values)}")
         yield str(path), section, values
     for assignment in assignments:
+        if _is_preset(assignment):
+            continue
         key, separator, text = assignment.partition("=")
         section, dot, name = key.strip().partition(".")
         if not separator or not dot:
@@ -94,6 +130,10 @@ def _tables(path: Path | None, assignments: Sequence[str]) -> Iterator[tuple[str
         where = f"--set {cut(assignment)}"
         _check_known(section, [field.name for field in fields(Config)], where, "")
         yield where, section, {name: _parse_value(text.strip())}
+
+
+def _is_preset(assignment: str) -> bool:
+    return assignment.partition("=")[0].strip() == "preset"
 
 
 def _typed(where: str, section: str, values: dict[str, Any]) -> dict[str, Any]:

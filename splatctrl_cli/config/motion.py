@@ -10,8 +10,8 @@ from splatctrl_cli.config.ranges import MAX_SEED, OneOf, Section, Within, check
 class ControlConfig(Section, section="control"):
     """III-E: QP inverse kinematics with control barrier functions."""
 
-    preset: Annotated[
-        str, OneOf(("reduced", "paper"), "reduced form, or III-E as printed: barrier_gain 1 and no second look")
+    program: Annotated[
+        str, OneOf(("reduced", "printed"), "reduced form, or that of III-E as printed, without a second look")
     ] = "reduced"
     solver: Annotated[str, OneOf(("clarabel", "daqp"), "of the QP; daqp is several times as fast")] = "clarabel"
     margin: Annotated[float, Within(0, 1, "m", "epsilon, the clearance to keep (IV-C)")] = 0.02

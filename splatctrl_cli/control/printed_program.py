@@ -5,28 +5,17 @@ slack per external row, of either sign, and ``x - J v`` the paper's delta_x, whi
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from splatctrl_cli.config import Config, ControlConfig
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.fallbacks import Choice, Rung, held, is_usable
 from splatctrl_cli.control.limits import box_rows
 from splatctrl_cli.control.qp import QpSolver, QuadraticProgram
 from splatctrl_cli.control.terms import Barrier, Cost, State, configured_weights
 from splatctrl_cli.records import Float64
 
-PAPER = "paper"
-
-
-def applied(config: ControlConfig) -> ControlConfig:
-    """The configuration with the numbers that its preset fixes: as printed, every row has a gain of 1 per second."""
-    return replace(config, barrier_gain=1.0) if config.preset == PAPER else config
-
-
-def with_preset(config: Config) -> Config:
-    """The whole configuration with its preset applied."""
-    return replace(config, control=applied(config.control))
+PRINTED = "printed"
 
 
 def assemble_printed(

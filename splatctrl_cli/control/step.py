@@ -13,7 +13,7 @@ from splatctrl_cli.control.fallbacks import Choice, Rung, descend, held
 from splatctrl_cli.control.goals import Guide, pose_error, reference_velocity
 from splatctrl_cli.control.limits import JointLimits
 from splatctrl_cli.control.preconditions import check_coverage, check_model, checked_posture
-from splatctrl_cli.control.printed_program import PAPER, solve_printed
+from splatctrl_cli.control.printed_program import PRINTED, solve_printed
 from splatctrl_cli.control.qp import QpSolver, solver_named, unsolved
 from splatctrl_cli.control.qp_rows import RowBuilder, Rows
 from splatctrl_cli.control.terms import BarrierTerm, Cost, CostTerm, ReachGoal, RowKind, State, standard_costs, summed
@@ -164,7 +164,7 @@ class QpIkController:
         view = self._viewed(q, T_world_goal, distance_rate, guide, last_velocity)
         error, state, rows = view.error, view.state, view.rows
         costs = [term.rows(state) for term in self._costs]
-        if config.preset == PAPER:
+        if config.program == PRINTED:
             printed = solve_printed(self._solver, state, summed(costs), rows.for_qp, config)
             return self._reported(error, rows, printed, rest, float(printed.rung is not Rung.HOLD))
         rows, choice, is_kept = self._descended(state, [*costs, self._reach.rows(state)], rows)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from splatctrl_cli.config import Config
-from splatctrl_cli.control.printed_program import with_preset
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.verdict import DAMAGED, Outcome, Reason, Verdict, verdict_of
@@ -177,7 +176,7 @@ def _steps(data: Path, out: Path, threads: int, progress: Progress) -> list[Step
         spheres=spheres,
         truth=truth,
         out=out / "audit",
-        config=with_preset(Config()),
+        config=Config(),
         threads=threads,
     )
     driven = replace(audited, out=out / "closed_loop", mode="closed-loop", start_time=CLOSED_LOOP_START)

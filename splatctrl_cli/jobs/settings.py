@@ -7,16 +7,15 @@ from pathlib import Path
 
 from splatctrl_cli.config import Config, load_config, sources_of
 from splatctrl_cli.config.ranges import Declared
-from splatctrl_cli.control.printed_program import with_preset
 
-DEFAULT, PRESET = "default", "control.preset"
+DEFAULT = "default"
 
 Value = int | float | str | tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """A key with its value; source: `DEFAULT`, the file's name, ``--set``, or `PRESET` (applied by replay)."""
+    """A key with its value; source: `DEFAULT`, the preset, the file's name, or ``--set``."""
 
     section: str
     key: str
@@ -42,25 +41,23 @@ class Setting:
 
 
 def resolved_settings(path: Path | None, assignments: Sequence[str]) -> tuple[Setting, ...]:
-    """All keys as a run would use them: defaults, then the file, then each assignment, then the preset.
+    """All keys as a run would use them: defaults, then the preset, the file, each assignment.
 
     Raises as `load_config`.
     """
-    given, default = load_config(path, assignments), Config()
-    used, sources = with_preset(given), sources_of(path, assignments)
+    used, default = load_config(path, assignments), Config()
+    sources = sources_of(path, assignments)
     settings = []
     for section in fields(Config):
         kind = getattr(default, section.name)
         for key, declared in kind.declared.items():
-            before, value = (getattr(getattr(config, section.name), key) for config in (given, used))
-            source = sources.get(f"{section.name}.{key}", DEFAULT) if value == before else PRESET
             settings.append(
                 Setting(
                     section=section.name,
                     key=key,
-                    value=value,
+                    value=getattr(getattr(used, section.name), key),
                     default=getattr(kind, key),
-                    source=source,
+                    source=sources.get(f"{section.name}.{key}", DEFAULT),
                     declared=declared,
                 )
             )

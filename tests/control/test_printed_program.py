@@ -6,18 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.config import ControlConfig, load_config
+from splatctrl_cli.config import ControlConfig
 from splatctrl_cli.control.fallbacks import Rung
-from splatctrl_cli.control.printed_program import applied
 from splatctrl_cli.control.step import QpIkController
 from splatctrl_cli.control.terms import RowKind
-from splatctrl_cli.errors import UsageError
 from splatctrl_cli.records import DistanceField, Float64
 from splatctrl_cli.robot.model import RobotModel
 from tests.control.fakes import Balls, PlanarArm, Plane, far_away
 
 REDUCED = ControlConfig(barrier_gain=1.0)
-PAPER = applied(replace(ControlConfig(), preset="paper"))
+PAPER = ControlConfig(program="printed", barrier_gain=1.0)
 
 
 def both(field: DistanceField, q: Float64, goal: Float64, **changes: float) -> tuple[object, ...]:
@@ -26,14 +24,6 @@ def both(field: DistanceField, q: Float64, goal: Float64, **changes: float) -> t
     T = arm.frame_pose(goal, "tip")
     configs = [replace(config, **changes) for config in (PAPER, REDUCED)]  # type: ignore[arg-type]
     return tuple(QpIkController(arm, config, field, frame="tip").step(q, T) for config in configs)
-
-
-def test_the_preset_fixes_the_gain_and_nothing_else() -> None:
-    assert replace(ControlConfig(), preset="paper", barrier_gain=1.0) == PAPER
-    assert applied(ControlConfig()) == ControlConfig()
-    assert load_config(None, ["control.preset=paper"]).control.preset == "paper"
-    with pytest.raises(UsageError, match=r"control\.preset: expected reduced or paper"):
-        load_config(None, ["control.preset=printed"])
 
 
 def test_both_forms_agree_where_no_external_row_is_active() -> None:

@@ -273,7 +273,7 @@ def test_holding_still_is_braking_where_the_arm_cannot_stop_at_once() -> None:
     np.testing.assert_allclose(step.velocity, [0.46, 0.0], atol=1e-12)
     at_once = controller(far_away(), solver=Scripted(3)).step(Q, goal(np.zeros(2)), last_velocity=last)
     assert at_once.rung is Rung.HOLD and not at_once.velocity.any()
-    printed = replace(config, preset="paper", barrier_gain=1.0)
+    printed = replace(config, program="printed", barrier_gain=1.0)
     step = controller(far_away(), printed, solver=Scripted(1)).step(Q, goal(np.zeros(2)), last_velocity=last)
     assert step.rung is Rung.HOLD
     np.testing.assert_allclose(step.velocity, [0.46, 0.0], atol=1e-12)

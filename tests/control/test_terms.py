@@ -151,10 +151,10 @@ class SlowShoulder(BarrierTerm):
         return Barrier(index=np.arange(2), G=G, h=h, distance=far, slack_cost=1e6, slack_weight=1.0)
 
 
-@pytest.mark.parametrize("preset", ["reduced", "paper"])
-def test_terms_of_ones_own_add_up_with_those_of_the_paper(preset: str) -> None:
+@pytest.mark.parametrize("program", ["reduced", "printed"])
+def test_terms_of_ones_own_add_up_with_those_of_the_paper(program: str) -> None:
     arm, q = PlanarArm(), np.array([0.3, 0.9])
-    config, goal = ControlConfig(preset=preset), arm.frame_pose(np.array([0.9, 1.4]), "tip")
+    config, goal = ControlConfig(program=program), arm.frame_pose(np.array([0.9, 1.4]), "tip")
 
     def stepped(*terms: CostTerm | BarrierTerm) -> ControlStep:
         return QpIkController(arm, config, far_away(), frame="tip", terms=terms).step(q, goal)

@@ -5,10 +5,9 @@ from pathlib import Path
 import pytest
 
 from splatctrl_cli.config import Config, load_config
-from splatctrl_cli.control.printed_program import with_preset
 from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
-GIVEN = ["scene.max_splats=9", "control.preset=paper", "control.max_acceleration=[1.0, 2.5]"]
+GIVEN = ["scene.max_splats=9", "preset=paper", "control.max_acceleration=[1.0, 2.5]"]
 
 
 @pytest.fixture
@@ -22,7 +21,8 @@ def test_each_value_says_where_it_comes_from(file: Path) -> None:
     found = {setting.name: (setting.value, setting.source) for setting in resolved_settings(file, GIVEN)}
     assert found["scene.max_splats"] == (9, "--set")
     assert found["scene.fill"] == (0.5, str(file))
-    assert found["control.barrier_gain"] == (1.0, "control.preset")
+    assert found["control.barrier_gain"] == (4.0, str(file))
+    assert found["control.program"] == ("printed", "--preset paper")
     assert found["control.margin"] == (Config().control.margin, "default")
     num_keys = sum(len(section) for section in Config().as_dict().values())
     assert len(found) == num_keys
@@ -31,7 +31,7 @@ def test_each_value_says_where_it_comes_from(file: Path) -> None:
 def test_what_is_printed_is_a_file_with_the_same_settings(file: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.toml"
     again.write_text("\n".join(toml_of(resolved_settings(file, GIVEN))))
-    assert load_config(again, []) == with_preset(load_config(file, GIVEN))
+    assert load_config(again, []) == load_config(file, GIVEN)
     assert f"fill = 0.5  # {file} (default: 0.85)" in again.read_text()
 
 
