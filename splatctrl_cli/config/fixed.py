@@ -105,6 +105,8 @@ SAME_PLACE_METRES = 0.001  # [m] within which two cameras stand in one place
 SAME_PLACE_DEGREES = 0.1  # [deg] likewise
 OTHER_VIEW_CLEARLY = 3.0  # [dB] by which a photo has to be nearer another view's render than its own
 SAME_MOTION_STATES = 20  # states in which a recording's clearance is compared with a truth file's
+SAME_LINK = 1e-3  # [m] by which the boxes about one link of two models of a robot may differ
+SAME_LINK_AREA = 0.01  # share of its surface by which a link of two models of a robot may differ
 SAME_CLEARANCE = 1e-3  # [m] a truth file keeps six digits
 RECORDINGS_APART_NS = 1_000_000_000  # [ns] between the times of two recordings that can still be one
 

@@ -246,6 +246,7 @@ class Reconstruction:
             "added": sum(row.added for row in self.rows),
             "relocated": sum(row.relocated for row in self.rows),
             "robot_joints": None if self.robot is None else list(self.robot.joint_names),
+            "robot_links": None if self.robot is None else self.robot.extents(),
             "unmet": last.unmet,
             "evicted": sum(row.evicted for row in self.rows),
             "unrepresented_voxels": last.unrepresented,

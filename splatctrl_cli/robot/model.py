@@ -145,6 +145,12 @@ class RobotModel:
             self._surface = RobotSurface.of(self.urdf, self.sphere_set, self._packages)
         return self._surface
 
+    def extents(self) -> dict[str, list[float]]:
+        """Where `surface` has each link, in one posture: `RobotSurface.extents`."""
+        q = np.asarray(0.3 * (1 + np.arange(len(self.joint_names)) % 3), np.float64)  # bent, so that each axis shows
+        surface = self.surface
+        return surface.extents(surface.poses({link: self.frame_pose(q, link) for link in surface.links}))
+
     def with_self_pairs(self, pairs: Index) -> "RobotModel":
         """The same robot, whose `self_pairs` are these (P, 2)."""
         return self._changed(_chosen_pairs=np.asarray(pairs, dtype=np.int64).reshape(-1, 2), _allowance=None)

@@ -144,6 +144,24 @@ class RobotSurface:
         """(L, 4, 4) of `links`, from poses by name."""
         return np.array([T_world_link[link] for link in self.links], np.float64).reshape(-1, 4, 4)
 
+    def extents(self, T_world_link: Float64) -> dict[str, list[float]]:
+        """By link, at T_world_link (L, 4, 4): lower and upper corner of the box about its solids and triangles [m],
+        and their area [m^2].
+        """
+        T = T_world_link[self.solid_links] @ self.T_link_solid
+        half, areas = _half_extents(self.kinds, self.sizes, T[:, :3, :3]), _areas(self.kinds, self.sizes)
+        T_link = T_world_link[self.triangle_links]
+        corners = np.einsum("fij,fkj->fki", T_link[:, :3, :3], self.triangles) + T_link[:, None, :3, 3]
+        sides = np.diff(corners, axis=1)
+        areas = np.append(areas, 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1))
+        lower = np.concatenate([T[:, :3, 3] - half, corners.min(axis=1)])
+        upper = np.concatenate([T[:, :3, 3] + half, corners.max(axis=1)])
+        number = np.append(self.solid_links, self.triangle_links)
+        return {
+            link: [*lower[number == k].min(axis=0), *upper[number == k].max(axis=0), areas[number == k].sum()]
+            for k, link in enumerate(self.links)
+        }
+
     def render(
         self,
         T_world_link: Float64,
@@ -188,6 +206,23 @@ class RobotSurface:
             if self.links[link] not in without:
                 np.minimum(least, _distance(kind, size, transform_points(T, points_world)), out=least)
         return least
+
+
+def _half_extents(kinds: Float64, sizes: Float64, R: Float64) -> Float64:
+    """Half edges (P, 3) [m] of the boxes along the axes about solids turned by R (P, 3, 3)."""
+    radius, length = sizes[:, :1], np.abs(R[:, :, 2]) * sizes[:, 1:2]
+    is_flat = np.isin(kinds, [CYLINDER])[:, None]
+    across = radius * np.where(is_flat, np.sqrt(np.maximum(1 - np.square(R[:, :, 2]), 0.0)), 1.0)
+    of_box = np.einsum("pij,pj->pi", np.abs(R), sizes)
+    return np.where((kinds == BOX)[:, None], of_box, np.where((kinds == BALL)[:, None], radius, across + length))
+
+
+def _areas(kinds: Float64, sizes: Float64) -> Float64:
+    """(P,) [m^2]."""
+    a, b, c = sizes.T
+    of_box, round_part, ends = 8 * (a * b + b * c + c * a), 4 * np.pi * a * b, np.pi * a * a
+    choices = [of_box, round_part + 2 * ends, 4 * ends, round_part + 4 * ends]
+    return np.select([kinds == kind for kind in (BOX, CYLINDER, BALL, CAPSULE)], choices)
 
 
 def _distance(kind: float, size: Float64, points: Float64) -> Float64:

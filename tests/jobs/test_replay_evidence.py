@@ -81,12 +81,18 @@ def test_a_scene_that_belongs_to_its_log_is_safe(stage: Stage) -> None:
     assert stage.judged()[0] == 0
 
 
+JOINTS = [f"joint{number}" for number in range(1, 8)]
 NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
     "other digests": (lambda s: of_run(s, inputs={"fake.mcap": "1" * 64}), "was made from another recording"),
     "another robot": (
         lambda s: of_run(s, metrics={"robot_joints": list("abcdefg")}),
         "another robot, with joints a, b",
     ),
+    "a table among the robot's links": (
+        lambda s: of_run(s, metrics={"robot_joints": JOINTS, "robot_links": {"cell": [0, 0, 0, 1, 1, 1, 6]}}),
+        "another robot, with link cell, which this one lacks",
+    ),
+    "robot of an earlier version": (lambda s: of_run(s, metrics={"robot_joints": JOINTS}), "kept the joints alone"),
     "with a calibration": (
         lambda s: of_run(s, inputs={"--calibration cell.toml": "1" * 64}),
         "was made with cell.toml, this log is read without one",

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from pinocchio.rpy import rpyToMatrix
 
 from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.model import RobotModel
@@ -12,6 +14,7 @@ from tests.robot.shapes import arm_of, l_shape, written
 BALL = '<sphere radius="0.02"/>'
 CAPSULE = '<capsule radius="0.1" length="0.4"/>'
 ORIGIN = '<origin xyz="0.1 0.2 0.3" rpy="0 1.5707963267948966 0"/>'
+TURNED = '<origin xyz="0.1 0.2 0.3" rpy="0.4 0.7 -0.5"/>'
 SPHERES = SphereSet(links=("base", "tip"), centers=np.zeros((2, 3)), radii=np.full(2, 0.3))
 
 
@@ -40,3 +43,25 @@ def test_meshes_of_packages_elsewhere_are_the_surface_where_their_folder_is_give
     assert RobotModel.from_urdf(urdf, SPHERES).surface.by_spheres == ("base",)
     found = RobotModel.from_urdf(urdf, SPHERES, packages=[tmp_path / "elsewhere"]).surface
     assert found.by_spheres == () and len(found.triangles) == len(l_shape().faces)
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere", "capsule", "mesh"])
+def test_extents_are_those_of_the_same_shape_as_triangles(tmp_path: Path, kind: str) -> None:
+    shape, text = {
+        "box": (trimesh.creation.box((0.2, 0.3, 0.5)), '<box size="0.2 0.3 0.5"/>'),
+        "cylinder": (trimesh.creation.cylinder(0.1, 0.4, 512), '<cylinder radius="0.1" length="0.4"/>'),
+        "sphere": (trimesh.creation.icosphere(5, 0.1), '<sphere radius="0.1"/>'),
+        "capsule": (trimesh.creation.capsule(0.4, 0.1, (512, 256)), '<capsule radius="0.1" length="0.4"/>'),
+        "mesh": (l_shape(), '<mesh filename="ell.stl"/>'),
+    }[kind]
+    if kind == "mesh":
+        shape.export(tmp_path / "ell.stl")
+    model = RobotModel.from_urdf(written(tmp_path, arm_of(text, BALL, origin=TURNED)), SPHERES)
+    assert model.surface.by_spheres == ()
+    T = np.eye(4)
+    T[:3, :3] = rpyToMatrix(0.4, 0.7, -0.5)
+    T[:3, 3] = 0.1, 0.2, 0.3
+    found = model.extents()["base"]
+    np.testing.assert_allclose(found[:6], shape.apply_transform(T).bounds.ravel(), atol=2e-4)
+    parts = 0.2 * np.pi * 0.3 if kind == "capsule" else 0.0  # it is a cylinder and two balls, whole
+    assert found[6] == pytest.approx(shape.area + parts, rel=2e-3)

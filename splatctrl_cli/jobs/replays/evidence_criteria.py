@@ -321,7 +321,7 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def belonging(judged: Judged) -> Iterator[Reason]:
-    """Scene, log and robot belong together: digests, first frames, times, joints; files as written; splats that
+    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as written; splats that
     agree with their occupancy grid.
     """
     for mismatch in judged.inputs.mismatches:

@@ -7,7 +7,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
-from splatctrl_cli.config.fixed import CLOCK_MIXED, RECORDINGS_APART_NS, SAME_CLEARANCE, SAME_MOTION_STATES
+from splatctrl_cli.config.fixed import (
+    CLOCK_MIXED,
+    RECORDINGS_APART_NS,
+    SAME_CLEARANCE,
+    SAME_LINK,
+    SAME_LINK_AREA,
+    SAME_MOTION_STATES,
+)
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
 from splatctrl_cli.logs.source_options import CALIBRATION
 from splatctrl_cli.logs.state_columns import StateColumns
@@ -64,12 +71,34 @@ def scene_mismatches(
         if found is not None:
             yield found
     yield from _map_mismatches(scene)
-    joints = run.get("metrics", {}).get("robot_joints")
-    if joints is not None and tuple(joints) != tuple(model.joint_names):
+    if other_robot := _robot_difference(run.get("metrics", {}), model):
         yield Mismatch(
-            sentence=f"{scene.path} was told apart from another robot, with joints {', '.join(joints)}",
-            remedy="reconstruct with this --urdf",
+            sentence=f"{scene.path} was told apart from another robot, {other_robot}",
+            remedy="reconstruct with this --urdf, or give the one that it was made with",
         )
+
+
+def _robot_difference(metrics: Mapping[str, Any], model: RobotModel) -> str:
+    """How the robot that a scene's splats were told apart from differs from a model, in words; empty where it does
+    not. What it has and the model lacks is neither in the map nor on the robot; what only the model has is in both.
+    """
+    joints = metrics.get("robot_joints")
+    if joints is None:
+        return ""
+    if tuple(joints) != tuple(model.joint_names):
+        return f"with joints {', '.join(joints)}"
+    theirs, ours = metrics.get("robot_links"), model.extents()
+    if theirs is None:
+        return "of which an earlier version kept the joints alone"
+    for link, (*corners, area) in theirs.items():
+        if link not in ours:
+            return f"with link {link}, which this one lacks: nothing else stands for it"
+        off = np.abs(np.subtract(corners, ours[link][:-1])).max()
+        if off > SAME_LINK:
+            return f"whose link {link} reaches {1e3 * off:.1f} mm farther, or less far"
+        if abs(area / ours[link][-1] - 1) > SAME_LINK_AREA:
+            return f"whose link {link} has a surface of {area:.4f} m^2, not {ours[link][-1]:.4f}"
+    return ""
 
 
 def _calibration_mismatches(scene: SceneFolder, digests: Mapping[str, str]) -> Iterator[Mismatch]:
