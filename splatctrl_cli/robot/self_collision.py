@@ -100,8 +100,19 @@ def without_disabled(model: RobotModel, disabled: Sequence[DisabledPair]) -> Int
     return np.asarray(pairs[np.array(keep, dtype=np.bool_)])
 
 
+def fixtures(model: RobotModel) -> set[str]:
+    """Links that stand still and carry no joint that moves: a table, a post, a cover of the base."""
+    bodies = model.urdf.rigid_bodies(model.joint_names)
+    moving = [joint for joint in model.urdf.joints if joint.name in model.joint_names]
+    led = {joint.child for joint in moving}
+    return {link for link, (leader, _) in bodies.items() if leader not in led} - {joint.parent for joint in moving}
+
+
 def joined_links(model: RobotModel, links: Sequence[str]) -> dict[frozenset[str], str]:
-    """Pairs of links that no posture tells anything about, and why: of one rigid body, or of two with one joint."""
+    """Pairs of links that no posture tells anything about, and why: of one rigid body, or of two with one joint, but
+    for fixtures.
+    """
+    standing = fixtures(model)
     bodies = model.urdf.rigid_bodies(model.joint_names)
     leader = {link: bodies[link][0] for link in links}
     parent = {joint.child: bodies[joint.parent][0] for joint in model.urdf.joints}
@@ -109,6 +120,8 @@ def joined_links(model: RobotModel, links: Sequence[str]) -> dict[frozenset[str]
     for one, other in combinations(links, 2):
         if leader[one] == leader[other]:
             reasons[frozenset((one, other))] = "one rigid body"
+        elif one in standing or other in standing:
+            continue
         elif leader[one] == parent.get(leader[other]) or leader[other] == parent.get(leader[one]):
             reasons[frozenset((one, other))] = "adjacent"
     return reasons

@@ -7,11 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatctrl_cli.config.fixed import SELF_KEPT, SELF_OFTEN, SELF_POSTURES, SELF_ROUNDING, SELF_SHARE, SELF_TOLD
+from splatctrl_cli.config.fixed import (
+    SELF_KEPT,
+    SELF_OFTEN,
+    SELF_POSTURES,
+    SELF_ROUNDING,
+    SELF_SHARE,
+    SELF_TOLD,
+    SELF_TOUCHING,
+)
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import random_postures
+from splatctrl_cli.robot.self_collision import fixtures, random_postures
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +28,7 @@ class KeptMargin:
 
     margin: below 0 the spheres may overlap by so much; None: they cannot be kept apart at all, and it stays as asked.
     apart: the least gap [m] of their surfaces (of their spheres where these are not known) that is not *near*, below.
+    is_fixture: one stands still and carries none, such as a table of the URDF.
     surface_gap: no gap [m] of their surfaces is less in the sampled postures in which their spheres keep the margin,
     negative where they overlap; None where the surfaces are not known.
     """
@@ -28,6 +37,19 @@ class KeptMargin:
     margin: float | None
     apart: float
     surface_gap: float | None
+    is_fixture: bool = False
+
+
+def fixture_margins(model: RobotModel, surfaces: SelfSurfaces, margin: float) -> tuple[KeptMargin, ...]:
+    """The pairs of a link that moves and one of `fixtures`, which no map has: they keep `margin` [m], or a share of
+    the largest gap that they ever have.
+    """
+    standing = fixtures(model)
+    postures, found = random_postures(model, SELF_TOUCHING, seed=0), []
+    for pair in (pair for pair in surfaces.pairs if not standing.isdisjoint(pair)):
+        apart = min(margin, SELF_SHARE * max(surfaces.gap(q, pair) for q in postures))
+        found.append(KeptMargin(links=pair, margin=None, apart=apart, surface_gap=None, is_fixture=True))
+    return tuple(found)
 
 
 def kept_margins(model: RobotModel, margin: float, surfaces: SelfSurfaces | None) -> tuple[KeptMargin, ...]:

@@ -30,6 +30,7 @@ POST = f"""<robot name="post">
 <joint name="slide" type="prismatic"><parent link="carriage"/><child link="bob"/><axis xyz="0 0 1"/>
 <limit lower="-9" upper="0.05" velocity="1" effort="1"/></joint></robot>"""
 POST_SPHERES = SphereSet(links=("post", "bob"), centers=np.array([[0, 0, -0.05], [0, 0, 0]]), radii=np.full(2, 0.04))
+COVER = '<collision><origin xyz="0.022 0 0.054"/><geometry><box size="0.02 0.02 0.008"/></geometry></collision>'
 DRIVE = ("--mode", "closed-loop", "--set", "control.solver=daqp", "--set", "control.max_time=4")
 SRDF = '<robot name="folding"><disable_collisions link1="block" link2="drum" reason="Never"/></robot>'
 
@@ -82,6 +83,30 @@ def test_spheres_that_overlap_where_the_links_do_not_are_no_contact(
     desk = desk_of(tmp_path, monkeypatch, spheres, -OPEN, OPEN)
     found = judged(desk)
     assert found["outcome"] == "passed" and found["value"] == pytest.approx(0.022, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("above", "expected"),
+    [(0.235, ("failed", "contact")), (0.2474, ("failed", "margin broken")), (0.29, ("passed", ""))],
+)
+def test_what_the_urdf_has_beside_the_arm_keeps_the_margin_though_no_sphere_stands_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, above: float, expected: tuple[str, str]
+) -> None:
+    """A shelf above the blade's way, whose highest point is 242.4 mm up, and a cover that is always 2 mm off."""
+    shelf = f'<origin xyz="0 0 {above + 0.01}"/><geometry><box size="0.5 0.5 0.02"/></geometry>'
+    cell = "".join(
+        f'<link name="{name}">{body}</link><joint name="of_{name}" type="fixed"><parent link="block"/>'
+        f'<child link="{name}"/></joint>'
+        for name, body in (("shelf", f"<collision>{shelf}</collision>"), ("cover", COVER))
+    )
+    urdf = URDF.replace("</robot>", f"{cell}</robot>")
+    desk = desk_of(tmp_path, monkeypatch, COVERING, OPEN, 0 * OPEN, -OPEN, urdf=urdf)
+    desk.source.joint_names = ("turn", "fold")
+    found = judged(desk)
+    assert (found["outcome"], found.get("label") or "") == expected
+    if expected[1] == "margin broken":
+        assert "drum and shelf, one of which stands still, are 5.0 mm apart, margin 20.0 mm" in found["sentence"]
+        assert found["time_s"] == pytest.approx(0.38, abs=0.03)
 
 
 def test_a_pair_that_an_srdf_names_may_touch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

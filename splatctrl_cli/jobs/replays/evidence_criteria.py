@@ -321,8 +321,8 @@ def clocks(judged: Judged) -> Iterator[Reason]:
 
 
 def belonging(judged: Judged) -> Iterator[Reason]:
-    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as written; splats that
-    agree with their occupancy grid.
+    """Scene, log and robot belong together: digests, first frames, calibration, times, joints, links; files as
+    written; splats that agree with their occupancy grid.
     """
     for mismatch in judged.inputs.mismatches:
         yield lacking(sentence=mismatch.sentence, remedy=mismatch.remedy)

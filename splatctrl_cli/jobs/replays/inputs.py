@@ -30,7 +30,7 @@ from splatctrl_cli.robot.link_gaps import SelfSurfaces
 from splatctrl_cli.robot.link_meshes import read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import without_disabled
-from splatctrl_cli.robot.self_margins import KeptMargin, kept_margins, with_kept_margins
+from splatctrl_cli.robot.self_margins import KeptMargin, fixture_margins, kept_margins, with_kept_margins
 from splatctrl_cli.robot.srdf import DisabledPair, read_srdf
 from splatctrl_cli.states.state_source import StateSource, open_states
 
@@ -106,7 +106,9 @@ def measured_robot(
     if config.coverage == "margin":
         _check_bounded(model)
     kept = () if request.mode == "audit" else kept_margins(model, config.self_margin, surfaces)
-    return MeasuredRobot(model=with_kept_margins(model, config.self_margin, kept), surfaces=surfaces, kept=kept)
+    beside = () if surfaces is None else fixture_margins(model, surfaces, config.margin)
+    model = with_kept_margins(model, config.self_margin, kept)
+    return MeasuredRobot(model=model, surfaces=surfaces, kept=(*kept, *beside))
 
 
 def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfig) -> list[str]:
@@ -122,7 +124,7 @@ def doubts_of(request: ReplayRequest, robot: MeasuredRobot, config: ControlConfi
             f"{' and '.join(pair.links)}: their spheres overlap in every posture sampled, and nothing tells whether "
             "they touch: fit finer spheres (splatctrl robot spheres), or leave the pair out (--srdf)"
             for pair in robot.kept
-            if pair.margin is None
+            if pair.margin is None and not pair.is_fixture
         ),
     ]
 

@@ -129,7 +129,8 @@ def _at_worst(event: Event, reason: Reason) -> Reason:
 
 
 def self_clearance(judged: Judged) -> Iterator[Reason]:
-    """No two links of the arm overlap, and none that were given a lower margin are driven nearer to each other than
+    """No two links of the arm overlap, none comes within the margin of one that stands still and carries none (a
+    table of the URDF), and none that were given a lower margin are driven nearer to each other than
     `control.self_margin` (or half of the largest gap that they ever have) and than in the recording. By their
     collision surfaces; by their spheres where these cannot be read.
     """
@@ -138,7 +139,8 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     if least is None or not np.isfinite(least):
         return
     if not events:
-        yield _brought_together(judged) or held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+        apart = held(f"at least {mm(least)}", least, 0.0, "m", judged.num_states)
+        yield _beside_fixture(judged) or _brought_together(judged) or apart
         return
     worst = min(events, key=lambda event: event.worst)
     reason = failed(
@@ -153,6 +155,26 @@ def self_clearance(judged: Judged) -> Iterator[Reason]:
     yield _at_worst(worst, reason)
 
 
+def _beside_fixture(judged: Judged) -> Reason | None:
+    """A moving link that came nearer than the margin to a link that stands still, such as a table of the URDF."""
+    found = [(gap, stamp, pair) for pair, (gap, stamp) in judged.replay.closest.items() if pair.is_fixture]
+    gap, stamp, pair = min(found, key=lambda one: one[0] - one[2].apart, default=(np.inf, 0, None))
+    if pair is None or gap >= pair.apart - SLIGHTLY_UNDER:
+        return None
+    return failed(
+        sentence=f"{' and '.join(pair.links)}, one of which stands still, are {mm(gap)} apart, margin "
+        f"{mm(pair.apart)}",
+        value=gap,
+        threshold=pair.apart,
+        unit="m",
+        who=" and ".join(pair.links),
+        time_s=float(stamp - int(judged.replay.audit.stamp_ns[0])) * 1e-9,
+        remedy="pairs that may touch are named by --srdf",
+        count=judged.num_states,
+        label=MARGIN,
+    )
+
+
 def _brought_together(judged: Judged) -> Reason | None:
     """What our controller brought nearer than a lowered margin is to keep it, and than the recording had it: the rows
     did not hold there what was asked for.
@@ -162,7 +184,7 @@ def _brought_together(judged: Judged) -> Reason | None:
         return None
     recorded = recorded_postures(inputs.states)
     for pair, (gap, stamp) in sorted(replay.closest.items(), key=lambda item: item[1][0] - item[0].apart):
-        if gap >= pair.apart - SLIGHTLY_UNDER:
+        if pair.is_fixture or gap >= pair.apart - SLIGHTLY_UNDER:
             continue
         before = least_gap(inputs.model, inputs.surfaces, pair, recorded)
         if gap < before - SLIGHTLY_UNDER:

@@ -66,7 +66,8 @@ class ReplayRecord:
         self._margin, self._longest = config.control.margin, config.verdict.longest_interval
         self._spheres = sphere_names(model.sphere_set)
         self._number = {name: number for number, name in enumerate(self._spheres)}
-        self._surfaces, self._enough, self._kept = surfaces, config.control.self_margin, kept
+        self._surfaces, self._kept = surfaces, kept
+        self._enough = max(config.control.self_margin, config.control.margin)
         self.closest: dict[KeptMargin, tuple[float, int]] = {}
         spheres = [f"{self._spheres[a]} and {self._spheres[b]}" for a, b in model.self_pairs()]
         self._pairs = spheres if surfaces is None else surfaces.names
