@@ -240,7 +240,8 @@ def _baked(job: _Job, partial: Path, progress: Progress) -> tuple[DistanceGrid, 
         num_unrepresented=job.obstacles.num_unrepresented,
     )
     treated = {} if unknown is None else unknown.header()
-    return store.grid({**header, **treated, "digests": source.digests, "stamp_ns": source.stamp_ns}), changes
+    made = {"digests": source.digests, "stamp_ns": source.stamp_ns, "made_from": source.made_from}
+    return store.grid({**header, **treated, **made}), changes
 
 
 def _settings(job: _Job) -> dict[str, Any]:

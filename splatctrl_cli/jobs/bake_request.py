@@ -1,6 +1,7 @@
 """What a bake is asked for, and what it reads: the scene, and for an update the field baked before."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as made_by
 from pathlib import Path
@@ -72,7 +73,8 @@ class BakeSource:
     """Splats, and the occupancy of the same moment where there is one.
 
     unrepresented: the occupied voxels without a splat; stamp_ns: when the splats were so; workspace: the box outside
-    which the scene keeps no splats; cameras: those that made it. Each None where it is not known (a bare splat file).
+    which the scene keeps no splats; cameras: those that made it; made_from: the scene's.
+    Each None (empty) where it is not known (a bare splat file).
     """
 
     splats: SplatSet
@@ -82,6 +84,7 @@ class BakeSource:
     stamp_ns: int | None = None
     workspace: Box | None = None
     cameras: tuple[str, ...] | None = None
+    made_from: Mapping[str, Any] = made_by(default_factory=dict)
 
 
 def read_bake_source(path: Path, at_seconds: float | None) -> BakeSource:
@@ -118,6 +121,7 @@ def _read_folder(path: Path, at_seconds: float | None) -> BakeSource:
         stamp_ns=then.stamp_ns,
         workspace=_workspace(final),
         cameras=scene.cameras,
+        made_from=scene.made_from,
         digests={file.name: sha256(file) for file in (files if occupancy is not None else files[:1])},
     )
 

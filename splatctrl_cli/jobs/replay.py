@@ -30,12 +30,13 @@ from splatctrl_cli.jobs.replays.inputs import (
     recorded_postures,
     words_of,
 )
+from splatctrl_cli.jobs.replays.known_scene import KnownScene
 from splatctrl_cli.jobs.replays.lockstep import check_lockstep, opened_scene, reads_whole_log
 from splatctrl_cli.jobs.replays.metrics import Metrics, metric_names, metrics_of
 from splatctrl_cli.jobs.replays.modes import replayed
 from splatctrl_cli.jobs.replays.outside import check_controller
 from splatctrl_cli.jobs.replays.pictures import draw_worst_frames, worst_sights
-from splatctrl_cli.jobs.replays.provenance import Mismatch, scene_mismatches, truth_mismatch
+from splatctrl_cli.jobs.replays.provenance import Mismatch, made_from_mismatches, scene_mismatches, truth_mismatch
 from splatctrl_cli.jobs.replays.request import MODES, ReplayInputs, ReplayRequest
 from splatctrl_cli.jobs.replays.result import Replay
 from splatctrl_cli.jobs.replays.standstill_baseline import read_baselines, read_zone
@@ -177,7 +178,7 @@ def _read(
         scene=scene,
         truth=truth,
         digests=digests,
-        mismatches=_mismatches(request, logged, model),
+        mismatches=_mismatches(request, scene, logged, model),
         declared=declared,
         surfaces=robot.surfaces,
         kept=robot.kept,
@@ -185,8 +186,12 @@ def _read(
     return inputs, logged, evidence, robot
 
 
-def _mismatches(request: ReplayRequest, logged: LoggedStates, model: RobotModel) -> tuple[Mismatch, ...]:
+def _mismatches(
+    request: ReplayRequest, known: KnownScene, logged: LoggedStates, model: RobotModel
+) -> tuple[Mismatch, ...]:
     """What does not belong together; a log that is its own scene always does."""
+    if request.field is not None:
+        return tuple(made_from_mismatches(request.field, known.made_from, logged.source, model))
     if request.scene is None:
         return ()
     return tuple(scene_mismatches(open_scene(request.scene), logged.source, logged.states, model))

@@ -168,6 +168,15 @@ class SceneFolder:
         return self.parts.digests is not None
 
     @property
+    def made_from(self) -> dict[str, Any]:
+        """Digests of the files that were read (`inputs`), the first frame of each camera, and the robot's joints and
+        links: what tells whether it belongs to a log and a robot.
+        """
+        metrics = self.run.get("metrics", {})
+        kept = {name: metrics[name] for name in ("first_frames", "robot_joints", "robot_links") if name in metrics}
+        return {"inputs": self.run.get("inputs", {}), **kept}
+
+    @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that trained the scene."""
         return self._metric("cameras", _names)

@@ -163,16 +163,33 @@ def test_parts_that_were_changed_are_refused_by_name(
     assert not list(stage.desk.folder.glob("out*"))
 
 
-def test_an_altered_field_is_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
-    field, scene = stage.desk.folder / "field", stage.scene()
+def baked(stage: Stage, scene: Path) -> Path:
+    """A field of the scene; the log has the stage's states."""
+    field = stage.desk.folder / "field"
     box = ["--box=-1.2,-1,0,1,1,1.4", "--voxel", "0.08", "--no-report", "--set", "field.max_loss=1"]
     assert main(["sdf-bake", str(scene), "-o", str(field), *box, "-q"]) == 0
+    stage.desk.source.states = stage.states
+    return field
+
+
+@pytest.mark.parametrize("links", [{}, {"cell": [0, 0, 0, 1, 1, 1, 6]}])
+def test_a_field_knows_the_robot_that_its_scene_was_told_apart_from(
+    stage: Stage, links: dict[str, list[float]]
+) -> None:
+    scene = stage.scene()
+    of_run(scene, metrics={"robot_joints": JOINTS, "robot_links": links})
+    _, verdict = stage.replayed("--field", str(baked(stage, scene)))
+    said = [reason["sentence"] for reason in verdict["reasons"] if reason["criterion"] == "evidence"]
+    assert ["another robot, with link cell, which this one lacks" in text for text in said] == [True] * len(links)
+
+
+def test_an_altered_field_is_refused(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
+    field = baked(stage, stage.scene())
     with np.load(field / "field.npz") as arrays:
         changed = dict(arrays)
     name = next(name for name in changed if "bound" in name)
     changed[name] = changed[name] + 1.0
     np.savez_compressed(field / "field.npz", **changed)
-    stage.desk.source.states = stage.states
     assert stage.replayed("--field", str(field)) == (4, {})
     assert "field.npz: was changed after it was written" in capsys.readouterr().err
 

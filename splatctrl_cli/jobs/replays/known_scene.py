@@ -4,6 +4,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as made_by
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -73,7 +74,7 @@ class KnownScene:
     moment_ns: the one time that a baked field is of, None where it has none. seen_at: what was known at a stamp
     of when space was last seen, None where nothing is recorded; without has_seen_times only of whether it ever was.
     figures: what the reconstruction reported of itself, once the replay is done. has_people_margin: whether people
-    are kept at another distance than things.
+    are kept at another distance than things. made_from: of a baked field, `SceneFolder.made_from`.
     """
 
     at: Callable[[int], KnownFields]
@@ -91,6 +92,7 @@ class KnownScene:
     has_seen_times: bool = True
     figures: Callable[[], Mapping[str, Any]] = dict
     has_people_margin: bool = False
+    made_from: Mapping[str, Any] = made_by(default_factory=dict)
 
     def age_s(self, stamp_ns: int) -> float:
         """How old [s] the scene in use at a stamp is, of a field how far its moment is from it; NaN where there are
@@ -174,6 +176,7 @@ def from_grid(path: Path) -> KnownScene:
         digests={file.name: sha256(file)},
         moment_ns=moment if isinstance(moment := grid.header.get("stamp_ns"), int) else None,
         box=barrier.box,
+        made_from=made if isinstance(made := grid.header.get("made_from"), dict) else {},
     )
 
 

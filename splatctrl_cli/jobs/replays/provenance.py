@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -40,26 +41,14 @@ def scene_mismatches(
 ) -> Iterator[Mismatch]:
     """How a reconstruction and a log with states of a robot do not belong together; nothing where they do.
 
-    By the digests of files of the same names, each training camera's first frame, the times that both cover, and the
-    joints of the robot that the scene was told apart with.
+    By `made_from_mismatches`, the times that both cover, and whether its parts agree.
     """
-    run: Mapping[str, Any] = scene.run
     if not scene.has_digests:
         yield Mismatch(
             sentence=f"{scene.path} is of an earlier version: nothing tells whether its files are as written",
             remedy="reconstruct again",
         )
-    other = changed_files(run.get("inputs", {}), source.digests())
-    recorded = run.get("metrics", {}).get("first_frames")
-    calibrations = list(_calibration_mismatches(scene, source.digests()))
-    yield from calibrations
-    if not other and not calibrations and recorded and source.cameras:
-        other = differences(recorded, source.records())
-    if other:
-        yield Mismatch(
-            sentence=f"{scene.path} was made from another recording: {'; '.join(other[:3])}",
-            remedy="reconstruct this log",
-        )
+    yield from made_from_mismatches(scene.path, scene.made_from, source, model)
     if scene.has_clock and not scene.snapshots:
         yield Mismatch(
             sentence=f"{scene.path} has no snapshot: the map of its end would judge the log from its beginning",
@@ -71,23 +60,55 @@ def scene_mismatches(
         if found is not None:
             yield found
     yield from _map_mismatches(scene)
-    if other_robot := _robot_difference(run.get("metrics", {}), model):
+
+
+def made_from_mismatches(
+    path: Path, made_from: Mapping[str, Any], source: RecordSource, model: RobotModel
+) -> Iterator[Mismatch]:
+    """How a scene or a field made from that (`SceneFolder.made_from`) does not belong to a log and a robot.
+
+    By the digests of files of the same names and of the calibration, each training camera's first frame, and the
+    joints and links of the robot that it was told apart from.
+    """
+    files, digests = made_from.get("inputs", {}), source.digests()
+    other, recorded = changed_files(files, digests), made_from.get("first_frames")
+    made, given = _calibrations(files), _calibrations(digests)
+    if made.keys() != given.keys():
+        with_made, with_given = (
+            f"with {', '.join(names.values())}" if names else "without one" for names in (made, given)
+        )
         yield Mismatch(
-            sentence=f"{scene.path} was told apart from another robot, {other_robot}",
+            sentence=f"calibration: {path} was made {with_made}, this log is read {with_given}",
+            remedy="give the --calibration that it was made with, or reconstruct",
+        )
+    elif not other and recorded and source.cameras:
+        other = differences(recorded, source.records())
+    if other:
+        yield Mismatch(
+            sentence=f"{path} was made from another recording: {'; '.join(other[:3])}", remedy="reconstruct this log"
+        )
+    if robot := _robot_difference(made_from, model):
+        yield Mismatch(
+            sentence=f"{path} was told apart from another robot, {robot}",
             remedy="reconstruct with this --urdf, or give the one that it was made with",
         )
 
 
-def _robot_difference(metrics: Mapping[str, Any], model: RobotModel) -> str:
+def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
+    """Names by digest of the calibrations among files that were read."""
+    return {digest: name.removeprefix(CALIBRATION) for name, digest in files.items() if name.startswith(CALIBRATION)}
+
+
+def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
     """How the robot that a scene's splats were told apart from differs from a model, in words; empty where it does
     not. What it has and the model lacks is neither in the map nor on the robot; what only the model has is in both.
     """
-    joints = metrics.get("robot_joints")
+    joints = made_from.get("robot_joints")
     if joints is None:
         return ""
     if tuple(joints) != tuple(model.joint_names):
         return f"with joints {', '.join(joints)}"
-    theirs, ours = metrics.get("robot_links"), model.extents()
+    theirs, ours = made_from.get("robot_links"), model.extents()
     if theirs is None:
         return "of which an earlier version kept the joints alone"
     for link, (*corners, area) in theirs.items():
@@ -99,21 +120,6 @@ def _robot_difference(metrics: Mapping[str, Any], model: RobotModel) -> str:
         if abs(area / ours[link][-1] - 1) > SAME_LINK_AREA:
             return f"whose link {link} has a surface of {area:.4f} m^2, not {ours[link][-1]:.4f}"
     return ""
-
-
-def _calibration_mismatches(scene: SceneFolder, digests: Mapping[str, str]) -> Iterator[Mismatch]:
-    """A log with digests of which poses, depths or clock are corrected otherwise than a scene's were."""
-    theirs, ours = (
-        {digest: name.removeprefix(CALIBRATION) for name, digest in files.items() if name.startswith(CALIBRATION)}
-        for files in (scene.run.get("inputs", {}), digests)
-    )
-    if theirs.keys() == ours.keys():
-        return
-    made, given = (f"with {', '.join(names.values())}" if names else "without one" for names in (theirs, ours))
-    yield Mismatch(
-        sentence=f"calibration: {scene.path} was made {made}, this log is read {given}",
-        remedy="give the --calibration that it was made with, or reconstruct",
-    )
 
 
 def times_apart(states_ns: Stamps, scene_ns: tuple[int, int]) -> Mismatch | None:
