@@ -55,6 +55,11 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
             progress.log(f"{len(fitter.arrays)} Gaussians seeded, extent of the scene {fitter.extent:.3f} m")
             wait = Wait(progress, f"fits {len(frames)} views", "iterations", config.gaussians.iterations).announce()
             fitter.fit(_audit(partial / "audit.jsonl", rows, wait))
+            if len(rows) == 1:
+                progress.log(
+                    f"warning: no Gaussian was added or removed: gaussians.iterations = {config.gaussians.iterations}"
+                    f" end before a round of gaussians.densify_every = {config.gaussians.densify_every}"
+                )
         with stopwatch.stage("write"):
             comments = {"format": FORMAT, "source": source.name}
             write_gaussian_ply(partial / "splats.ply", fitter.gaussians(), comments)

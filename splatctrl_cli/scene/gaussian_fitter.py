@@ -111,8 +111,9 @@ class GaussianFitter:
     def _after_iteration(self, rng: np.random.Generator) -> GaussianAuditRow | None:
         """Densify and reset as the schedule says; the audit row of a round that did."""
         g, done = self.config.gaussians, self.num_iterations
-        is_growing = done < g.densify_until * g.iterations
-        densifies = is_growing and done >= g.densify_from and done % g.densify_every == 0
+        last = g.densify_until * g.iterations
+        is_growing = done < last
+        densifies = is_growing and done >= min(g.densify_from, last / 2) and done % g.densify_every == 0
         every = round(g.reset_every * g.iterations)
         resets = is_growing and every > 0 and done % every == 0
         if not densifies and not resets:

@@ -154,3 +154,16 @@ def test_parameters_and_sets_say_the_same() -> None:
     assert back.scales == pytest.approx(gaussians.scales, rel=1e-6)
     assert back.quats_wxyz == pytest.approx(gaussians.quats_wxyz, abs=1e-6)
     assert back.opacities == pytest.approx(gaussians.opacities, abs=2e-7)
+
+
+@pytest.mark.parametrize(("iterations", "rounds"), [(800, [200, 300]), (2300, [500, 600, 700, 800, 900, 1000, 1100])])
+def test_few_iterations_are_densified_in_the_second_quarter(iterations: int, rounds: list[int]) -> None:
+    rules = replace(GaussianConfig(), iterations=iterations)
+    fitter = GaussianFitter(replace(CONFIG, gaussians=rules), WORKSPACE, frames(), threads=1)
+    rng, found = np.random.default_rng(0), []
+    for done in range(1, iterations + 1):
+        fitter.num_iterations = done
+        fitter._terms = [fitter._evaluate(fitter.views[0])] if done % 100 == 0 else []
+        if fitter._after_iteration(rng) is not None:
+            found.append(done)
+    assert found == rounds
