@@ -155,7 +155,7 @@ class GaussianConfig(Section, section="gaussians"):
     lr_logit_opacity: Annotated[float, Within(0, 10, "", "learning rate of opacity logits")] = 5e-2
     densify_from: Annotated[
         int,
-        Within(0, MOST_ITERATIONS, "", "iterations before the first adding and removing, or half of those with them"),
+        Within(0, MOST_ITERATIONS, "", "iterations before the first adding and removing, or half of densify_until"),
     ] = 500
     densify_until: Annotated[float, Within(0, 1, "", "share of the iterations after which their number is fixed")] = (
         0.5
