@@ -28,6 +28,7 @@ class Descent:
 
     background: the colour behind the splats, None until it is chosen. heard: called after each iteration. device:
     where the iterations of `run` are done, the processor if None; everything else is done on the processor.
+    `run` raises DeviceError where the device fails.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class Descent:
         self.background: Color | None = None
         self.heard: Callable[[], None] = lambda: None
         self._config, self._buffer, self._seed, self._num_threads = config, buffer, seed, num_threads
-        self._device = device
+        self.device = device
         self._raster = Rasteriser(num_threads)
         self._loss = ImageLoss(num_threads)
         self._gradients: Float32 = np.empty((config.max_splats, 10), np.float32)
@@ -53,8 +54,8 @@ class Descent:
         """
         weights = self._weights()
         weights = replace(weights, depth=depth * weights.depth)
-        if self._device is not None:
-            return self._run_on(self._device, views, weights, settings)
+        if self.device is not None:
+            return self._run_on(self.device, views, weights, settings)
         terms = {}
         for view in views:
             planes = self.planes(view)
@@ -78,6 +79,7 @@ class Descent:
     ) -> dict[int, LossTerms]:
         different = {id(view): view for view in views}
         device.forget_views()
+        device.expect([view.target.counted.shape for view in different.values()])
         numbers = {key: device.add_view(view.camera, view.target) for key, view in different.items()}
         device.put(self._buffer.parameters, self._buffer.moments)
         terms = device.run([numbers[id(view)] for view in views], weights, settings, self._step_seed())

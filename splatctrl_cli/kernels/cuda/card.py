@@ -1,14 +1,16 @@
 """A CUDA card: memory over the driver, kernels and graphs over cuda-core."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from cuda.bindings import driver
 from cuda.core import Device, LaunchConfig, launch
 
-from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch
-from splatctrl_cli.kernels.cuda.program import OLDEST, compiled
+from splatctrl_cli.kernels.cuda.driver import Card, usable_card
+from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, OutOfMemory
+from splatctrl_cli.kernels.cuda.program import compiled
 
 MANY = 20  # replays in a graph: to launch one costs the host as much as a small map's iteration takes
 
@@ -17,31 +19,46 @@ def _check(result: tuple[Any, ...]) -> Any:
     """The values of a driver call, or its error by name."""
     status, *values = result
     if status == driver.CUresult.CUDA_SUCCESS:
-        return values[0] if values else None
+        return values if len(values) > 1 else values[0] if values else None
     _, name = driver.cuGetErrorName(status)
-    raise DeviceError(f"CUDA device: {name.decode() if name else status}")
+    raise _fault(name.decode() if name else str(status))
+
+
+def _fault(what: str) -> DeviceError:
+    return (OutOfMemory if "OUT_OF_MEMORY" in what else DeviceError)(what)
+
+
+@contextmanager
+def _named_faults() -> Iterator[None]:
+    """Turns what cuda-core raises, which has no public class, into DeviceError."""
+    try:
+        yield
+    except DeviceError:
+        raise
+    except Exception as error:
+        raise _fault(str(error)) from error
 
 
 class CudaDevice:
-    """The card of that number as `Memory`; everything is queued on one stream."""
+    """A card, the first by default, as `Memory`; everything is queued on one stream.
 
-    def __init__(self, index: int = 0) -> None:
-        try:
-            _check(driver.cuInit(0))
-        except RuntimeError as error:  # also where the driver's library is not there
-            raise DeviceError(f"no CUDA device: {error}") from error
-        count = _check(driver.cuDeviceGetCount())
-        if index >= count:
-            raise DeviceError(f"CUDA device {index}: expected one of {count}")
-        self._device: Any = Device(index)
-        self._device.set_current()
-        self.capability = tuple(self._device.compute_capability)
-        self.name: str = self._device.name
-        if self.capability < OLDEST:
-            raise DeviceError(f"{self.name}: compute capability {self.capability}, expected {OLDEST} or later")
-        self._stream: Any = self._device.create_stream()
-        self._code: Any = compiled(self.capability)
+    Raises DeviceError where it cannot be used.
+    """
+
+    def __init__(self, card: Card | None = None) -> None:
+        card = card or usable_card()
+        self.name, self.capability = card.name, card.capability
+        with _named_faults():
+            self._device: Any = Device(card.index)
+            self._device.set_current()
+            self._stream: Any = self._device.create_stream()
+            self._code: Any = compiled(self.capability)
         self._handle = int(self._stream.handle)
+
+    def available(self) -> int:
+        """Bytes that are free."""
+        free, _ = _check(driver.cuMemGetInfo())
+        return int(free)
 
     def allocate(self, num_bytes: int) -> int:
         """Memory of zeros."""
@@ -76,11 +93,12 @@ class CudaDevice:
     def record(self, launches: Sequence[Launch]) -> "CudaGraph":
         """The launches as graphs: of one replay, and of MANY."""
         graphs = {}
-        for count in (1, MANY):
-            builder = self._device.create_graph_builder().begin_building()
-            self._queue(builder, [*launches] * count)
-            graphs[count] = builder.end_building().complete()
-            graphs[count].upload(self._stream)
+        with _named_faults():
+            for count in (1, MANY):
+                builder = self._device.create_graph_builder().begin_building()
+                self._queue(builder, [*launches] * count)
+                graphs[count] = builder.end_building().complete()
+                graphs[count].upload(self._stream)
         return CudaGraph(graphs, self._stream)
 
     def queue(self, launches: Sequence[Launch]) -> None:
@@ -110,7 +128,8 @@ class CudaGraph:
 
     def run(self, num_times: int = 1) -> None:
         """Queue them, so many times."""
-        for _ in range(num_times // MANY):
-            self._graphs[MANY].launch(self._stream)
-        for _ in range(num_times % MANY):
-            self._graphs[1].launch(self._stream)
+        with _named_faults():
+            for _ in range(num_times // MANY):
+                self._graphs[MANY].launch(self._stream)
+            for _ in range(num_times % MANY):
+                self._graphs[1].launch(self._stream)

@@ -11,7 +11,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, Memory
+from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, Memory, OutOfMemory
 from splatctrl_cli.kernels.raster import (
     Float32,
     Float64,
@@ -29,11 +29,18 @@ RUN = np.dtype(
     [("settings", "f4", 10), ("seed", "u8"), ("weights", "f4", 4), ("normalised", "i4"), ("background", "f4", 3)]
 )
 COUNTERS = np.dtype([(n, "i4") for n in ("next", "now", "num_parts", "most_parts", "longest_list")])
-TILE, SPLAT_BYTES, NUM_SUMS, PATCH, NUM_TERMS = 16, 64, 10, 32, 5
+TILE, NUM_SUMS, PATCH, NUM_TERMS = 16, 10, 32, 5
 PROJECT_LANES = 4  # threads of a splat
 PROJECT, BLEND, LOSS, BACKWARD, STEP = 128, 128, 128, 64, 128  # threads in a block
 MOST_SPLATS = 1 << 24
+LIST_CAPACITY, SPLAT_TILES = 512, 16  # entries of a tile's list and tiles of a splat that there is room for at first
 LEAST_TABLE = 1 << 16  # bytes, so that graphs outlive a longer schedule
+NUM_TABLES = 5  # of the run, the views, the schedule, the counters and the terms
+STATE = {"parameters": 32, "first": 32, "second": 32, "num_steps": 4}  # bytes of a splat
+WORK = {"gradients": 32, "splats": 64, "first_parts": 4, "num_parts": 4}
+PIXEL = {"planes": 20, "plane_gradients": 20, "maps": 36}  # bytes of a pixel, for all views of a size
+LIST_ENTRY = {"keys": 8, "list_parts": 4, "entries": 8}
+IMAGE_BYTES = 8  # of a pixel of a view: colour, depth, counted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,35 +59,68 @@ def camera_row(camera: Float64) -> Array:
     return row
 
 
-class DeviceFit:
-    """The optimiser of N splats on a device."""
+def bytes_needed(
+    num_splats: int,
+    sizes: Sequence[tuple[int, int]],
+    list_capacity: int = LIST_CAPACITY,
+    splat_tiles: float = SPLAT_TILES,
+) -> int:
+    """Memory of a fit of N splats to views of `sizes` (H, W)."""
+    splats = (sum(STATE.values()) * 2 + sum(WORK.values()) + 4 * NUM_SUMS * splat_tiles) * num_splats
+    tiles = [-(-height // TILE) * -(-width // TILE) for height, width in set(sizes)]
+    pixels = sum(sum(PIXEL.values()) * height * width for height, width in set(sizes))
+    images = sum(IMAGE_BYTES * height * width for height, width in sizes)
+    return round(
+        NUM_TABLES * LEAST_TABLE
+        + splats
+        + pixels
+        + images
+        + sum(tiles) * (8 + sum(LIST_ENTRY.values()) * list_capacity)
+    )
 
-    def __init__(self, device: Memory, num_splats: int, *, list_capacity: int = 512, part_capacity: int = 0) -> None:
+
+class DeviceFit:
+    """The optimiser of N splats on a device, of views of `sizes` (H, W) to begin with.
+
+    Raises OutOfMemory where there is no room, with what would fit.
+    """
+
+    def __init__(
+        self,
+        device: Memory,
+        num_splats: int,
+        sizes: Sequence[tuple[int, int]] = (),
+        *,
+        list_capacity: int = LIST_CAPACITY,
+        part_capacity: int = 0,
+    ) -> None:
         if num_splats >= MOST_SPLATS:
             raise DeviceError(f"num_splats: expected less than {MOST_SPLATS}, got {num_splats}")
         self.device, self.num_splats = device, num_splats
         self.views: list[_DeviceView] = []
-        self.list_capacity, self.part_capacity = list_capacity, part_capacity or 16 * max(num_splats, 256)
+        self.list_capacity, self.part_capacity = list_capacity, part_capacity or SPLAT_TILES * max(num_splats, 256)
         self._addresses: dict[str, int] = {}
         self._sizes: dict[str, int] = {}
-        self._images: list[int] = []
-        n = num_splats
-        for name, size in {
-            "parameters": 32 * n, "first": 32 * n, "second": 32 * n, "num_steps": 4 * n, "gradients": 32 * n,
-            "splats": SPLAT_BYTES * n, "first_parts": 4 * n, "num_parts": 4 * n, "counters": COUNTERS.itemsize,
-            "run": RUN.itemsize,
-        }.items():  # fmt: skip
-            self._room(name, size)
-        for name in ("parameters", "first", "second", "num_steps"):
-            self._room(f"{name}_before", self._sizes[name])
-        self._room("parts", 4 * NUM_SUMS * self.part_capacity)
+        self._images: dict[int, int] = {}  # bytes by address
         self._graphs: dict[tuple[int, int, str], Graph] = {}
+        self.expect(sizes)
+        for name, size in {**STATE, **{f"{name}_before": size for name, size in STATE.items()}, **WORK}.items():
+            self._room(name, size * num_splats)
+        self._room("counters", COUNTERS.itemsize)
+        self._room("run", RUN.itemsize)
+        self._room("parts", 4 * NUM_SUMS * self.part_capacity)
 
     def close(self) -> None:
         """Give back the memory."""
         for address in [*self._addresses.values(), *self._images]:
             self.device.free(address)
-        self._addresses, self._images = {}, []
+        self._addresses, self._images, self._sizes = {}, {}, {}
+
+    def expect(self, sizes: Sequence[tuple[int, int]]) -> None:
+        """Views of these sizes (H, W) will be added. Raises OutOfMemory where they do not fit."""
+        self._asked = list(sizes)
+        if self._needed(self.num_splats) > self._usable():
+            raise self._too_large()
 
     def put(self, parameters: Float32, moments: Moments) -> None:
         """Splats (N, 8) and Adam's state, from the host."""
@@ -112,7 +152,7 @@ class DeviceFit:
         """Give back the images; numbers of views start from 0 again."""
         for address in self._images:
             self.device.free(address)
-        self.views, self._images = [], []
+        self.views, self._images = [], {}
 
     def run(
         self, schedule: Sequence[int], weights: LossWeights, settings: OptimiserSettings, seed: int
@@ -123,8 +163,7 @@ class DeviceFit:
         """
         if not schedule:
             return {}
-        state = ("parameters", "first", "second", "num_steps")
-        for name in state:
+        for name in STATE:
             self.device.copy(self._addresses[f"{name}_before"], self._addresses[name], self._sizes[name])
         while True:
             self.rewind(schedule, weights, settings, seed)
@@ -132,7 +171,7 @@ class DeviceFit:
                 self._graph(*size, "step").run(len(list(group)))
             if self._fits():
                 return self._terms(schedule)
-            for name in state:
+            for name in STATE:
                 self.device.copy(self._addresses[name], self._addresses[f"{name}_before"], self._sizes[name])
 
     def planes(self, view: int) -> Float32:
@@ -179,17 +218,43 @@ class DeviceFit:
         """The address of a named piece of memory of at least that size; what it held is lost where it grows."""
         if self._sizes.get(name, -1) < num_bytes:
             if name in self._addresses:
-                self.device.free(self._addresses[name])
-            self._addresses[name] = self.device.allocate(num_bytes)
+                self.device.free(self._addresses.pop(name))
+            self._sizes.pop(name, None)
+            self._addresses[name] = self._allocate(num_bytes)
             self._sizes[name] = num_bytes
             self._graphs = {}
         return self._addresses[name]
 
     def _image(self, values: Array) -> int:
-        address = self.device.allocate(values.nbytes)
+        address = self._allocate(values.nbytes)
+        self._images[address] = values.nbytes
         self.device.write(address, values)
-        self._images.append(address)
         return address
+
+    def _allocate(self, num_bytes: int) -> int:
+        try:
+            return self.device.allocate(num_bytes)
+        except OutOfMemory:
+            raise self._too_large() from None
+
+    def _needed(self, num_splats: int) -> int:
+        tiles = self.part_capacity / max(self.num_splats, 1)
+        return bytes_needed(num_splats, self._asked, self.list_capacity, tiles)
+
+    def _usable(self) -> int:
+        return self.device.available() + sum(self._sizes.values()) + sum(self._images.values())
+
+    def _too_large(self) -> OutOfMemory:
+        """The error that says what was needed and what would fit, in budgets of one significant digit."""
+        usable, fixed = self._usable(), self._needed(0)
+        each = (self._needed(self.num_splats) - fixed) / max(self.num_splats, 1)
+        most = min(int((usable - fixed) / each), self.num_splats // 2)
+        views = f" and {len(self._asked)} views" if self._asked else ""
+        return OutOfMemory(
+            f"out of memory: {self.num_splats} splats{views} take {self._needed(self.num_splats) / 1e6:.0f} MB,"
+            f" {usable / 1e6:.0f} MB are free",
+            remedy=f"a budget of {_rounded_down(most)} splats would fit" if most > 0 else "take smaller images",
+        )
 
     def rewind(
         self, schedule: Sequence[int], weights: LossWeights | None, settings: OptimiserSettings | None, seed: int = 0
@@ -263,13 +328,8 @@ class DeviceFit:
 
         lengths, num_entries = image("list_lengths", 4 * tiles), image("num_entries", 4 * tiles)
         slots = tiles * self.list_capacity
-        keys, list_parts, entries = (
-            image("keys", 8 * slots),
-            image("list_parts", 4 * slots),
-            image("entries", 8 * slots),
-        )
-        planes, plane_gradients = image("planes", 20 * pixels), image("plane_gradients", 20 * pixels)
-        maps = image("maps", 36 * pixels)
+        keys, list_parts, entries = (image(name, size * slots) for name, size in LIST_ENTRY.items())
+        planes, plane_gradients, maps = (image(name, size * pixels) for name, size in PIXEL.items())
         ssim, errors = image("patch_ssim", 12 * patches), image("patch_errors", 24 * patches)
         depths = image("patch_depths", 8 * patches)
         n, h, w = np.int32(self.num_splats), np.int32(height), np.int32(width)
@@ -315,3 +375,8 @@ class DeviceFit:
                 ),
             ),
         ]  # fmt: skip
+
+
+def _rounded_down(number: int) -> int:
+    digits: int = 10 ** (len(str(number)) - 1)
+    return number // digits * digits

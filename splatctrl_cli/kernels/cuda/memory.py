@@ -10,7 +10,15 @@ Array = NDArray[Any]
 
 
 class DeviceError(RuntimeError):
-    """The device is not there, cannot be used, or has failed."""
+    """The device is not there, cannot be used, or has failed; `remedy` says what to do about it."""
+
+    def __init__(self, message: str, *, remedy: str = "") -> None:
+        super().__init__(message)
+        self.remedy = remedy
+
+
+class OutOfMemory(DeviceError):  # noqa: N818  (as the driver names it)
+    """The device has no room for what was asked."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +42,10 @@ class Memory(Protocol):
     """What the engine needs of a device; addresses are int."""
 
     def allocate(self, num_bytes: int) -> int:
-        """Memory of zeros."""
+        """Memory of zeros. Raises OutOfMemory."""
+
+    def available(self) -> int:
+        """Bytes that are free."""
 
     def free(self, address: int) -> None:
         """Give it back."""

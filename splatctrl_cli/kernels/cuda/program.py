@@ -11,7 +11,6 @@ from cuda.core.utils import FileStreamProgramCache, make_program_cache_key
 
 HERE = Path(__file__).parent
 FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include looks through them
-OLDEST = (7, 5)  # compute capability
 
 
 @cache

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import splatctrl_cli.kernels
-from splatctrl_cli.kernels.cuda.memory import Array, Launch
+from splatctrl_cli.kernels.cuda.memory import Array, Launch, OutOfMemory
 
 HERE = Path(__file__).parent
 KERNELS = Path(splatctrl_cli.kernels.__file__).parent
@@ -37,20 +37,26 @@ def library() -> ctypes.CDLL:
 
 
 class EmulatedDevice:
-    """`Memory` of the processor; nothing is queued, launches run at once."""
+    """`Memory` of the processor, of at most `limit` bytes; nothing is queued, launches run at once."""
 
-    def __init__(self, *, backwards: bool = False) -> None:
-        self.backwards = backwards
+    def __init__(self, *, backwards: bool = False, limit: int = 1 << 40) -> None:
+        self.backwards, self.limit = backwards, limit
         self.held: dict[int, Array] = {}
+        self.sizes: dict[int, int] = {}
+
+    def available(self) -> int:
+        return self.limit - sum(self.sizes.values())
 
     def allocate(self, num_bytes: int) -> int:
+        if num_bytes > self.available():
+            raise OutOfMemory("CUDA_ERROR_OUT_OF_MEMORY")
         memory = np.zeros(max(num_bytes, 1) // 64 * 8 + 16, np.uint64)  # aligned by numpy to 16; the rest by hand
         address = -(-memory.ctypes.data // 64) * 64
-        self.held[address] = memory
+        self.held[address], self.sizes[address] = memory, num_bytes
         return address
 
     def free(self, address: int) -> None:
-        del self.held[address]
+        del self.held[address], self.sizes[address]
 
     def write(self, address: int, values: Array) -> None:
         values = np.ascontiguousarray(values)

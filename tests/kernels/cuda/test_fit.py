@@ -1,5 +1,6 @@
 """The device's kernels against the package's own and the float64 references; see emulator.py for "processor"."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -7,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatctrl_cli.kernels.cuda.fit import DeviceFit
-from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory
+from splatctrl_cli.kernels.cuda.fit import LIST_CAPACITY, DeviceFit, bytes_needed
+from splatctrl_cli.kernels.cuda.memory import DeviceError, Memory, OutOfMemory
 from splatctrl_cli.kernels.raster import Float32, LossTerms, LossWeights, TargetView
 from tests.kernels.cuda.emulator import EmulatedDevice
 from tests.kernels.cuda.scenes import (
@@ -226,3 +227,47 @@ def test_splats_out_of_view_keep_their_bytes(device: Memory) -> None:
 def test_more_splats_than_an_entry_can_number_are_refused() -> None:
     with pytest.raises(DeviceError, match="num_splats: expected less than 16777216"):
         DeviceFit(EmulatedDevice(), 1 << 24)
+
+
+def test_memory_needed_is_what_a_run_holds() -> None:
+    """Two views of one size, one of another; beside it are the sums of patches."""
+    p, on = parameters(2000, radius=0.005), EmulatedDevice()
+    sizes = [(61, 83), (61, 83), (104, 80)]
+    fit = DeviceFit(on, len(p), sizes)
+    fit.put(p, moments(len(p)))
+    for height, width in sizes:
+        fit.add_view(camera(width, height), target(width, height))
+    fit.run([0, 1, 2], WEIGHTS, SETTINGS, 1)
+    assert fit.list_capacity == LIST_CAPACITY
+    assert abs(sum(on.sizes.values()) - bytes_needed(len(p), sizes)) < 5_000
+
+
+def test_what_does_not_fit_is_refused_with_the_budget_that_does() -> None:
+    sizes, limit = [(480, 640)] * 4, 60_000_000
+    assert bytes_needed(1_000, sizes) < limit < bytes_needed(50_000, sizes)
+    fit = DeviceFit(EmulatedDevice(limit=limit), 50_000)
+    with pytest.raises(OutOfMemory, match=r"50000 splats and 4 views take .* MB, 60 MB are free") as caught:
+        fit.expect(sizes)
+    said = re.fullmatch(r"a budget of (\d+) splats would fit", caught.value.remedy)
+    assert said is not None
+    fit.close()
+    small = DeviceFit(fit.device, int(said[1]))
+    small.expect(sizes)
+    small.close()
+    with pytest.raises(OutOfMemory) as caught:
+        DeviceFit(EmulatedDevice(limit=20_000_000), 1_000).expect(sizes)
+    assert caught.value.remedy == "take smaller images"
+
+
+def test_lists_that_outgrow_the_memory_are_an_error_that_leaves_nothing_behind() -> None:
+    p, view = parameters(2500, radius=0.03, seed=2), camera(24, 20)
+    p[:, 7] = -4.0
+    free = DeviceFit(EmulatedDevice(), len(p))
+    free.close()
+    assert not free.device.sizes
+    just = bytes_needed(len(p), [(20, 24)]) + 10_000
+    fit = fitted(EmulatedDevice(limit=just), p, view, target(24, 20))
+    with pytest.raises(OutOfMemory, match=r"out of memory: 2500 splats .*3 MB are free"):
+        fit.planes(0)
+    fit.close()
+    assert not fit.device.sizes
