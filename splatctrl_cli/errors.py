@@ -43,3 +43,13 @@ class WriteError(SplatCtrlError):
     """Writing failed, e.g. the disk is full (exit code 6)."""
 
     exit_code = 6
+
+
+class DeviceFault(SplatCtrlError):  # noqa: N818  (the run can go on elsewhere)
+    """A card failed or was lost while it computed (exit code 70); what was written before can be gone on from."""
+
+
+class DeviceFull(DeviceFault):
+    """A card has too little memory for what was asked (exit code 2)."""
+
+    exit_code = 2

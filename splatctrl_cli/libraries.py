@@ -30,7 +30,10 @@ else:
 
 def is_installed(module: str) -> bool:
     """Whether a library of an extra is there; it is not loaded."""
-    return find_spec(module) is not None
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 def of_extra(module: str, extra: str, what: str) -> Any:

@@ -80,6 +80,12 @@ def add_threads(parser: Parser) -> None:
     Options(parser.run_group)("--threads THREADS", threads, whole(0, 1024))
 
 
+def add_device(parser: Parser) -> None:
+    """``--device``."""
+    where = "auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (docs/gpu.md)"
+    Options(parser.run_group)("--device NAME", f"where to compute: {where}", _device, "auto")
+
+
 def add_gates(add: Options) -> None:
     """``--require 'metric>=value'``."""
     add("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
@@ -201,6 +207,13 @@ def pose(text: str) -> tuple[float, ...]:
         expected = "expected a unit quaternion qx,qy,qz,qw"
         raise argparse.ArgumentTypeError(f"{expected}, got one of length {length:.3f}")
     return values
+
+
+def _device(text: str) -> str:
+    """The name of a device, for argparse."""
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,3})?", text):
+        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {shown(text)}")
+    return text
 
 
 def numbers(text: str) -> tuple[float, ...]:

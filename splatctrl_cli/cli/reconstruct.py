@@ -11,6 +11,7 @@ from splatctrl_cli.cli.options import request_of, source_options
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.jobs.correct_views import Corrections
+from splatctrl_cli.jobs.device import shown
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
@@ -21,8 +22,6 @@ from splatctrl_cli.records import Box
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
-    if args.device == "cuda":
-        raise UsageError("--device cuda: no command runs on a card yet", remedy="give --device cpu")
     config = load_config(args.config, args.set)  # refused before the source is opened
     if args.max_splats is not None:
         config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))
@@ -73,6 +72,7 @@ def _lines(result: ReconstructResult) -> list[str]:
     lines = table(list(columns), [list(columns.values())])
     reasons = (f"{count} {reason.replace('_', ' ')}" for reason, count in removed.items() if count)
     lines.append("removed: " + (", ".join(reasons) or "none"))
+    lines.append("computed on " + ", then ".join(shown(device) for device in metrics["devices"]))
     return lines
 
 

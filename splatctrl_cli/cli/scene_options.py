@@ -8,6 +8,7 @@ from splatctrl_cli.cli.options import (
     BOX,
     add_config,
     add_declare,
+    add_device,
     add_disagreement,
     add_gates,
     add_output,
@@ -56,7 +57,7 @@ def reconstruct_options(add: Options, parser: Parser) -> None:
     add_disagreement(more)
     more("--refine-poses", "put the views of a still scene where they see the same surfaces, by depth and colour")
     more("--refine-exposure", "give the views of a still scene one brightness and white balance")
-    Options(parser.run_group)("--device", "where to compute", ("auto", "cpu", "cuda"), "auto")
+    add_device(parser)
 
 
 def export_options(add: Options, parser: Parser) -> None:
@@ -179,6 +180,7 @@ def score_options(add: Options, parser: Parser) -> None:
     more("--cloud-unit M", "metres per unit (default: 0.001 with --dtu, else 1)", real(1e-9, 1e3, "m"))
     more("--cloud-max M", "farther points count in a share, not in a mean", real(1e-6, 1e3, "m"), 0.02)
     more("--cloud-spacing M", "both sides are thinned to points this far apart", real(1e-6, 1e3, "m"), 0.0002)
+    add_device(parser)
     more = add.group("fit")
     more(
         "--fit",

@@ -9,6 +9,7 @@ from splatctrl_cli.cli.options import request_of
 from splatctrl_cli.cli.reconstruct import recording_of
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.evaluate.score_report import PREFIX, counted
+from splatctrl_cli.jobs.device import shown
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.score_cloud import CloudSettings
 from splatctrl_cli.jobs.score_fit import EACH, METHODS, FitRequest, score_fits
@@ -18,6 +19,7 @@ OF_FITS: dict[str, object] = {
     "config": None,
     "set": [],
     "seed": 0,
+    "device": "auto",
     "fit_iterations": None,
     "fit_splats": None,
 }  # where they are not given
@@ -165,6 +167,7 @@ def _lines_of_fits(report: Mapping[str, Any]) -> list[str]:
     first, *others = [_number(value, "+.2f") for value in (*gains, metrics["psnr_gain"])]
     rows.append(["ours - 3D-GS", first, "-", *others, "-", "-", "-"])
     header = ("method", "paper's dB", "paper's splats", *(f"{scan} dB" for scan in report["scans"]))
+    devices = {fit["method"]: fit["devices"] for fit in fits}
     return [
         *table((*header, "mean dB", "splats", "memory MiB", "fit s"), rows),
         "paper's: its section IV-A, on scans, views, sizes and iterations that it does not name; the rest: here",
@@ -174,6 +177,7 @@ def _lines_of_fits(report: Mapping[str, Any]) -> list[str]:
         *_protocol_lines(report["protocol"]),
         f"PSNR {report['psnr']}; {settings['splats']:,} splats to begin with, {settings['iterations']} iterations,"
         f" seed {settings['seed']}, the same losses; memory: the largest of the scans",
+        *(f"{METHODS[name].name} computed on {shown(on[-1])}" for name, on in devices.items()),
     ]
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.errors import UsageError, WriteError
+from splatctrl_cli.errors import DeviceFault, UsageError, WriteError
 from splatctrl_cli.files.output_lock import held, remove
 
 MARKERS = ("run.json", "capture.json")  # at the top of every folder that a command wrote
@@ -41,8 +41,8 @@ def output_path(
     """Yield ``NAME.partial`` (an empty folder, or a file name to write to); rename it to `path` on success.
 
     A failure leaves nothing behind; an interrupted run leaves ``NAME.partial``. `checkpoint` names the file in that
-    folder from which a run can go on: where it is there, a failure to write leaves the folder, too. With `resume`
-    such a folder is yielded as it is, and no failure removes it.
+    folder from which a run can go on: where it is there, a failure to write or of a card leaves the folder, too. With
+    `resume` such a folder is yielded as it is, and no failure removes it.
     Where `path` is a link, all of this happens to what it leads to, and the link stays.
     Raises UsageError when `path` has no name of its own, exists without `force`, is not of the kind to write, is
     a folder that no command wrote, or is being written by another run, and when its parent cannot be written;
@@ -74,7 +74,7 @@ def output_path(
             _replace(partial, path)
         except Exception as error:
             failed_to_write = isinstance(error, OSError) and is_write_failure(error, partial)
-            is_kept = can_go_on() and (failed_to_write or is_resumed)
+            is_kept = can_go_on() and (failed_to_write or is_resumed or isinstance(error, DeviceFault))
             if not is_kept:
                 remove(partial)
             if isinstance(error, OSError) and failed_to_write:

@@ -1,6 +1,7 @@
 """A reconstruction from its request to its result: a recording into splats, occupancy, audit and snapshots."""
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.gates import check_gate_names
 from splatctrl_cli.evaluate.verdict import Verdict
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
+from splatctrl_cli.jobs.device import FitDevice
 from splatctrl_cli.jobs.logged_robot import other_frame, urdf_of
 from splatctrl_cli.jobs.open_recording import guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress
@@ -42,18 +44,25 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
     """
     check_gate_names(request.require, GATED)
     training_cameras(request.source)
+    device = FitDevice(request.device)
     robot = _robot(request, progress)
     declared = declarations_of(request.declare, robot)
     stopwatch, checkpoint_file = Stopwatch(), partial_path(request.out) / CHECKPOINT
     goes_on = _goes_on(request, checkpoint_file, progress)
     with (
+        closing(device),
         told_how_to_go_on(checkpoint_file),
         output_path(
             request.out, force=request.force, is_folder=True, checkpoint=CHECKPOINT, resume=request.resume
         ) as partial,
+        device.told_how_to_go_on(checkpoint_file),
     ):
         inputs = request.source.digests()
-        fitted = _begun(request, robot, declared, partial, inputs, goes_on=goes_on)
+        run = _identity(request, inputs)
+        checkpoint = checkpoint_to_go_on_from(partial, run) if goes_on else None
+        fitted = Reconstruction(
+            request, robot, partial, identity=run, declared=declared, checkpoint=checkpoint, device=device
+        )
         if goes_on:
             progress.log(f"{partial}: continues after {fitted.num_read} time steps")
         with stopwatch.stage("fit_since_resume" if goes_on else "fit"):
@@ -80,20 +89,9 @@ def reconstruct(request: ReconstructRequest, progress: Progress = SILENT) -> Rec
     return replace(written, removed=removed)
 
 
-def _begun(
-    request: ReconstructRequest,
-    robot: RobotModel | None,
-    declared: Declarations,
-    folder: Path,
-    inputs: Mapping[str, str],
-    *,
-    goes_on: bool,
-) -> Reconstruction:
-    """The run at its beginning, or where an interrupted one left it."""
+def _identity(request: ReconstructRequest, inputs: Mapping[str, str]) -> dict[str, Any]:
     files = {name: getattr(request, name) for name in ("urdf", "spheres", "points", "declare")}
-    run = identity({"seed": request.seed, **request.options}, files, request.config, inputs)
-    checkpoint = checkpoint_to_go_on_from(folder, run) if goes_on else None
-    return Reconstruction(request, robot, folder, identity=run, declared=declared, checkpoint=checkpoint)
+    return identity({"seed": request.seed, **request.options}, files, request.config, inputs)
 
 
 def written_run(

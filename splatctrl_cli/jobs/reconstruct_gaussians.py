@@ -12,6 +12,7 @@ from splatctrl_cli.evaluate.metrics import DESCRIBES
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.evaluate.verdict import verdict_of
 from splatctrl_cli.files.output import Stopwatch, output_path
+from splatctrl_cli.jobs.device import CUDA
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, written_run
 from splatctrl_cli.jobs.reconstruct_verdict import GATED as SPLATS_GATED
@@ -36,6 +37,10 @@ def reconstruct_gaussians(request: ReconstructRequest, progress: Progress = SILE
 
     Raises UsageError for a recording with a clock, and for a request with a robot, points, or a run to go on with.
     """
+    if request.device.startswith(CUDA):
+        raise UsageError(
+            f"--device {request.device}: --method 3dgs computes on the processor", remedy="give --device cpu"
+        )
     source, config = request.source, request.config
     check_gate_names(request.require, GATED)
     _refuse_what_needs_time(request)

@@ -14,6 +14,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
 from splatctrl_cli.jobs.camera_agreement import CameraAgreement
 from splatctrl_cli.jobs.correct_views import Corrections
+from splatctrl_cli.jobs.device import CPU, Device, FitDevice
 from splatctrl_cli.jobs.open_recording import guessed_unit
 from splatctrl_cli.jobs.progress import SILENT, Progress, Wait
 from splatctrl_cli.records import Box, Record, RecordSource, RgbdFrame
@@ -32,6 +33,8 @@ from splatctrl_cli.scene_files.scene_writer import Checkpoint, SceneWriter
 from splatctrl_cli.splat_files.points import read_points
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
+
+KEPT = ("num_read", "is_refined", "first_frames", "corrected")  # attributes that a checkpoint keeps as they are
 
 
 def training_cameras(source: RecordSource) -> list[str]:
@@ -57,8 +60,9 @@ class ReconstructRequest:
     urdf, spheres: the robot, whose splats are told apart and whose reach is the workspace unless `box` is given;
     without urdf the one that the log `recording` describes, where it does. points: a coloured cloud to start from,
     instead of depth. declare: a TOML of what the robot carries. corrections: of the views of a still scene, by
-    each other. resume: go on with what an interrupted run left. require: gates on its metrics. options: what else
-    decides the bytes, by the names of the options: a run that is resumed must have the same.
+    each other. resume: go on with what an interrupted run left. device: where to compute, as of --device. require:
+    gates on its metrics. options: what else decides the bytes, by the names of the options: a run that is resumed
+    must have the same.
     """
 
     source: RecordSource
@@ -76,6 +80,7 @@ class ReconstructRequest:
     resume: bool = False
     seed: int = 0
     threads: int = 0
+    device: str = CPU
     require: Sequence[str] = ()
     options: Mapping[str, object] = field(default_factory=dict)
 
@@ -84,7 +89,7 @@ class Reconstruction:
     """One run of a request into `folder`; with `checkpoint` it goes on where that was written.
 
     declared: what the robot carries. identity: plain values that a run which goes on must have in common with this
-    one. observe: is shown every frame of the source on its way into time steps.
+    one. device: the processor unless given. observe: is shown every frame of the source on its way into time steps.
     """
 
     def __init__(
@@ -96,11 +101,11 @@ class Reconstruction:
         identity: Mapping[str, Any],
         declared: Declarations | None = None,
         checkpoint: Checkpoint | None = None,
+        device: FitDevice | None = None,
         observe: Callable[[RgbdFrame], None] | None = None,
     ) -> None:
-        self.observe = observe
+        self.observe, self.device, self.robot = observe, device or FitDevice(), robot
         self.request, self.source, self.config = request, request.source, request.config
-        self.robot = robot
         self.cloud = None if request.points is None else read_points(request.points)  # instead of depth
         self.identity = identity
         self.declared = declared or Declarations()
@@ -126,6 +131,8 @@ class Reconstruction:
 
     def run(self, console: Progress) -> None:
         """Step through what is left of the log."""
+        if self.fitter is not None:
+            self.device.give(self.fitter, [view.frame for view in self.fitter.window.newest], console)
         self._step_through(console)
         self.check_found()
         if not self.source.has_clock and not self.is_refined:
@@ -180,6 +187,7 @@ class Reconstruction:
         self.agreement.check(step, self.config.occupancy, console)
         if self.fitter is None:
             self.fitter = self._new_fitter(self._workspace(step))
+            self.device.give(self.fitter, step.frames, console)
             if self.cloud is not None:
                 self.fitter.plant(self.cloud)
         elif not self.source.has_clock and self.fitter.num_steps == 1:
@@ -234,6 +242,7 @@ class Reconstruction:
         last = self.rows[-1]
         return {
             "cameras": self.cameras,
+            "devices": self.device.history,
             "has_clock": self.source.has_clock,
             "scale": self.config.scene.scale or 1.0,
             "voxel": self.config.occupancy.voxel,
@@ -301,12 +310,10 @@ class Reconstruction:
         assert self.fitter is not None
         progress = {
             "run": self.identity,
-            "num_read": self.num_read,
-            "is_refined": self.is_refined,
+            **{name: getattr(self, name) for name in KEPT},
             "disagreement": self.agreement.disagreement,
             "depth": None if self.depth is None else asdict(self.depth),
-            "first_frames": self.first_frames,
-            "corrected": self.corrected,
+            "devices": self.device.history,
             "stamps": [] if self.source.has_clock else self.stamps,
         }
         self.writer.checkpoint(progress, fitter_state(self.fitter), is_last=is_last)
@@ -317,13 +324,12 @@ class Reconstruction:
             AuditRow(**row | {name: tuple(row[name]) for name in tuples if name in row})
             for row in self.writer.audited()
         ]
-        self.num_read = checkpoint.progress["num_read"]
-        self.is_refined = checkpoint.progress["is_refined"]
-        self.stamps = checkpoint.progress["stamps"]
-        self.agreement.disagreement = checkpoint.progress["disagreement"]
-        self.first_frames = checkpoint.progress["first_frames"]
-        self.corrected = checkpoint.progress["corrected"]
-        depth = checkpoint.progress["depth"]
+        progress = checkpoint.progress
+        for name in (*KEPT, "stamps"):
+            setattr(self, name, progress[name])
+        self.agreement.disagreement = progress["disagreement"]
+        self.device.history = progress.get("devices", [{**Device().as_dict(), "from_iteration": 0}])
+        depth = progress["depth"]
         self._fit_to(None if depth is None else RecordedDepth(**depth))
         self.fitter = self._new_fitter(workspace_of(checkpoint.state))
         restore_fitter(self.fitter, checkpoint.state)

@@ -19,6 +19,7 @@ from splatctrl_cli.evaluate.images import psnr
 from splatctrl_cli.evaluate.metrics import DECIBELS, DESCRIBES, TIME, Scale
 from splatctrl_cli.evaluate.perceptual import Lpips
 from splatctrl_cli.evaluate.score_report import AVERAGING, SCALES, judged, mean_of
+from splatctrl_cli.jobs.device import CPU, Device, demanded
 from splatctrl_cli.jobs.open_recording import RecordingRequest, is_folder_of_views, open_to_train
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
@@ -65,12 +66,14 @@ class FitRequest(Scoring):
     """Fit the scans of a data set (`recording.scan`: names joined by commas; None: all), or an image folder.
 
     config: a TOML file; settings: ``SECTION.KEY=VALUE``. iterations: of each method (None: those of the
-    configuration); num_splats: the budget, and Gaussians to begin with. require: gates on the metrics of both.
+    configuration); num_splats: the budget, and Gaussians to begin with. device: of our method, as of --device; the
+    baseline computes on the processor. require: gates on the metrics of both.
     """
 
     config: Path | None = None
     settings: tuple[str, ...] = ()
     seed: int = 0
+    device: str = CPU
     iterations: int | None = None
     num_splats: int = COMPARED_SPLATS
 
@@ -95,6 +98,7 @@ class Fitted:
             "method": self.method,
             "splats": int(self.scene.metrics["splats"]),
             "iterations": int(self.scene.metrics["iterations"]),
+            "devices": self.scene.metrics.get("devices", [Device().as_dict()]),
             "memory": self.memory,
             "seconds": round(self.scene.seconds["fit"], 4),
             "psnr": metrics["psnr_masked"] if "psnr_masked" in metrics else metrics["psnr_all"],
@@ -159,6 +163,7 @@ def _checked(request: FitRequest) -> FitRequest:
         Lpips(request.lpips)
     scene = load_config(request.config, request.settings).scene
     check_gate_names(request.require, GATED)
+    demanded(request.device)
     if recording.is_dtu:
         recording = replace(recording, protocol=recording.protocol or PROTOCOL)
     iterations = request.iterations
@@ -207,7 +212,11 @@ def _reconstruct(
     try:
         source = open_to_train(replace(scoring.recording, options=options, masks=None))
         config, seed, threads = _config(request), request.seed, request.threads
-        made = run(ReconstructRequest(source=source, out=out, config=config, seed=seed, threads=threads), progress)
+        device = CPU if method == "3dgs" else request.device
+        made = run(
+            ReconstructRequest(source=source, out=out, config=config, seed=seed, threads=threads, device=device),
+            progress,
+        )
     except KeyboardInterrupt:
         raise KeyboardInterrupt from None  # its message would name --resume, which score does not have
     except SplatCtrlError as error:

@@ -67,7 +67,8 @@ REFUSED: dict[str, list[Refusal]] = {
     ],
     "reconstruct": [
         ("", 2, "expected a SOURCE or --dtu ROOT, and not both"),
-        ("log.mcap --device cuda", 2, "--device cuda: no command runs on a card yet; give --device cpu"),
+        ("log.mcap --device gpu", 2, "--device: expected auto, cpu, cuda or cuda:N, got 'gpu'"),
+        ("log.mcap --device cuda:99", 2, "or give --device cpu"),
         ("log.mcap --spheres x.yaml", 2, "give --urdf"),
         ("log.mcap --urdf arm.urdf --spheres ball.yaml", 4, "joints not in the log: hinge; the log has: joint_a"),
         (
@@ -93,6 +94,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("log.mcap --seed=-1", 2, "argument --seed: expected a whole number, 0 to 2147483647"),
     ],
     GAUSSIANS: [
+        ("--device cuda", 2, "--device cuda: --method 3dgs computes on the processor; give --device cpu"),
         ("--urdf robot.urdf", 2, "--urdf: does not apply"),
         ("--resume", 2, "--resume: does not apply"),
         ("--points cloud.ply", 2, "--points: does not apply"),
@@ -180,6 +182,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("--dtu root", 2, "not allowed with argument"),
         ("--images all", 2, "--images all: expected a folder for them; give -o"),
         ("--seed 3", 2, "--seed: only with --fit"),
+        ("--device cuda", 2, "--device: only with --fit"),
         ("--fit-iterations 3", 2, "--fit-iterations: only with --fit"),
         ("--cloud-unit 1", 2, "--cloud-unit: only with --cloud"),
         ("--cloud a.ply --cloud-max 0", 2, "--cloud-max: expected 1e-06 to 1000 m, got '0'"),
