@@ -42,13 +42,23 @@ def cube_levels(points: Float32, colors: Float32, edge: float, num_levels: int) 
     above: Index = np.zeros(len(points), np.int64)
     for level in range(num_levels):
         size = edge / 2**level
-        key: Index = np.zeros(len(points), np.int64)
-        for column in points.T:
-            key = key * 2_097_152 + np.floor(column.astype(np.float64) / size).astype(np.int64)
-        first, cube = np.unique(key, return_index=True, return_inverse=True)[1:]
+        first, cube = np.unique(_keys(points, size), return_index=True, return_inverse=True)[1:]
         levels.append(_level(points, colors, cube, above[first], size))
         above = cube
     return levels
+
+
+def num_cubes(points: Float32, edge: float) -> int:
+    """How many cubes of `edge` [m] hold points (K, 3)."""
+    return len(np.unique(_keys(points, edge)))
+
+
+def _keys(points: Float32, edge: float) -> Index:
+    """A number for the cube of each point."""
+    key: Index = np.zeros(len(points), np.int64)
+    for column in points.T:
+        key = key * 2_097_152 + np.floor(column.astype(np.float64) / edge).astype(np.int64)
+    return key
 
 
 def _level(points: Float32, colors: Float32, cube: Index, parent: Index, edge: float) -> CubeLevel:

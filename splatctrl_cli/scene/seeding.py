@@ -14,7 +14,7 @@ from splatctrl_cli.geometry import back_project, back_project_pixels, transform_
 from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
+from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, num_cubes, tolerance_for
 
 NO_SEEDS = Seeds(
     centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3), np.float32)
@@ -108,7 +108,7 @@ def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig) 
     points, colors, _ = _joined(sources)
     extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
     edge = config.max_radius / config.radius_per_edge
-    while edge < extent and len(cube_levels(points, colors, edge, 1)[0].detail) > count:
+    while edge < extent and num_cubes(points, edge) > count:
         edge *= 1.05
     tolerance = tolerance_for(cube_levels(points, colors, edge, SEED_LEVELS), count)
     return SeedDensity(edge=edge, tolerance=tolerance, num_candidates=len(points))

@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float32, SplatSet
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seed_octree import cube_levels, leaves, tolerance_for
+from splatctrl_cli.scene.seed_octree import cube_levels, leaves, num_cubes, tolerance_for
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
     add_mask,
@@ -207,3 +207,10 @@ def test_more_pixels_than_are_looked_at_together_are_thinned_in_each_view(monkey
     assert every == 5
     assert kept == [960, 0, 12]
     assert not (thinned(masks[2], every) & ~masks[2]).any()
+
+
+def test_cubes_are_counted_as_they_are_made() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (5000, 3)).astype(np.float32)
+    for edge in (0.05, 0.31, 3.0):
+        assert num_cubes(points, edge) == len(cube_levels(points, points, edge, 1)[0].points)
+    assert num_cubes(points[:0], 0.1) == 0
