@@ -76,9 +76,10 @@ class FitDevice:
         self.history: list[dict[str, Any]] = []
 
     def give(self, fitter: SceneFitter, frames: Sequence[RgbdFrame], progress: Progress) -> None:
-        """Let a fitter compute there; `frames` are those of its first time step."""
-        num_splats = fitter.config.max_splats
+        """Let a fitter compute there; `frames` are those of its first time step, keyframes come to them."""
+        num_splats, window = fitter.config.max_splats, fitter.config.window
         sizes = [(frame.intrinsics.height, frame.intrinsics.width) for frame in frames]
+        sizes += [max(sizes)] * window
         if self._device is None:
             self._device = self._chosen(num_splats, sizes, progress)
         device, last = self._device, self.history[-1] if self.history else None

@@ -27,8 +27,7 @@ class Descent:
     """The optimiser of a buffer's M splats; noise is drawn from the seed and the number of the iteration.
 
     background: the colour behind the splats, None until it is chosen. heard: called after each iteration. device:
-    where the iterations of `run` are done, the processor if None; everything else is done on the processor.
-    `run` raises DeviceError where the device fails.
+    where `run` and `rendering` are done, the processor if None; they raise DeviceError where it fails.
     """
 
     def __init__(
@@ -54,7 +53,7 @@ class Descent:
         """
         weights = self._weights()
         weights = replace(weights, depth=depth * weights.depth)
-        if self.device is not None:
+        if self.device is not None and views:
             return self._run_on(self.device, views, weights, settings)
         terms = {}
         for view in views:
@@ -74,13 +73,16 @@ class Descent:
             self.heard()
         return terms
 
+    def keep(self, views: Sequence[View]) -> None:
+        """From here on only these are looked at: images of others leave the device."""
+        if self.device is not None:
+            self.device.keep([view.target for view in views])
+
     def _run_on(
         self, device: DeviceFit, views: Sequence[View], weights: LossWeights, settings: OptimiserSettings
     ) -> dict[int, LossTerms]:
         different = {id(view): view for view in views}
-        device.forget_views()
-        device.expect([view.target.counted.shape for view in different.values()])
-        numbers = {key: device.add_view(view.camera, view.target) for key, view in different.items()}
+        numbers = {key: device.number_of(view.camera, view.target) for key, view in different.items()}
         device.put(self._buffer.parameters, self._buffer.moments)
         terms = device.run([numbers[id(view)] for view in views], weights, settings, self._step_seed())
         device.take(self._buffer.parameters, self._buffer.moments)
@@ -99,8 +101,12 @@ class Descent:
         return self._raster.forward()
 
     def rendering(self, view: View) -> Rendering:
-        """The same as an image."""
-        planes = self.planes(view)
+        """The same as an image, from the device if there is one."""
+        if self.device is None:
+            planes = self.planes(view)
+        else:
+            self.device.put(self._buffer.parameters)
+            planes = self.device.planes(self.device.number_of(view.camera, view.target))
         return Rendering(color=np.moveaxis(planes[:3], 0, 2), depth=planes[3], opacity=planes[4])
 
     def evaluate(self, view: View) -> LossTerms:

@@ -119,6 +119,7 @@ class SceneFitter:
         filled = self._seed(views, masks)
         is_first = self.descent.num_iterations == 0 and bool(self.buffer.is_alive.any())
         self.window.advance(views)
+        self.descent.keep([*self.window.newest, *self.window.keyframes])
         num_iterations = self.config.first_iterations if is_first else self.config.iterations_per_step
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config)
         as_they_were = self.buffer.parameters[hidden].copy()
@@ -395,6 +396,5 @@ class SceneFitter:
 
 
 def _halved(views: Sequence[View]) -> list[View]:
-    """The views, in order, at half the size."""
     small = {id(view): halved(view) for view in views}
     return [small[id(view)] for view in views]

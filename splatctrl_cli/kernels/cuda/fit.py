@@ -47,6 +47,7 @@ IMAGE_BYTES = 8  # of a pixel of a view: colour, depth, counted
 class _DeviceView:
     height: int
     width: int
+    target: TargetView
     row: Array  # one VIEW
     num_values: float
     num_depths: float
@@ -122,9 +123,10 @@ class DeviceFit:
         if self._needed(self.num_splats) > self._usable():
             raise self._too_large()
 
-    def put(self, parameters: Float32, moments: Moments) -> None:
-        """Splats (N, 8) and Adam's state, from the host."""
-        for name, values in self._state(parameters, moments).items():
+    def put(self, parameters: Float32, moments: Moments | None = None) -> None:
+        """Splats (N, 8), and Adam's state if given, from the host."""
+        state = {"parameters": parameters} if moments is None else self._state(parameters, moments)
+        for name, values in state.items():
             self.device.write(self._addresses[name], values)
 
     def take(self, parameters: Float32, moments: Moments) -> None:
@@ -143,16 +145,30 @@ class DeviceFit:
         row["per"] = 1.0 / num_values, 1.0 / num_depths if num_depths else 0.0
         row["images"] = images
         view = _DeviceView(
-            height=height, width=width, row=row, num_values=num_values, num_depths=float(max(num_depths, 1))
+            height=height,
+            width=width,
+            target=target,
+            row=row,
+            num_values=num_values,
+            num_depths=float(max(num_depths, 1)),
         )
         self.views.append(view)
         return len(self.views) - 1
 
-    def forget_views(self) -> None:
-        """Give back the images; numbers of views start from 0 again."""
-        for address in self._images:
+    def number_of(self, camera: Float64, target: TargetView) -> int:
+        """The number of a view, which is added if its target is not there."""
+        known = (k for k, view in enumerate(self.views) if view.target is target)
+        number = next(known, None)
+        return self.add_view(camera, target) if number is None else number
+
+    def keep(self, targets: Sequence[TargetView]) -> None:
+        """Give back the images of other views; the numbers of those that stay change."""
+        kept = {id(target) for target in targets}
+        gone = [view for view in self.views if id(view.target) not in kept]
+        self.views = [view for view in self.views if id(view.target) in kept]
+        for address in [int(address) for view in gone for address in view.row["images"]]:
             self.device.free(address)
-        self.views, self._images = [], {}
+            del self._images[address]
 
     def run(
         self, schedule: Sequence[int], weights: LossWeights, settings: OptimiserSettings, seed: int
