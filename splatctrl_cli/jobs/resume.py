@@ -11,7 +11,7 @@ from splatctrl_cli import __version__
 from splatctrl_cli.config import Config
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.kernels import native
+from splatctrl_cli.kernels import arithmetic
 from splatctrl_cli.scene_files.scene_writer import Checkpoint, read_checkpoint
 
 DECIDING_OPTIONS: Mapping[str, object] = {  # what decides the bytes of a scene beside its configuration, if not given
@@ -52,7 +52,7 @@ def deciding_versions() -> dict[str, str]:
     """What of this program, its kernels and its packages may change a bit."""
     return {
         "splatctrl": __version__,
-        "kernels": native.__name__.rpartition(".")[2],
+        "kernels": arithmetic(),
         **{name: metadata.version(name) for name in DECIDING_PACKAGES},
     }
 

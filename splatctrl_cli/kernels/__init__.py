@@ -1,7 +1,7 @@
 """Compiled kernels: numpy in, numpy out. Imports nothing of ours.
 
-One module per instruction set is built; `native` is the best that this processor runs. SPLATCTRL_KERNELS=base
-forces the plain one.
+One module per instruction set is built; `native` is the best that this processor runs. SPLATCTRL_KERNELS=base or v3
+forces a plainer one; v3 (AVX2) and v4 (AVX-512) give the same bytes.
 """
 
 import importlib
@@ -10,13 +10,19 @@ from typing import Any
 
 
 def _best() -> Any:
+    forced = os.environ.get("SPLATCTRL_KERNELS", "auto")
     base = importlib.import_module("splatctrl_cli.kernels._native_base")
-    if os.environ.get("SPLATCTRL_KERNELS", "auto") != "base" and base.runs_x86_64_v3():
-        return importlib.import_module("splatctrl_cli.kernels._native_v3")
-    return base
+    level = min(base.x86_64_level(), {"base": 0, "v3": 3}.get(forced, 4))
+    return importlib.import_module(f"splatctrl_cli.kernels._native_v{level}") if level else base
 
 
 native: Any = _best()
+
+
+def arithmetic() -> str:
+    """What results depend on: the plainest module that gives the same bytes as `native`."""
+    name: str = native.__name__.rpartition(".")[2]
+    return "_native_v3" if name == "_native_v4" else name
 
 
 MIN_CAP = 16  # threads that may be asked for on any machine

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.kernels import native
+from splatctrl_cli.kernels.raster import empty_planes
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -44,7 +45,7 @@ class GaussianRasteriser:
 
     def forward(self, out: Float32 | None = None) -> Float32:
         """Planes (5, H, W) of the prepared view: red, green, blue, depth [m], accumulated opacity."""
-        planes = np.empty((5, *self._shape), np.float32) if out is None else out
+        planes = empty_planes(*self._shape) if out is None else out
         self.native.forward(planes, self.num_threads)
         return planes
 

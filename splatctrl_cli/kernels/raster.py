@@ -24,6 +24,14 @@ def pack_camera(
     ).astype(np.float64)
 
 
+def empty_planes(height: int, width: int) -> Float32:
+    """Planes (5, H, W) to be written, at a whole cache line: a tile's row is one line then, not two."""
+    size = 5 * height * width
+    memory = np.empty(size + 16, np.float32)
+    first = -(memory.ctypes.data // 4) % 16
+    return memory[first : first + size].reshape(5, height, width)
+
+
 class Rasteriser:
     """Renders one view at a time and differentiates it; keeps its buffers between calls."""
 
@@ -41,7 +49,7 @@ class Rasteriser:
 
     def forward(self, out: Float32 | None = None) -> Float32:
         """Planes (5, H, W) of the prepared view (eq. 2 and 3)."""
-        planes = np.empty((5, *self._shape), np.float32) if out is None else out
+        planes = empty_planes(*self._shape) if out is None else out
         self.native.forward(planes, self.num_threads)
         return planes
 

@@ -13,6 +13,7 @@ from splatctrl_cli.kernels.raster import (
     LossWeights,
     OptimiserSettings,
     Rasteriser,
+    empty_planes,
     optimiser_step,
     unpack_parameters,
 )
@@ -58,7 +59,7 @@ class Descent:
         terms = {}
         for view in views:
             planes = self.planes(view)
-            plane_gradients = np.empty_like(planes)
+            plane_gradients = empty_planes(*view.target.depth.shape)
             terms[id(view)] = self._loss.evaluate(planes, view.target, weights, plane_gradients)
             self._raster.backward(planes, plane_gradients, self._gradients)
             optimiser_step(
@@ -112,7 +113,7 @@ class Descent:
     def evaluate(self, view: View) -> LossTerms:
         """The loss of a view."""
         planes = self.planes(view)
-        return self._loss.evaluate(planes, view.target, self._weights(), np.empty_like(planes))
+        return self._loss.evaluate(planes, view.target, self._weights(), empty_planes(*view.target.depth.shape))
 
     def _weights(self) -> LossWeights:
         return loss_weights(self._config, self.background or BLACK)

@@ -12,7 +12,7 @@ from splatctrl_cli.config import Config, GaussianConfig, SceneConfig
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.kernels import num_threads
 from splatctrl_cli.kernels.gaussians import GaussianArrays, GaussianRasteriser, GaussianRates, gaussian_step
-from splatctrl_cli.kernels.raster import ImageLoss, LossTerms
+from splatctrl_cli.kernels.raster import ImageLoss, LossTerms, empty_planes
 from splatctrl_cli.records import Box, Float32, GaussianSet, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.densify import Densified, densify, fresh, reset_opacity
@@ -101,7 +101,7 @@ class GaussianFitter:
     def _iterate(self, view: View) -> None:
         self._raster.prepare(view.camera, self.arrays.parameters, self.degree)
         planes = self._raster.forward()
-        plane_gradients = np.empty_like(planes)
+        plane_gradients = empty_planes(*view.target.depth.shape)
         weights = loss_weights(self.config.scene, self.background)
         self._terms.append(self._loss.evaluate(planes, view.target, weights, plane_gradients))
         gradients = self._raster.backward(planes, plane_gradients)
@@ -142,7 +142,7 @@ class GaussianFitter:
         self._raster.prepare(view.camera, self.arrays.parameters, self.degree)
         planes = self._raster.forward()
         weights = loss_weights(self.config.scene, self.background)
-        return self._loss.evaluate(planes, view.target, weights, np.empty_like(planes))
+        return self._loss.evaluate(planes, view.target, weights, empty_planes(*view.target.depth.shape))
 
     def _row(self, what: Densified, *, opacity_reset: bool) -> GaussianAuditRow:
         loss, psnr = mean_loss(self._terms, self.config.scene), psnr_of(self._terms)

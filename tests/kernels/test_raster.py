@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatctrl_cli.geometry import invert_transform, look_at
-from splatctrl_cli.kernels.raster import Float32, Float64, Rasteriser, pack_camera
+from splatctrl_cli.kernels.raster import Float32, Float64, Rasteriser, empty_planes, pack_camera
 from tests.reference import raster as reference
 
 Arrays = tuple[Float32, Float32, Float32, Float32]
@@ -44,6 +44,10 @@ def test_planes_equal_the_reference() -> None:
     assert np.abs(planes - expected).max() < 1.2 / 255
     assert np.median(np.abs(planes - expected)) < 1e-6
     assert np.mean(np.abs(planes - expected) > 1e-5) < 1e-3
+
+
+def test_planes_begin_at_a_whole_cache_line() -> None:
+    assert all(empty_planes(7, width).ctypes.data % 64 == 0 for width in range(1, 40))
 
 
 def test_gradients_equal_autograd_of_the_reference() -> None:

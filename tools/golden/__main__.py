@@ -21,7 +21,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from splatctrl_cli.kernels import native
+from splatctrl_cli.kernels import arithmetic
 from tools.golden.digest import lines, of_json, parse, stamps, written
 
 ROOT = Path(__file__).parent.parent.parent
@@ -87,7 +87,7 @@ def prepare(scratch: Path, recordings: Path) -> dict[str, str]:
 
 def header() -> list[str]:
     """What digests depend on beside the code."""
-    kernels = native.__name__.rpartition("_")[2]
+    kernels = arithmetic().rpartition("_")[2]
     return [
         "# Written by `python -m tools.golden --write`; compared by `python -m tools.golden`.",
         f"# {platform.machine()}, kernels {kernels}, " + ", ".join(f"{name} {version(name)}" for name in LIBRARIES),

@@ -3,11 +3,16 @@
 
 namespace {
 
-bool runs_x86_64_v3() {
+// 4, 3 or 0: of the x86-64 levels that a module is built for, the highest that this processor runs.
+int x86_64_level() {
 #if defined(__x86_64__)
-  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");
+  if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !__builtin_cpu_supports("bmi2")) return 0;
+  const bool is_wide = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+                       __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+                       __builtin_cpu_supports("avx512vl");
+  return is_wide ? 4 : 3;
 #else
-  return false;
+  return 0;
 #endif
 }
 
@@ -15,7 +20,7 @@ bool runs_x86_64_v3() {
 
 NB_MODULE(SPLATCTRL_MODULE, m) {
   nanobind::set_leak_warnings(false);  // an interrupted run keeps objects in its traceback; that is no leak
-  m.def("runs_x86_64_v3", &runs_x86_64_v3, "True where this processor has AVX2, FMA and BMI2.");
+  m.def("x86_64_level", &x86_64_level, "4 where this processor has AVX-512, 3 where AVX2, FMA and BMI2, 0 elsewhere.");
   splatctrl::bind_raster(m);
   splatctrl::bind_gaussians(m);
   splatctrl::bind_field(m);

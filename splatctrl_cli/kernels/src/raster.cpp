@@ -14,6 +14,7 @@ namespace {
 
 constexpr int kProjectChunk = 512;
 constexpr int kListChunks = 16;  // of the depth order
+constexpr int kTileChunk = 8;    // tiles side by side: each fetches the next one's pixels
 
 // Stable, by the upper half of the keys.
 void radix_sort(std::vector<std::uint64_t>& keys, std::vector<std::uint64_t>& scratch) {
@@ -136,8 +137,15 @@ TileImage Rasteriser::image_of(int tile) const {
   return {tile % tiles_x_ * kTileWidth, tile / tiles_x_ * kTileHeight, camera_.width, camera_.height};
 }
 
+void Rasteriser::each_tile(int num_threads, const std::function<void(int)>& visit) const {
+  const int num_tiles = tiles_x_ * tiles_y_;
+  parallel_for((num_tiles + kTileChunk - 1) / kTileChunk, num_threads, [&](int chunk) {
+    for (int tile = chunk * kTileChunk; tile < std::min(num_tiles, (chunk + 1) * kTileChunk); ++tile) visit(tile);
+  });
+}
+
 void Rasteriser::forward(float* planes, int num_threads) {
-  parallel_for(tiles_x_ * tiles_y_, num_threads, [&](int tile) {
+  each_tile(num_threads, [&](int tile) {
     TileEntry* entries = entries_.data();
     tile_forward(image_of(tile), splats_.data(), entries + tile_start_[tile], entries + tile_start_[tile + 1], planes);
   });
@@ -147,7 +155,7 @@ void Rasteriser::forward(float* planes, int num_threads) {
 void Rasteriser::backward(const float* planes, const float* plane_gradients, SplatGradient* gradients,
                           int num_threads) {
   if (!has_blended_) throw std::logic_error("backward: expected forward to have been called first");
-  parallel_for(tiles_x_ * tiles_y_, num_threads, [&](int tile) {
+  each_tile(num_threads, [&](int tile) {
     const TileEntry* entries = entries_.data();
     tile_backward(image_of(tile), splats_.data(), entries + tile_start_[tile], entries + tile_start_[tile + 1], planes,
                   plane_gradients, parts_.data());

@@ -47,6 +47,7 @@ class Rasteriser {
   void fill_tiles(int num_threads);
   int chunk_first(int chunk) const;  // rank at which a chunk of the depth order begins
   TileImage image_of(int tile) const;
+  void each_tile(int num_threads, const std::function<void(int)>& visit) const;
 
   Camera camera_{};
   int num_splats_ = 0, tiles_x_ = 0, tiles_y_ = 0;

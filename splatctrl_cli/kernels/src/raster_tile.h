@@ -16,16 +16,16 @@ struct SplatGradient {
   float color[3];
 };
 
-// A tile is made of strips, eight pixels of a row each, numbered column by column: columns / 8 * kTileHeight + row.
-using StripMask = std::uint32_t;
+// A tile is made of blocks, 4 x 4 pixels each, numbered column by column: x / 4 * 4 + y / 4.
+using BlockMask = std::uint16_t;
 
 // A splat on a tile's list.
 struct TileEntry {
   int rank;         // in depth
   int part;         // where its gradient goes
-  StripMask reach;  // the strips that tile_forward() blended it on
+  BlockMask reach;  // the blocks that tile_forward() blended it on, at first none
 };
-constexpr int kPrefetch = 2;  // entries beyond the last of a list that are read too, to fetch what they name
+constexpr int kPrefetch = 8;  // entries beyond the last of a list that are read too, to fetch what they name
 
 // Where a tile lies in the planes of an image.
 struct TileImage {

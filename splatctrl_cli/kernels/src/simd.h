@@ -24,6 +24,17 @@ inline Float8 load8(const float* p) {
 
 inline void store8(float* p, Float8 v) { std::memcpy(p, &v, sizeof v); }
 
+// Eight bytes as floats.
+inline Float8 load_bytes8(const std::uint8_t* p) {
+#if defined(__AVX2__)
+  return (Float8)_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(p))));
+#else
+  Float8 v;
+  for (int lane = 0; lane < 8; ++lane) v[lane] = p[lane];
+  return v;
+#endif
+}
+
 #if defined(__AVX__)
 inline Float8 min8(Float8 a, Float8 b) { return (Float8)_mm256_min_ps((__m256)a, (__m256)b); }
 inline Float8 max8(Float8 a, Float8 b) { return (Float8)_mm256_max_ps((__m256)a, (__m256)b); }

@@ -1,0 +1,88 @@
+"""The kernels for AVX2 and for AVX-512 give the same bytes: who checks a result may have another processor."""
+
+import hashlib
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from splatctrl_cli.field.clusters import cluster_points
+from splatctrl_cli.kernels import arithmetic, native
+from splatctrl_cli.kernels import field as fields
+from splatctrl_cli.kernels.raster import (
+    ImageLoss,
+    LossWeights,
+    Moments,
+    OptimiserSettings,
+    Rasteriser,
+    TargetView,
+    empty_planes,
+    optimiser_step,
+)
+from tests.field.scenes import cloud, queries
+from tests.kernels.test_raster import camera, splats
+
+
+def fit_bytes(width: int, height: int) -> bytes:
+    """What an iteration of the fit computes."""
+    view, count, rng = camera(width, height), 500, np.random.default_rng(3)
+    centers, radii, opacities, colors = splats(count, seed=5)
+    raster = Rasteriser(2)
+    raster.prepare(view, centers, radii, opacities, colors)
+    planes, by_planes = raster.forward(), empty_planes(height, width)
+    target = TargetView(
+        color=rng.integers(0, 256, (3, height, width), np.uint8),
+        depth=rng.uniform(0.0, 2.0, (height, width)).astype(np.float32),
+        counted=rng.integers(0, 2, (height, width), np.uint8),
+    )
+    weights = LossWeights(dssim=0.2, color=1.0, depth=0.5, opacity=0.1, normalised=True, background=(0.1, 0.2, 0.3))
+    terms = ImageLoss(2).evaluate(planes, target, weights, by_planes)
+    gradients = raster.backward(planes, by_planes)
+    parameters = np.column_stack([centers, np.log(radii), colors, np.log(opacities / (1 - opacities))])
+    moments = Moments(
+        first=np.zeros((count, 8), np.float32),
+        second=np.zeros((count, 8), np.float32),
+        num_steps=np.zeros(count, np.uint32),
+    )
+    settings = OptimiserSettings(
+        lr_center=2e-4, lr_log_radius=6e-3, lr_color=1e-2, lr_logit_opacity=5e-2, regulariser=1e-6, noise=5e5,
+        min_opacity=0.1, min_radius=1e-3, max_radius=0.1, radius_depth=0.8,
+    )  # fmt: skip
+    moved = np.ascontiguousarray(parameters, np.float32)
+    optimiser_step(raster, gradients, moved, moments, settings, 7)
+    arrays = planes, by_planes, gradients, moved, moments.first, moments.second
+    return b"".join(array.tobytes() for array in arrays) + repr(terms).encode()
+
+
+def field_bytes() -> bytes:
+    """Scores and gradients of the fields."""
+    centers, radii = cloud(700)
+    points, at = cluster_points(centers), queries()
+    relative, offsets = points.relative(at), points.offsets(radii)
+    laid_out = points.laid_out(radii, spare=0.0).astype(np.float32)
+    results = [
+        *fields.nearest(points.clusters, offsets, relative),
+        *fields.matern(points.clusters, offsets, None, 0.02, 1e-3, relative),
+        *fields.gaussian(points.clusters, offsets, laid_out, None, 0.0, 0.02, 1e-5, relative),
+    ]
+    return b"".join(np.ascontiguousarray(result).tobytes() for result in results)
+
+
+def digests() -> list[str]:
+    parts = [arithmetic().encode(), fit_bytes(45, 37), fit_bytes(160, 128), field_bytes()]
+    return [hashlib.sha256(part).hexdigest() for part in parts]
+
+
+@pytest.mark.skipif(native.x86_64_level() < 4, reason="this processor has no AVX-512")
+def test_avx2_and_avx512_give_the_same_bytes() -> None:
+    here = [sys.executable, "-c", f"from {__name__} import digests; print(digests())"]
+    of = {
+        kernels: subprocess.run(
+            here, env=os.environ | {"SPLATCTRL_KERNELS": kernels}, capture_output=True, text=True, check=True
+        ).stdout
+        for kernels in ("v3", "auto")
+    }
+    assert of["v3"] == of["auto"]
+    assert len(of["v3"].split()) == 4
