@@ -15,6 +15,7 @@ from splatctrl_cli.cli.common import table
 
 NAMES = (
     "iteration",
+    "growth",
     "streaming",
     "occupancy",
     "eviction_cost",
