@@ -89,7 +89,7 @@ class FitDevice:
             if last is not None:
                 progress.log(
                     f"warning: computed on {shown(last)} before iteration {begins}, on {shown(device.as_dict())} from"
-                    " there: the bytes differ from those of either alone"
+                    " there; for the bytes of one of them alone start over"
                 )
         if device.memory is not None:
             self._fit = fitter.descent.device = DeviceFit(device.memory, num_splats, sizes)
