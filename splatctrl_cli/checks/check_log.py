@@ -61,9 +61,10 @@ def check_log(
         findings = [finding for finding in findings if finding.code != "tf-ends"]  # the same, from its cause
     lacks = _lacks(log, found, options)
     findings += [error("missing", log.path.name, *_parted(lack)) for lack in lacks]
-    checked = [checked_camera(t, c, watch.images, found.tf, options) for t, c in rig if c is not None]
-    of_states = log_states(found, options, model)
     correction = correction_of(options, log.path.name)
+    late_ns = {c.name: correction.late_ns(c.name) for _, c in rig if correction is not None and c is not None}
+    checked = [checked_camera(t, c, watch.images, found.tf, options, late_ns) for t, c in rig if c is not None]
+    of_states = log_states(found, options, model)
     if correction is not None:
         checked = [replace(c, frames=tuple(map(correction.frame, c.frames))) for c in checked]
         if of_states.states is not None:

@@ -163,9 +163,16 @@ def ready(log: RawLog, found: Survey, topics: CameraTopics, options: SourceOptio
 
 
 def checked_camera(
-    topics: CameraTopics, camera: Camera, images: Mapping[str, ImageWatch], tf: TfTree, options: SourceOptions
+    topics: CameraTopics,
+    camera: Camera,
+    images: Mapping[str, ImageWatch],
+    tf: TfTree,
+    options: SourceOptions,
+    late_ns: Mapping[str, int],
 ) -> CheckedCamera:
-    """With the frames whose depth was kept and whose pose is known."""
+    """With the frames whose depth was kept and whose pose is known. late_ns: how late frames are stamped against
+    transforms, by camera, 0 where nothing is said of it.
+    """
     depths, colors = images.get(topics.depth), images.get(topics.color)
     kept_colors = {kept.stamp_ns: kept for kept in (colors.kept if colors is not None else ())}
     frames = []
@@ -174,7 +181,8 @@ def checked_camera(
         is_near = near is not None and abs(near - kept.stamp_ns) <= options.pairing_tolerance_s * 1e9
         color = kept_colors[near] if near is not None and is_near else None
         stamp_ns = kept.stamp_ns if color is None else color.stamp_ns
-        T = camera.pose_at(tf, stamp_ns, round(options.pose_tolerance_s * 1e9))
+        at_ns = stamp_ns - late_ns.get(camera.name, 0)
+        T = camera.pose_at(tf, at_ns, round(options.pose_tolerance_s * 1e9))
         if T is not None:
             frames.append(_frame(camera, kept, color, stamp_ns, T))
     return CheckedCamera(topics=topics, camera=camera, frames=tuple(frames))

@@ -55,6 +55,7 @@ class RosLogSource:
         found = survey(log, by_log_time=options.stamps == "log")
         _check_not_empty(log, found)
         self._rig = _rig(log, found, options)
+        self._tf = found.tf
         self._loss = LossReport(damaged=found.damage.count, notes=[*found.damage.notes, *found.tf.notes])
         self.cameras = tuple(camera.name for camera in self._rig)
         self._loss.notes.extend(still_note(camera.name) for camera in self._rig if camera.fixed_pose is not None)
@@ -88,6 +89,11 @@ class RosLogSource:
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Of every planned frame."""
         return ((planned.stamp_ns, planned.camera.name, planned.T_world_camera) for planned in self._plan)
+
+    def pose_at(self, camera: str, stamp_ns: int) -> Float64 | None:
+        """T_world_camera (4, 4) of a camera at any time [ns]; None where tf does not know it."""
+        tolerance_ns = round(self._options.pose_tolerance_s * SECOND_NS)
+        return next(c for c in self._rig if c.name == camera).pose_at(self._tf, stamp_ns, tolerance_ns)
 
     def digests(self) -> dict[str, str]:
         """sha256 of the log's files."""

@@ -20,7 +20,16 @@ from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CALIBRATION, SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, decoded
-from splatctrl_cli.records import Float32, Float64, JointState, LossReport, Record, RgbdFrame, by_stamp
+from splatctrl_cli.records import (
+    SECOND_NS,
+    Float32,
+    Float64,
+    JointState,
+    LossReport,
+    Record,
+    RgbdFrame,
+    by_stamp,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +43,7 @@ class Correction:
     @property
     def clock_ns(self) -> int:
         """By how much the stamps of joint states are late against those of frames [ns], to be added to them."""
-        return round((self.calibration.clock or 0.0) * 1e9)
+        return round((self.calibration.clock or 0.0) * SECOND_NS)
 
     def camera(self, name: str) -> CalibratedCamera:
         """A camera of the recording. Raises InputError for one that was not calibrated."""
@@ -65,6 +74,10 @@ class Correction:
             f" has it ({off:.1f} mm apart)",
             remedy="calibrate this recording: the camera was moved, or its pose was set anew",
         )
+
+    def late_ns(self, name: str) -> int:
+        """By how much a camera's frames are stamped late against its recorded poses [ns]: 0 where it stands still."""
+        return self.clock_ns if self.clock_ns and self.camera(name).moves else 0
 
     def depth(self, name: str, depth: Float32) -> Float32:
         """A depth image [m] as it should be."""
@@ -101,19 +114,23 @@ def correction_of(options: SourceOptions, where: str) -> Correction | None:
 def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
     """The source, corrected where the options have a calibration. Raises InputError where that is not of it."""
     correction = correction_of(options, source.name)
-    return source if correction is None else CalibratedSource(source, correction)
+    if correction is None:
+        return source
+    return CalibratedSource(source, correction, round(options.pose_tolerance_s * SECOND_NS))
 
 
 class CalibratedSource:
     """Records of another source as a calibration corrects them.
 
     Joint states are moved to the clock of the frames. A moving camera is where the recording has it at the time of
-    its frame by the robot's clock, between its recorded poses.
+    its frame by the robot's clock: by a log's transforms then, of other recordings between the poses of frames. A
+    frame that has no pose within `tolerance_ns` of that time is left out, and counted.
     """
 
-    def __init__(self, source: FrameSource, correction: Correction) -> None:
+    def __init__(self, source: FrameSource, correction: Correction, tolerance_ns: int = 0) -> None:
         self.inner = source
         self._correction = correction
+        self._tolerance_ns = tolerance_ns
         if isinstance(source, CaptureSource) and sha256(correction.file) in source.made_of:
             raise InputError(
                 f"{source.name}: was ingested with {correction.file}", remedy="leave --calibration out: it is applied"
@@ -135,10 +152,10 @@ class CalibratedSource:
 
     @property
     def loss(self) -> LossReport:
-        """That of the source, with a note."""
+        """That of the source, with a note, and with the frames that the clock leaves without a pose."""
         loss = self.inner.loss
         notes = self._correction.notes(list(self.inner.digests().values()))
-        return replace(loss, notes=[*loss.notes, *notes])
+        return replace(loss, without_pose=loss.without_pose + self._num_without_pose, notes=[*loss.notes, *notes])
 
     def records(self) -> Iterator[Record]:
         """Joint states and frames by stamp."""
@@ -150,7 +167,10 @@ class CalibratedSource:
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:
         """Stamp [ns], camera and T_world_camera (4, 4) of each frame, by stamp."""
-        return ((stamp, camera, self._pose(stamp, camera, T)) for stamp, camera, T in self.inner.poses())
+        for stamp, camera, T_recorded in self.inner.poses():
+            T = self._pose(stamp, camera, T_recorded)
+            if T is not None:
+                yield stamp, camera, T
 
     def digests(self) -> dict[str, str]:
         """sha256 of the source's files, and of the calibration."""
@@ -159,10 +179,11 @@ class CalibratedSource:
     def _frames(self) -> Iterator[StoredFrame]:
         for item in self.inner.stored():
             if isinstance(item, StoredFrame):
-                yield self._corrected(item)
+                T = self._pose(item.stamp_ns, item.camera, item.T_world_camera)
+                if T is not None:
+                    yield self._corrected(item, T)
 
-    def _corrected(self, stored: StoredFrame) -> StoredFrame:
-        T = self._pose(stored.stamp_ns, stored.camera, stored.T_world_camera)
+    def _corrected(self, stored: StoredFrame, T: Float64) -> StoredFrame:
         camera = self._correction.camera(stored.camera)
         if (camera.scale, camera.bias) == (1.0, 0.0):
             return replace(stored, T_world_camera=T)
@@ -182,10 +203,20 @@ class CalibratedSource:
 
         return replace(stored, T_world_camera=T, read_depth=counted, depth_unit=scaled)
 
-    def _pose(self, stamp_ns: int, camera: str, T_recorded: Float64) -> Float64:
-        if self._correction.clock_ns and self._correction.camera(camera).moves:
-            T_recorded = _between(*self._paths[camera], stamp_ns - self._correction.clock_ns)
-        return self._correction.pose(camera, T_recorded)
+    def _pose(self, stamp_ns: int, camera: str, T_recorded: Float64) -> Float64 | None:
+        late_ns = self._correction.late_ns(camera)
+        T = self._recorded_at(camera, stamp_ns - late_ns) if late_ns else T_recorded
+        return None if T is None else self._correction.pose(camera, T)
+
+    def _recorded_at(self, camera: str, stamp_ns: int) -> Float64 | None:
+        if isinstance(self.inner, RosLogSource):
+            return self.inner.pose_at(camera, stamp_ns)
+        return _between(*self._paths[camera], stamp_ns, self._tolerance_ns)
+
+    @cached_property
+    def _num_without_pose(self) -> int:
+        """Frames that have a pose as recorded, and none at their time by the robot's clock."""
+        return sum(self._pose(*frame) is None for frame in self.inner.poses())
 
     @cached_property
     def _paths(self) -> dict[str, tuple[list[int], list[Float64]]]:
@@ -208,11 +239,12 @@ class CalibratedSource:
                     return
 
 
-def _between(stamps: list[int], poses: list[Float64], stamp_ns: int) -> Float64:
-    """The pose (4, 4) at a time between those of a path, its end beyond it."""
+def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:
+    """The pose (4, 4) at a time between those of a path, its end within a tolerance of that, else None."""
     after = int(np.searchsorted(stamps, stamp_ns))
     if after in (0, len(stamps)):
-        return poses[min(after, len(stamps) - 1)]
+        end = min(after, len(stamps) - 1)
+        return poses[end] if abs(stamp_ns - stamps[end]) <= tolerance_ns else None
     share = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
     return interpolate_transform(poses[after - 1], poses[after], share)
 

@@ -3,18 +3,23 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.calibration import SetUp, errors, write_log
+from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors, write_log
 from splatctrl_cli.calibration.calibration_file import read_calibration
+from splatctrl_cli.calibration.unknowns import transform_of, twist_between
+from splatctrl_cli.checks import check_log
+from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.geometry import look_at
 from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
 from splatctrl_cli.jobs.ingest import IngestRequest, ingest
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import RgbdFrame
+from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.simulate.arm import HAND
 from splatctrl_cli.simulate.recording import RecordingOptions, Scene
 from splatctrl_cli.sources.source import open_source
 from splatctrl_cli.states.state_source import open_states
@@ -113,6 +118,94 @@ def test_a_calibration_of_other_cameras_is_refused(
 def test_what_is_calibrated_is_the_recording_as_it_is(log: Path, result: CalibrateResult) -> None:
     with pytest.raises(UsageError, match="--calibration"):
         calibrate(CalibrateRequest(paths=(log,), options=SourceOptions(calibration=result.out)))
+
+
+@pytest.fixture(scope="module")
+def wrist() -> SetUp:
+    """A camera on the hand, recorded 2 cm and 2 degrees off its mount, with a clock 50 ms off."""
+    setup = SetUp(2, SMALL, has_wrist=True)
+    turn, move = np.array([1, 2, -2]) / 3, np.array([2, -1, 2]) / 3
+    setup.off[WRIST] = transform_of(np.concatenate([np.radians(2) * turn, 0.02 * move]))
+    setup.clock = 0.05
+    return setup
+
+
+@pytest.fixture(scope="module")
+def wrist_log(wrist: SetUp, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("wrist") / "log.mcap"
+    write_log(wrist, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def wrist_result(wrist_log: Path, sample_data: Path) -> CalibrateResult:
+    robot = sample_data / "tabletop"
+    return calibrate(
+        CalibrateRequest(
+            paths=(wrist_log,),
+            out=wrist_log.with_name("rig.toml"),
+            urdf=robot / "robot.urdf",
+            spheres=robot / "robot_spheres.yaml",
+        )
+    )
+
+
+def off_hand(setup: SetUp, stamp_ns: int, T: Float64) -> tuple[float, float]:
+    """How far [m] and [deg] the wrist camera at T is from where it was at a time."""
+    q = setup._motion.at((stamp_ns - setup.start_ns) * 1e-9)[0]
+    twist = twist_between(setup.link_poses(q)[HAND] @ T_HAND_WRIST, T)
+    return float(np.linalg.norm(twist[3:])), float(np.degrees(np.linalg.norm(twist[:3])))
+
+
+def test_a_camera_on_the_wrist_is_put_right_on_its_mount(wrist: SetUp, wrist_result: CalibrateResult) -> None:
+    found = wrist_result.calibration.cameras[WRIST]
+    assert found.moves
+    twist = twist_between(np.linalg.inv(wrist.off[WRIST]), found.T)
+    assert np.linalg.norm(twist[3:]) < 0.002
+    assert np.linalg.norm(twist[:3]) < np.radians(0.2)
+    assert largest(wrist, wrist_result, "clock") < 0.003
+    change = next(change for change in wrist_result.changes if change.camera == WRIST)
+    assert change.distance == pytest.approx(0.02, abs=0.002)
+    assert change.angle == pytest.approx(2.0, abs=0.2)
+
+
+def test_each_frame_of_the_wrist_is_where_the_hand_was(
+    wrist: SetUp, wrist_log: Path, wrist_result: CalibrateResult
+) -> None:
+    """The hand moves by centimetres in the 50 ms that its clock is off, and not evenly between frames."""
+    options = SourceOptions(calibration=wrist_result.out)
+    poses = [(stamp, T) for stamp, camera, T in open_source(wrist_log, options).poses() if camera == WRIST]
+    assert len(poses) == 6
+    recorded = [(stamp, T) for stamp, camera, T in open_source(wrist_log).poses() if camera == WRIST]
+    assert min(off_hand(wrist, *pose)[0] for pose in recorded) > 0.008
+    for pose in poses:
+        distance, angle = off_hand(wrist, *pose)
+        assert distance < 0.003 and angle < 0.25
+
+
+def test_check_has_the_frames_of_the_wrist_there_too(
+    wrist: SetUp, wrist_log: Path, wrist_result: CalibrateResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(check_log, "judged", lambda evidence, *_: evidence)
+    evidence: Any = check_log.check_log(open_raw_log(wrist_log), SourceOptions(calibration=wrist_result.out))
+    frames = [frame for frame in evidence.frames if frame.camera == WRIST]
+    assert frames
+    assert max(off_hand(wrist, frame.stamp_ns, frame.T_world_camera)[0] for frame in frames) < 0.003
+
+
+def test_frames_of_a_capture_that_the_clock_leaves_without_a_pose_are_counted(
+    wrist_log: Path, wrist_result: CalibrateResult
+) -> None:
+    """A capture has poses at its frames alone: 50 ms before the first there is none."""
+    plain = wrist_log.with_name("plain.capture")
+    ingest(IngestRequest(paths=(wrist_log,), out=plain))
+    source = open_source(plain, SourceOptions(calibration=wrist_result.out))
+    stamps = [stamp for stamp, camera, _ in source.poses() if camera == WRIST]
+    frames = [record.stamp_ns for record in source.records() if isinstance(record, RgbdFrame)]
+    recorded = [stamp for stamp, camera, _ in open_source(plain).poses() if camera == WRIST]
+    assert stamps == recorded[1:]
+    assert len(frames) == 2 * len(recorded) - 1
+    assert source.loss.without_pose == 1
 
 
 def refused(setup: SetUp, folder: Path, **request: object) -> str:
