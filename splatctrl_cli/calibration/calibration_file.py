@@ -1,6 +1,7 @@
 """``calibration.toml``: where cameras stand, what their depths and clocks are off by, and how sure that is."""
 
 import json
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,8 +26,9 @@ class CalibratedCamera:
     T (4, 4): T_world_camera of one that stands still, T_recorded_camera of one that moves; recorded (4, 4):
     T_world_camera as the calibrated recording has it, None of one that moves. scale, bias [m]: the true depth is
     ``scale depth + bias``. sigma_position (3,) [m], sigma_rotation (3,) [rad]: along and about the
-    axes of the world, of a moving camera its own; sigma_depth: of scale and bias. held: what was taken as it is;
-    unobserved: directions that the recording said nothing of, and that stayed as recorded.
+    axes of the world, of a moving camera its own; sigma_depth: of scale and bias; depth_noticed: how far from 1 a
+    scale, and from 0 a bias [m], would have to be to be taken for one, inf where none was looked for. held: what was
+    taken as it is; unobserved: directions that the recording said nothing of, and that stayed as recorded.
     """
 
     T: Float64
@@ -36,6 +38,7 @@ class CalibratedCamera:
     sigma_position: tuple[float, ...] = (0.0, 0.0, 0.0)
     sigma_rotation: tuple[float, ...] = (0.0, 0.0, 0.0)
     sigma_depth: tuple[float, ...] = (0.0, 0.0)
+    depth_noticed: tuple[float, ...] = (math.inf, math.inf)
     covariance: Float64 = field(default_factory=lambda: np.zeros((6, 6)))
     held: tuple[str, ...] = ()
     unobserved: tuple[str, ...] = ()
@@ -86,6 +89,7 @@ def calibration_text(calibration: Calibration) -> str:
             f"sigma_position = {_numbers(camera.sigma_position)}  # [m], along {axes} axes",
             f"sigma_rotation = {_numbers(camera.sigma_rotation)}  # [rad], about {axes} axes",
             f"sigma_depth = {_numbers(camera.sigma_depth)}  # of depth_scale and depth_bias [m]",
+            f"depth_noticed = {_numbers(camera.depth_noticed)}  # off by less, they would be taken as recorded",
             f"held = {_list(map(_text, camera.held))}",
             f"unobserved = {_list(map(_text, camera.unobserved))}",
             f"covariance = {_list(_numbers(row) for row in camera.covariance)}  # of position, rotation",
@@ -179,6 +183,7 @@ def _camera(entry: Mapping[str, Any]) -> CalibratedCamera:
         sigma_position=_finite(entry["sigma_position"], 3),
         sigma_rotation=_finite(entry["sigma_rotation"], 3),
         sigma_depth=_finite(entry["sigma_depth"], 2),
+        depth_noticed=tuple(map(float, entry["depth_noticed"])),
         covariance=covariance,
         held=tuple(map(str, entry["held"])),
         unobserved=tuple(map(str, entry["unobserved"])),

@@ -1,7 +1,7 @@
 """From evidence to a calibration: where to start, what to solve for, and whether one solution stands out."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from splatctrl_cli.calibration.evidence import Evidence
 from splatctrl_cli.calibration.unknowns import POSE, Estimate, Unknowns, twist_between
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import NotEvaluableError
+from splatctrl_cli.records import Float64
 
 WIDE = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_REACHES)
 FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
@@ -18,12 +19,15 @@ FREED = tuple(Widths(reach=reach) for reach in fixed.CALIBRATION_FREED)
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """The estimate, how sure it is, and the residuals that it makes least, within `widths`."""
+    """The estimate, how sure it is, and the residuals that it makes least, within `widths`. noticed, by camera: how
+    far a scale would have to be from 1, and a bias [m] from 0, to be taken for one.
+    """
 
     estimate: Estimate
     certainty: Certainty
     adjustment: Adjustment
     widths: Widths
+    noticed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def within_observed(self, start: Estimate) -> "Solution":
         """Solved anew from a start in the directions alone that are known within `CALIBRATION_SIGMA`."""
@@ -35,7 +39,7 @@ class Solution:
         solution = _solution(some, some.solved(near, [narrow(some, near)]))
         within = np.linalg.solve(reach, known @ known.T @ reach)
         covariance = within @ solution.certainty.covariance @ within.T
-        return replace(solution, certainty=replace(solution.certainty, covariance=covariance))
+        return replace(solution, noticed=self.noticed, certainty=replace(solution.certainty, covariance=covariance))
 
     @property
     def held(self) -> tuple[str, ...]:
@@ -161,43 +165,104 @@ def _check_ties(adjustment: Adjustment, estimate: Estimate) -> None:
 
 
 def _with_depths(solution: Solution) -> Solution:
-    """With a scale for the depths of those cameras that show clearly that they need one, and then with a bias."""
-    for kind in ("scales", "biases"):
-        unknowns = solution.adjustment.unknowns
-        tried = _freed(solution, _with(unknowns, kind, unknowns.poses))
-        needed = [camera for camera in unknowns.poses if _needs(tried, camera, kind)]
-        if len(needed) == len(unknowns.poses):
-            solution = tried
-        elif needed:
-            solution = _freed(solution, _with(unknowns, kind, needed))
-    return solution
+    """With scales and biases of depths, where the recording shows clearly that some camera needs one.
+
+    All are tried together, for while one that is wrong is held, others make up for it. Those least sure to differ
+    from 1 or 0 are held again, one by one, until all that are left differ by `CALIBRATION_DEPTH_SURE[0]` sigmas.
+    """
+    unknowns = solution.adjustment.unknowns
+    tried = _freed(solution, replace(unknowns, scales=unknowns.poses, biases=unknowns.cameras))
+    off, covariance, free = _narrowed(tried)
+    solution = replace(solution, noticed=_noticed(tried, free))
+    if not any(_is_sure(tried, at, off[at], covariance[at, at]) for at in free):
+        return solution
+    scales, biases = (
+        [camera for camera in some if tried.adjustment.unknowns.columns(camera)[POSE + number] in free]
+        for number, some in enumerate((unknowns.poses, unknowns.cameras))
+    )
+    found = _freed(solution, replace(unknowns, scales=scales, biases=biases))
+    return solution if any(_is_absurd(*found.estimate.depth_of(one)) for one in unknowns.cameras) else found
 
 
-def _with(unknowns: Unknowns, kind: str, cameras: Sequence[str]) -> Unknowns:
-    return replace(unknowns, scales=cameras) if kind == "scales" else replace(unknowns, biases=cameras)
+def _narrowed(tried: Solution) -> tuple[Float64, Float64, list[int]]:
+    """How far each unknown (P,) of depths is from 1 or 0, the covariance (P, P), and where those stand that are left
+    free once the others are held at that. Of a scale and a bias that explain the same, the likelier is left
+    (`CALIBRATION_DEPTH_USUAL`).
+    """
+    unknowns, covariance = tried.adjustment.unknowns, tried.certainty.covariance
+    off, free, usual = np.zeros(unknowns.size), [], []
+    for camera in unknowns.cameras:
+        (scale, bias), columns = tried.estimate.depth_of(camera), unknowns.columns(camera)[POSE:]
+        for at, value, sigma in zip(columns, (scale - 1, bias), fixed.CALIBRATION_DEPTH_USUAL, strict=True):
+            if at >= 0:
+                off[at] = value
+                free.append(int(at))
+                usual.append(sigma)
+    gain = np.linalg.solve(covariance[np.ix_(free, free)] + np.diag(np.square(usual)), covariance[free]).T
+    off, covariance = off - gain @ off[free], covariance - gain @ covariance[free]
+    while free:
+        ratios = [abs(off[at]) / np.sqrt(covariance[at, at]) for at in free]
+        least = int(np.argmin(ratios))
+        if ratios[least] >= fixed.CALIBRATION_DEPTH_SURE[0]:
+            break
+        off, covariance = _with_held(off, covariance, free.pop(least))
+    return off, covariance, free
+
+
+def _with_held(off: Float64, covariance: Float64, at: int) -> tuple[Float64, Float64]:
+    """What becomes of estimates (P,) and their covariance (P, P) when one of them is held at 0."""
+    gain = covariance[:, at] / max(covariance[at, at], np.finfo(float).tiny)
+    return off - gain * off[at], covariance - np.outer(gain, covariance[at])
+
+
+def _noticed(tried: Solution, free: Sequence[int]) -> dict[str, tuple[float, float]]:
+    """By camera, the scale (how far from 1) and the bias [m] that would have been taken, had it been so large; inf
+    where none is looked for.
+    """
+    unknowns = tried.adjustment.unknowns
+    held = [at for at in range(POSE * len(unknowns.poses), unknowns.size - unknowns.has_clock) if at not in free]
+    found = {}
+    for camera in unknowns.cameras:
+        least = [np.inf, np.inf]
+        for number, at in enumerate(unknowns.columns(camera)[POSE:].tolist()):
+            covariance = tried.certainty.covariance
+            for other in held if at >= 0 else ():
+                if other != at:
+                    covariance = _with_held(np.zeros(unknowns.size), covariance, other)[1]
+            if at >= 0:
+                per_metre = 1.0 if number else max(_far(tried, camera), 1e-3)
+                sure = fixed.CALIBRATION_DEPTH_SURE[1] * float(np.sqrt(max(covariance[at, at], 0.0)))
+                least[number] = max(sure, fixed.CALIBRATION_DEPTH_LEAST / per_metre)
+        found[camera] = (least[0], least[1])
+    return found
+
+
+def _is_sure(tried: Solution, at: int, off: float, variance: float) -> bool:
+    """Whether a scale or a bias, at its place among the unknowns, is surely not 1 or 0, and changes the depths."""
+    unknowns = tried.adjustment.unknowns
+    camera = next(camera for camera in unknowns.cameras if at in unknowns.columns(camera))
+    change = off if at == unknowns.columns(camera)[-1] else off * _far(tried, camera)
+    is_clear = abs(off) > fixed.CALIBRATION_DEPTH_SURE[1] * np.sqrt(variance)
+    return bool(is_clear and abs(change) > fixed.CALIBRATION_DEPTH_LEAST)
+
+
+def _is_absurd(scale: float, bias: float) -> bool:
+    most = fixed.CALIBRATION_DEPTH_MOST
+    return abs(scale - 1) > most[0] or abs(bias) > most[1]
 
 
 def _freed(solution: Solution, unknowns: Unknowns) -> Solution:
-    """Solved anew with scales or biases, from the best of what several scales lead to at a first look."""
+    """Solved anew with scales and biases, from the best of what several scales lead to at a first look."""
     evidence = solution.adjustment.evidence
     adjustment, few = Adjustment(evidence, unknowns), Adjustment(evidence.thinned(), unknowns)
     estimates = []
-    for scale in fixed.CALIBRATION_SCALES if not unknowns.biases else (1.0,):
+    for scale in fixed.CALIBRATION_SCALES if unknowns.scales else (1.0,):
         depth = {camera: (scale * solution.estimate.depth_of(camera)[0], 0.0) for camera in unknowns.scales}
         begin = replace(solution.estimate, depth=depth)
         estimates.append(few.solved(begin, FREED, rounds=fixed.CALIBRATION_ROUGH))
     near = estimates[int(np.argmin(_costs(few, estimates)))]
-    return _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
-
-
-def _needs(tried: Solution, camera: str, kind: str) -> bool:
-    """Whether a scale or a bias is surely not 1 or 0, changes the depths, and is not absurd."""
-    (scale, bias), sigmas = tried.estimate.depth_of(camera), tried.certainty.sigma_depth(camera)
-    if abs(scale - 1) > fixed.CALIBRATION_DEPTH_MOST[0] or abs(bias) > fixed.CALIBRATION_DEPTH_MOST[1]:
-        return False
-    off, sigma = (scale - 1, sigmas[0]) if kind == "scales" else (bias, sigmas[1])
-    change = off * _far(tried, camera) if kind == "scales" else off
-    return abs(off) > fixed.CALIBRATION_DEPTH_SURE * sigma and abs(change) > fixed.CALIBRATION_DEPTH_LEAST
+    freed = _solution(adjustment, adjustment.solved(near, [narrow(adjustment, near)]))
+    return replace(freed, noticed=solution.noticed)
 
 
 def _far(solution: Solution, camera: str) -> float:

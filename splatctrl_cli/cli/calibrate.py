@@ -1,6 +1,7 @@
 """``splatctrl calibrate``: where cameras stand against each other and the robot, and how sure that is."""
 
 import argparse
+import math
 from collections.abc import Iterator
 
 from splatctrl_cli.cli.common import Console, table
@@ -49,6 +50,8 @@ def _lines(result: CalibrateResult) -> Iterator[str]:
 def _row(change: CameraChange) -> list[object]:
     remark = "held" if change.is_held else "; ".join(f"not observed: {text}" for text in change.unobserved)
     depth = "as recorded"
+    if math.isfinite(change.bias_noticed):
+        depth += f" ({1e3 * change.bias_noticed:.0f} mm off would show)"
     if (change.scale, change.bias) != (1.0, 0.0):
         depth = f"x {change.scale:.4f}" + (f" {1e3 * change.bias:+.1f} mm" if change.bias else "")
     return [

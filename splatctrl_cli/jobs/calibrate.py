@@ -53,7 +53,9 @@ class CalibrateRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraChange:
-    """What became of a camera: how far it was moved [m] and turned [deg], and the largest sigma of each."""
+    """What became of a camera: how far it was moved [m] and turned [deg], and the largest sigma of each; scale and
+    bias [m] of its depths, and the bias that would have been noticed.
+    """
 
     camera: str
     distance: float
@@ -62,6 +64,7 @@ class CameraChange:
     sigma_rotation: float
     scale: float
     bias: float
+    bias_noticed: float
     is_held: bool
     unobserved: tuple[str, ...]
 
@@ -97,12 +100,17 @@ class CalibrateResult:
                     "sigma_deg": round(change.sigma_rotation, 4),
                     "depth_scale": change.scale,
                     "depth_bias_mm": round(1e3 * change.bias, 3),
+                    "depth_bias_noticed_mm": _finite_mm(change.bias_noticed),
                     "held": change.is_held,
                     "unobserved": list(change.unobserved),
                 }
                 for change in self.changes
             },
         }
+
+
+def _finite_mm(metres: float) -> float | None:
+    return round(1e3 * metres, 3) if np.isfinite(metres) else None
 
 
 def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> CalibrateResult:
@@ -280,6 +288,7 @@ def _calibration(source: FrameSource, solution: Solution, unknown: Mapping[str, 
             sigma_position=tuple(map(float, sigma[:3])),
             sigma_rotation=tuple(map(float, sigma[3:])),
             sigma_depth=certainty.sigma_depth(camera),
+            depth_noticed=tuple(map(float, solution.noticed.get(camera, (np.inf, np.inf)))),
             covariance=covariance,
             held=tuple(name for name, of_cameras in found.items() if camera not in of_cameras),
             unobserved=unknown.get(camera, ()),
@@ -306,6 +315,7 @@ def _change(calibration: Calibration, solution: Solution, camera: str) -> Camera
         sigma_rotation=float(np.degrees(max(entry.sigma_rotation))),
         scale=entry.scale,
         bias=entry.bias,
+        bias_noticed=entry.depth_noticed[1],
         is_held=camera in solution.held,
         unobserved=entry.unobserved,
     )

@@ -26,6 +26,7 @@ RIG = Calibration(
             T=look_at([1.0, 0.2, 0.9], [0.3, 0.0, 0.1]),
             recorded=look_at([1.02, 0.2, 0.9], [0.3, 0.0, 0.1]),
             scale=1.02,
+            depth_noticed=(0.004, 0.003),
             bias=-0.003,
             covariance=np.diag(np.arange(6) * 1e-7),
             unobserved=("translation along the table's normal",),

@@ -120,6 +120,52 @@ def test_what_is_calibrated_is_the_recording_as_it_is(log: Path, result: Calibra
         calibrate(CalibrateRequest(paths=(log,), options=SourceOptions(calibration=result.out)))
 
 
+class Biased(SetUp):
+    """Three cameras, one of which measures 10 mm short at every depth."""
+
+    def __init__(self, seed: int, biased: str) -> None:
+        super().__init__(seed, SMALL)
+        self.biased, self.scale = biased, 1.0
+        self.off["cam0"] = np.eye(4)
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        for frame in super().frames():
+            short = np.where(frame.depth > 0, frame.depth - np.float32(0.01), 0).astype(np.float32)
+            yield replace(frame, depth=short) if frame.camera == self.biased else frame
+
+
+@pytest.mark.parametrize(
+    ("biased", "seed", "has_robot"), [("cam1", 2, False), ("cam0", 2, False), ("cam0", 3, False), ("cam1", 2, True)]
+)
+def test_a_depth_bias_is_found_within_its_sigma_and_in_the_camera_that_has_it(
+    biased: str, seed: int, has_robot: bool, tmp_path: Path, sample_data: Path
+) -> None:
+    """A scale of the same camera, or the bias of a camera that is taken as recorded, fits nearly as well."""
+    setup = Biased(seed, biased)
+    write_log(setup, tmp_path / "log.mcap")
+    robot = sample_data / "tabletop"
+    files = {"urdf": robot / "robot.urdf", "spheres": robot / "robot_spheres.yaml"} if has_robot else {}
+    request: Any = {"paths": (tmp_path / "log.mcap",), "out": tmp_path / "rig.toml", **files}
+    found = calibrate(CalibrateRequest(**request))
+    for name, camera in found.calibration.cameras.items():
+        if name == biased:
+            assert abs(camera.bias - 0.01) < 2 * camera.sigma_depth[1] < 0.005
+        else:
+            assert camera.bias == 0.0 and "depth bias" in camera.held
+            assert camera.depth_noticed[1] < 0.01
+        assert camera.scale == 1.0
+    rows = [row for row in errors("", setup, found) if row.unknown in ("position", "rotation")]
+    assert max(abs(row.error) / row.sigma for row in rows) < 3
+
+
+def test_the_bias_that_would_not_be_noticed_is_said(setup: SetUp, result: CalibrateResult) -> None:
+    for name, camera in result.calibration.cameras.items():
+        assert camera.bias == 0.0
+        assert 0.002 <= camera.depth_noticed[1] < 0.01
+        assert (camera.scale != 1.0) == (name == "cam0")
+        assert camera.depth_noticed[0] < abs(setup.scale - 1)
+
+
 @pytest.fixture(scope="module")
 def wrist() -> SetUp:
     """A camera on the hand, recorded 2 cm and 2 degrees off its mount, with a clock 50 ms off."""
