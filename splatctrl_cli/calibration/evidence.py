@@ -69,7 +69,7 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
     by_camera: dict[str, list[RgbdFrame]] = {}
     for frame in frames:
         by_camera.setdefault(frame.camera, []).append(strided(frame, fixed.CALIBRATION_ROWS))
-    moving = frozenset(camera for camera, its in by_camera.items() if not _stands_still(its))
+    moving = moving_cameras(frames)
     mounts = {camera: _mount(arm, by_camera[camera]) for camera in moving} if arm is not None else {}
     views: list[DepthView] = []
     for camera, its in sorted(by_camera.items()):
@@ -93,9 +93,15 @@ def evidence_of(frames: Sequence[RgbdFrame], arm: Arm | None) -> Evidence:
     )
 
 
-def _stands_still(frames: Sequence[RgbdFrame]) -> bool:
-    poses = np.array([frame.T_world_camera for frame in frames])
-    return bool(np.abs(poses - poses[0]).max() < fixed.CALIBRATION_MOUNT)
+def moving_cameras(frames: Sequence[RgbdFrame]) -> frozenset[str]:
+    """Those whose recorded poses differ."""
+    first: dict[str, Float64] = {}
+    moving = set()
+    for frame in frames:
+        T = first.setdefault(frame.camera, frame.T_world_camera)
+        if np.abs(frame.T_world_camera - T).max() >= fixed.CALIBRATION_MOUNT:
+            moving.add(frame.camera)
+    return frozenset(moving)
 
 
 def _mount(arm: Arm | None, frames: Sequence[RgbdFrame]) -> tuple[str, Float64] | None:

@@ -4,6 +4,7 @@ import argparse
 import math
 from collections.abc import Iterator
 
+from splatctrl_cli.calibration.board import board_of
 from splatctrl_cli.cli.common import Console, table
 from splatctrl_cli.cli.options import locked_joints, request_of, source_options
 from splatctrl_cli.config import fixed
@@ -19,6 +20,7 @@ def run(args: argparse.Namespace) -> int:
         paths=tuple(args.source),
         options=source_options(args),
         locked=locked_joints(args),
+        board=None if args.board is None else board_of(args.board),
     )
     result = calibrate(request, console)
     console.result({"out": str(result.out), **result.metrics}, _lines(result))

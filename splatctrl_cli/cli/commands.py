@@ -166,6 +166,10 @@ def _calibrate(add: Options, parser: Parser) -> None:
         "--hold CAMERA",
         "what stays as recorded (default: the robot's base, without --urdf the first camera)",
     )
+    add(
+        "--board COLUMNSxROWS:M",
+        "begin where a board of so many inner corners (chessboard or ChArUco), squares of M metres, has the cameras",
+    )
     add("--allow-unobserved", "write what the recording says, although not all can be told from it")
     more = add.group("robot")
     more("--spheres FILE", "its spheres (default: those of the URDF), for links without geometry", Path)

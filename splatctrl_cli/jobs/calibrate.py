@@ -1,27 +1,31 @@
 """A calibration from its request to its result: cameras against each other and the robot, from what they recorded."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from splatctrl_cli.calibration.arm import Arm
+from splatctrl_cli.calibration.board import Board, Sighting, other_size, sighting_of
+from splatctrl_cli.calibration.board_start import Rig, board_start
 from splatctrl_cli.calibration.calibration_file import CalibratedCamera, Calibration, calibration_text
 from splatctrl_cli.calibration.certainty import plane_of, unobserved
-from splatctrl_cli.calibration.evidence import Evidence, evidence_of
+from splatctrl_cli.calibration.evidence import Evidence, evidence_of, moving_cameras
 from splatctrl_cli.calibration.solution import Solution, solved
 from splatctrl_cli.calibration.unknowns import Estimate, twist_of
 from splatctrl_cli.checks.limits import VIEWS_RANGE
 from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError, UsageError
 from splatctrl_cli.files.output import output_path
+from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.jobs.check import posed_robot
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame
-from splatctrl_cli.records import RgbdFrame, spread
+from splatctrl_cli.records import Float64, RgbdFrame, spread
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.sources.source import open_session
 
@@ -34,7 +38,8 @@ class CalibrateRequest:
 
     out: the TOML file (None: calibration.toml here). urdf: a robot whose joint states are recorded, from whose
     surface the cameras are placed; its spheres, base, locked joints and packages as `replay` takes them. hold: the
-    camera that stays where it is recorded where there is no robot (None: the first). allow_unobserved: write what
+    camera that stays where it is recorded where there is no robot (None: the first). board: what places the cameras
+    to begin with, where the recorded poses are far off. allow_unobserved: write what
     could be found where not all could.
     """
 
@@ -47,6 +52,7 @@ class CalibrateRequest:
     base: tuple[float, ...] | None = None
     locked: Mapping[str, float] = field(default_factory=dict)
     hold: str | None = None
+    board: Board | None = None
     allow_unobserved: bool = False
     force: bool = False
 
@@ -133,11 +139,18 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
     source = open_session(request.paths, request.options)
     arm = None if model is None else _arm(model, source)
     with output_path(out, force=request.force, is_folder=False) as partial:
-        frames = _frames(source, progress)
+        frames, sightings = _frames(source, request.board, progress)
         if arm is not None:
             _check_travel(arm, frames)
+        cameras, moving = sorted({frame.camera for frame in frames}), moving_cameras(frames)
+        held = _held(request, cameras, has_anchor=arm is not None or bool(moving))
+        begin = {camera: np.eye(4) for camera in cameras}
+        if request.board is not None:
+            by_stamp = {c: {f.stamp_ns: f.T_world_camera for f in frames if f.camera == c} for c in cameras}
+            rig = Rig(recorded=by_stamp, moving=moving, arm=arm, held=held)
+            begin = board_start(request.board, sightings, rig)
+        frames = [replace(frame, T_world_camera=frame.T_world_camera @ begin[frame.camera]) for frame in frames]
         evidence = evidence_of(frames, arm)
-        held = _held(request, evidence)
         progress.log(f"calibrate: {len(frames)} frames of {', '.join(evidence.cameras)}")
         start = Estimate(corrections={camera: np.eye(4) for camera in evidence.cameras})
         solution = solved(evidence, start, held)
@@ -146,13 +159,14 @@ def calibrate(request: CalibrateRequest, progress: Progress = SILENT) -> Calibra
             if not request.allow_unobserved:
                 raise _refusal(unknown, evidence)
             solution = solution.within_observed(start)
-        calibration = _calibration(source, solution, unknown)
+        calibration = _calibration(source, solution, begin, unknown)
         partial.write_text(calibration_text(calibration), encoding="utf-8")
-    before, after = (solution.adjustment.distance(estimate) for estimate in (start, solution.estimate))
+    recorded = Estimate(corrections={camera: invert_transform(T) for camera, T in begin.items()})
+    before, after = (solution.adjustment.distance(estimate) for estimate in (recorded, solution.estimate))
     return CalibrateResult(
         out=out,
         calibration=calibration,
-        changes=tuple(_change(calibration, solution, camera) for camera in evidence.cameras),
+        changes=tuple(_change(calibration, solution, begin, camera) for camera in evidence.cameras),
         before=before,
         after=after,
         num_frames=len(frames),
@@ -173,8 +187,10 @@ def _arm(model: RobotModel, source: FrameSource) -> Arm:
     return Arm(model, source.states.of_joints(model.joint_order(source.joint_names)))
 
 
-def _frames(source: FrameSource, progress: Progress) -> list[RgbdFrame]:
-    """Up to `CALIBRATION_FRAMES` of each camera by stamp, taken at the same moments, without colour."""
+def _frames(source: FrameSource, board: Board | None, progress: Progress) -> tuple[list[RgbdFrame], list[Sighting]]:
+    """Up to `CALIBRATION_FRAMES` of each camera by stamp, taken at the same moments, without colour, and the board
+    where they show it. Raises NotEvaluableError where none does.
+    """
     stamps: dict[str, list[int]] = {}
     for stamp, camera, _ in source.poses():
         stamps.setdefault(camera, []).append(stamp)
@@ -186,13 +202,36 @@ def _frames(source: FrameSource, progress: Progress) -> list[RgbdFrame]:
         for camera, its in stamps.items()
         for moment in moments
     }
-    frames = []
+    frames: list[RgbdFrame] = []
+    sightings: list[Sighting | None] = []
+    others: Counter[tuple[int, int]] = Counter()
     for item in source.stored():
         if isinstance(item, StoredFrame) and (item.camera, item.stamp_ns) in chosen:
             frames.append(_without_color(item))
+            if board is not None:
+                sightings.append(sighting_of(board, item.frame))
+                other = None if any(sightings) or sum(others.values()) > 3 else other_size(item.frame)
+                others.update([] if other is None else [other])
             if len(frames) % 30 == 0:
                 progress.log(f"calibrate: {len(frames)} of {len(chosen)} frames read")
-    return frames
+    if board is not None and not any(sightings):
+        raise _no_board(board, len(frames), others)
+    return frames, [sighting for sighting in sightings if sighting is not None]
+
+
+def _no_board(board: Board, num_frames: int, others: Counter[tuple[int, int]]) -> NotEvaluableError:
+    text = f"calibrate: no board of {board} inner corners in {num_frames} frames"
+    (columns, rows), times = others.most_common(1)[0] if others else ((board.columns, board.rows), 0)
+    if times > 1 and {columns, rows} != {board.columns, board.rows}:
+        return NotEvaluableError(
+            f"{text}, but one of {columns}x{rows}", remedy=f"give --board {columns}x{rows}:{board.square:g}"
+        )
+    if not board.is_one_way_up:
+        return NotEvaluableError(
+            f"{text} with markers; without them, one of that size looks the same after half a turn",
+            remedy="use a ChArUco board, or a chessboard of an odd and an even number of inner corners, as 9x6",
+        )
+    return NotEvaluableError(text, remedy="show its printed side, whole and lit, to every camera, or give its size")
 
 
 def _without_color(stored: StoredFrame) -> RgbdFrame:
@@ -223,22 +262,20 @@ def _check_travel(arm: Arm, frames: Sequence[RgbdFrame]) -> None:
         )
 
 
-def _held(request: CalibrateRequest, evidence: Evidence) -> tuple[str, ...]:
-    """The cameras that stay: with a robot none, else one, where none moves with it."""
-    if request.hold is not None and request.hold not in evidence.cameras:
-        raise UsageError(
-            f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(evidence.cameras)}"
-        )
+def _held(request: CalibrateRequest, cameras: Sequence[str], *, has_anchor: bool) -> tuple[str, ...]:
+    """The cameras that stay: none where there is a robot or one that moves, else one."""
+    if request.hold is not None and request.hold not in cameras:
+        raise UsageError(f"--hold {request.hold}: no such camera", remedy=f"use one of: {', '.join(cameras)}")
     if request.hold is not None:
         return (request.hold,)
-    if evidence.arm is not None or evidence.moving:
+    if has_anchor:
         return ()
-    if len(evidence.cameras) < 2:
+    if len(cameras) < 2:
         raise NotEvaluableError(
-            f"calibrate: one camera that stands still, {evidence.cameras[0]}, and no robot to place it against",
+            f"calibrate: one camera that stands still, {cameras[0]}, and no robot to place it against",
             remedy="give --urdf of a robot that it sees, or a recording of several cameras",
         )
-    return evidence.cameras[:1]
+    return (cameras[0],)
 
 
 def _unobserved(solution: Solution) -> dict[str, tuple[str, ...]]:
@@ -265,13 +302,19 @@ def _refusal(unknown: Mapping[str, tuple[str, ...]], evidence: Evidence) -> NotE
     )
 
 
-def _calibration(source: FrameSource, solution: Solution, unknown: Mapping[str, tuple[str, ...]]) -> Calibration:
+def _calibration(
+    source: FrameSource,
+    solution: Solution,
+    begin: Mapping[str, Float64],
+    unknown: Mapping[str, tuple[str, ...]],
+) -> Calibration:
+    """begin: T_recorded_camera (4, 4) by camera, that the solution was begun at."""
     evidence, estimate, certainty = solution.adjustment.evidence, solution.estimate, solution.certainty
     cameras = {}
     for camera in evidence.cameras:
-        recorded = next(view.T_world_camera for view in evidence.views if view.camera == camera)
+        begun = next(view.T_world_camera for view in evidence.views if view.camera == camera)
         moves = camera in evidence.moving
-        T = estimate.corrections[camera] if moves else recorded @ estimate.corrections[camera]
+        T = (begin[camera] if moves else begun) @ estimate.corrections[camera]
         R = np.eye(3) if moves else T[:3, :3]
         to_axes = np.zeros((6, 6))
         to_axes[:3, 3:], to_axes[3:, :3] = R, R
@@ -282,7 +325,7 @@ def _calibration(source: FrameSource, solution: Solution, unknown: Mapping[str, 
         found = {"pose": unknowns.poses, "depth scale": unknowns.scales, "depth bias": unknowns.biases}
         cameras[camera] = CalibratedCamera(
             T=T,
-            recorded=None if moves else recorded,
+            recorded=None if moves else begun @ invert_transform(begin[camera]),
             scale=float(scale),
             bias=float(bias),
             sigma_position=tuple(map(float, sigma[:3])),
@@ -304,8 +347,8 @@ def _calibration(source: FrameSource, solution: Solution, unknown: Mapping[str, 
     )
 
 
-def _change(calibration: Calibration, solution: Solution, camera: str) -> CameraChange:
-    twist = twist_of(solution.estimate.corrections[camera])
+def _change(calibration: Calibration, solution: Solution, begin: Mapping[str, Float64], camera: str) -> CameraChange:
+    twist = twist_of(begin[camera] @ solution.estimate.corrections[camera])
     entry = calibration.cameras[camera]
     return CameraChange(
         camera=camera,

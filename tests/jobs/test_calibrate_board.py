@@ -1,0 +1,275 @@
+"""`calibrate --board`: cameras that are recorded far off, or nowhere, begin where a board has them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.calibration import T_HAND_WRIST, WRIST, SetUp, errors, write_log
+from splatctrl_cli.calibration.board import Board, board_of, sighting_of
+from splatctrl_cli.calibration.board_start import hand_eye
+from splatctrl_cli.calibration.unknowns import transform_of, twist_between
+from splatctrl_cli.errors import NotEvaluableError, UsageError
+from splatctrl_cli.geometry import invert_transform, look_at
+from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, calibrate
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.records import Float64, RgbdFrame
+from splatctrl_cli.simulate.arm import HAND
+from splatctrl_cli.simulate.motion import Motion
+from splatctrl_cli.simulate.recording import RecordingOptions, Scene
+from tests.calibration.boards import printed, with_board
+
+OPTIONS = RecordingOptions(duration_s=3.0, fps=4.0, width=320, height=240, color_rays=0)
+BOARD = Board(columns=7, rows=4, square=0.03)
+EYES = [np.array([0.38 + 0.85 * np.cos(a), 0.85 * np.sin(a), 0.75]) for a in (-0.7, 0.0, 0.7)]
+FAR = transform_of(np.concatenate([np.radians(60) * np.array([2, -1, 2]) / 3, 0.5 * np.array([1, 2, -2]) / 3]))
+
+
+def facing(center: Float64, twist: Float64) -> Float64:
+    """T_world_board of a board about a place, turned and moved a little from where it faces the cameras."""
+    T = look_at(list(np.mean(EYES, axis=0)), list(center))
+    T[:3, 3] = center
+    T = T @ transform_of(twist)
+    T[:3, 3] -= T[:3, :3] @ BOARD.points.mean(axis=0)
+    return T
+
+
+class Shown(SetUp):
+    """Three cameras on one side of a table, before which somebody holds a board for the first half."""
+
+    is_shown_to: tuple[str, ...] = ("cam0", "cam1", "cam2", WRIST)
+    image = printed(BOARD)
+
+    def __init__(self, *, has_wrist: bool = False, options: RecordingOptions = OPTIONS) -> None:
+        super().__init__(2, options, has_wrist=has_wrist)
+        self.cameras = tuple(
+            replace(camera, T_world_camera=look_at(list(eye), [0.4, 0.0, 0.25]))
+            for camera, eye in zip(self.cameras, EYES, strict=False)
+        )
+        self.off = dict.fromkeys(self.names, FAR)
+
+    def board(self, seconds: float) -> Float64 | None:
+        """T_world_board."""
+        if seconds > 0.45 * self.options.duration_s:
+            return None
+        turn, move = np.random.default_rng(round(seconds * 1e3)).uniform(-1, 1, (2, 3)) * [
+            [0.2, 0.2, 0.4],
+            [0.04] * 3,
+        ]
+        return facing(np.array([0.6, 0.0, 0.3]), np.concatenate([turn, move]))
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        for frame in super().frames():
+            T = self.board((frame.stamp_ns - self.start_ns) * 1e-9)
+            if T is None or frame.camera not in self.is_shown_to:
+                yield frame
+            else:
+                yield with_board(frame, BOARD, T, self.image)
+
+
+class Turning(Shown):
+    """The same, with an arm that turns its hand about a place."""
+
+    amount = 1.0
+
+    def _scene(self, seed: int, options: RecordingOptions) -> Scene:
+        turns = np.array([[0, 0, 0], [0.35, 0.3, 0.4], [-0.35, 0.25, -0.5], [0.3, -0.3, -0.3], [-0.3, -0.25, 0.5]])
+        waypoints = np.tile([-0.1, -0.4, 0.0, -1.9, 0.0, 1.5, 0.69], (5, 1))
+        waypoints[:, 4:] += self.amount * turns
+        waypoints[:, 0] += 0.3 * turns[:, 0]
+        times = np.linspace(0.06, 0.94, 5) * options.duration_s
+        return replace(super()._scene(seed, options), motion=Motion(times=times, waypoints=waypoints))
+
+    def hand(self, seconds: float) -> Float64:
+        return self.link_poses(self._motion.at(seconds)[0])[HAND]
+
+
+class Gripped(Turning):
+    """The same, with the board in the gripper."""
+
+    def board(self, seconds: float) -> Float64 | None:
+        middle = self.hand(0.0)
+        return self.hand(seconds) @ invert_transform(middle) @ facing(middle[:3, 3] + [0.1, 0.0, -0.2], np.zeros(6))
+
+
+class Lying(Turning):
+    """A board that stands still, before a camera on the wrist and one beside the table."""
+
+    amount = 0.6
+
+    def __init__(self) -> None:
+        super().__init__(has_wrist=True)
+
+    def board(self, seconds: float) -> Float64 | None:
+        eye = self.hand(0.0) @ T_HAND_WRIST
+        center = eye[:3, 3] + 0.5 * eye[:3, 2]
+        T = look_at(list(0.5 * (eye[:3, 3] + EYES[0])), list(center))
+        T[:3, 3] = center - T[:3, :3] @ BOARD.points.mean(axis=0)
+        return T
+
+
+def calibrated(setup: SetUp, folder: Path, **request: Any) -> CalibrateResult:
+    write_log(setup, folder / "log.mcap")
+    return calibrate(CalibrateRequest(**{"paths": (folder / "log.mcap",), "out": folder / "rig.toml", **request}))
+
+
+def robot_in(sample_data: Path) -> dict[str, Path]:
+    folder = sample_data / "tabletop"
+    return {"urdf": folder / "robot.urdf", "spheres": folder / "robot_spheres.yaml"}
+
+
+def check_errors(setup: SetUp, result: CalibrateResult) -> None:
+    rows = [row for row in errors("", setup, result) if row.unknown in ("position", "rotation")]
+    assert rows
+    assert max(abs(row.error) for row in rows if row.unknown == "position") < 0.002
+    assert max(abs(row.error) for row in rows if row.unknown == "rotation") < np.radians(0.2)
+    moved = [change for change in result.changes if not change.is_held]
+    assert all(change.distance > 0.4 and change.angle == pytest.approx(60, abs=0.5) for change in moved)
+
+
+def test_cameras_half_a_metre_off_are_found_by_a_board_that_somebody_holds(tmp_path: Path) -> None:
+    setup = Shown()
+    setup.off["cam0"] = np.eye(4)
+    result = calibrated(setup, tmp_path, board=BOARD)
+    check_errors(setup, result)
+    recorded = result.calibration.cameras["cam1"].recorded
+    assert recorded is not None  # what --calibration knows the camera by, not where the board had it
+    np.testing.assert_allclose(recorded, setup.cameras[1].T_world_camera @ FAR, atol=1e-6)
+
+
+def test_cameras_without_a_recorded_pose_are_placed_against_the_one_that_is_held(tmp_path: Path) -> None:
+    nowhere = {
+        f"cam{number}": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0) for number in range(3)
+    }  # --camera-pose NAME=identity
+    setup = Shown()
+    result = calibrated(setup, tmp_path, board=BOARD, options=SourceOptions(camera_poses=nowhere))
+    T_world_first = setup.cameras[0].T_world_camera
+    for camera in setup.cameras[1:]:
+        truth = invert_transform(T_world_first) @ camera.T_world_camera
+        off = twist_between(truth, result.calibration.cameras[camera.name].T)
+        assert np.linalg.norm(off[3:]) < 0.002 and np.linalg.norm(off[:3]) < np.radians(0.2)
+
+
+def test_cameras_half_a_metre_off_the_robot_are_found_by_a_board_in_its_gripper(
+    tmp_path: Path, sample_data: Path
+) -> None:
+    setup = Gripped()
+    check_errors(setup, calibrated(setup, tmp_path, board=BOARD, **robot_in(sample_data)))
+
+
+def test_a_wrist_camera_half_a_metre_off_its_mount_is_found_by_a_board_that_stands_still(
+    tmp_path: Path, sample_data: Path
+) -> None:
+    setup = Lying()
+    check_errors(setup, calibrated(setup, tmp_path, board=BOARD, **robot_in(sample_data)))
+
+
+class ShownApart(Shown):
+    """The board is shown to one camera after the other."""
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        for frame in super().frames():
+            turn = round((frame.stamp_ns - self.start_ns) * 1e-9 * self.options.fps) % 3
+            is_its = frame.camera == f"cam{turn}"
+            yield frame if is_its else replace(frame, color=np.full((240, 320, 3), 90, np.uint8))
+
+    def board(self, seconds: float) -> Float64 | None:
+        return super().board(0.4 * seconds)
+
+
+class Mirrored(Shown):
+    """Two cameras on the printed side, one behind the board."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        behind = replace(self.cameras[2], T_world_camera=look_at([-0.3, 0.2, 0.8], [0.4, 0.0, 0.25]))
+        self.cameras = (*self.cameras[:2], behind)
+
+
+def showing(board: Board) -> Shown:
+    setup = Shown()
+    setup.image = printed(board)
+    return setup
+
+
+@pytest.mark.parametrize(
+    ("setup", "board", "says", "remedy"),
+    [
+        (ShownApart, "7x4:0.03", "does not tie together: cam0 | cam1, cam2", "at the same moment"),
+        (Mirrored, "7x4:0.03", "too few views of the board of 7x4 inner corners: cam2 in 0", "its printed side"),
+        (Shown, "8x5:0.03", "no board of 8x5 inner corners in 36 frames, but one of 7x4", "--board 7x4:0.03"),
+        (
+            lambda: showing(Board(columns=6, rows=4, square=0.03)),
+            "6x4:0.03",
+            "looks the same after half a turn",
+            "use a ChArUco board",
+        ),
+        (Shown, "7x4:0.02", "measure about 30 mm by the cameras' depth, expected 20", "--board 7x4:0.030"),
+        (lambda: SetUp(2, replace(OPTIONS, fps=1.0)), "7x4:0.03", "no board of 7x4 inner corners", "whole and lit"),
+    ],
+)
+def test_a_board_that_does_not_place_the_cameras_is_refused(
+    setup: Any, board: str, says: str, remedy: str, tmp_path: Path
+) -> None:
+    with pytest.raises(NotEvaluableError) as refusal:
+        calibrated(setup(), tmp_path, board=board_of(board))
+    assert says in refusal.value.message
+    assert remedy in (refusal.value.remedy or "")
+    assert not list(tmp_path.glob("rig.toml*"))
+
+
+def test_a_board_seen_by_one_camera_only_is_refused(tmp_path: Path) -> None:
+    setup = Shown()
+    setup.is_shown_to = ("cam1",)
+    with pytest.raises(NotEvaluableError, match=r"cam0 in 0, cam2 in 0 frames .*; only cam1 sees it"):
+        calibrated(setup, tmp_path, board=BOARD)
+
+
+def test_a_board_that_no_robot_holds_does_not_tie_the_cameras_to_it(tmp_path: Path, sample_data: Path) -> None:
+    """Somebody moves it beside the robot: no link moves as it does."""
+    with pytest.raises(NotEvaluableError, match=r"tied to no robot: .*does not move with the robot") as refusal:
+        calibrated(Turning(options=replace(OPTIONS, duration_s=6.0)), tmp_path, board=BOARD, **robot_in(sample_data))
+    assert "let the gripper hold the board" in (refusal.value.remedy or "")
+
+
+def test_the_hand_eye_equation_is_solved_and_poses_that_turn_about_one_axis_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    X, stays = transform_of(rng.normal(size=6)), transform_of(rng.normal(size=6))
+    ends = [transform_of(0.5 * rng.normal(size=6)) for _ in range(8)]
+    pairs = [(A, invert_transform(A @ X) @ stays) for A in ends]
+    pairs[3] = (pairs[3][0], pairs[3][1] @ transform_of(np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])))  # misread
+    found = hand_eye(pairs)
+    np.testing.assert_allclose(found.X, X, atol=1e-9)
+    np.testing.assert_allclose(found.stays, stays, atol=1e-9)
+    turns = [transform_of(np.array([0.0, 0.0, angle, *rng.normal(size=3)])) for angle in np.linspace(0, 2, 8)]
+    with pytest.raises(NotEvaluableError, match="hardly turns the board"):
+        hand_eye([(A, invert_transform(A @ X) @ stays) for A in turns])
+    with pytest.raises(NotEvaluableError, match="too few views of the board by one camera: 4"):
+        hand_eye([pair for i, pair in enumerate(pairs) if i not in (0, 1, 2, 3)])
+
+
+@pytest.mark.parametrize("has_markers", [False, True])
+@pytest.mark.parametrize("turn", [0.0, 0.5, 1.0])
+def test_a_board_is_seen_where_it_is_whichever_way_it_is_turned(has_markers: bool, turn: float) -> None:
+    board = Board(columns=7, rows=4, square=0.05) if not has_markers else Board(columns=6, rows=4, square=0.05)
+    frame = next(iter(Shown().frames()))
+    flat = replace(frame, depth=np.full_like(frame.depth, 5.0))
+    T = facing(np.array([0.5, 0.0, 0.3]), np.zeros(6))
+    half = transform_of(np.array([0.0, 0.0, turn * np.pi, 0.0, 0.0, 0.0]))
+    T = T @ transform_of(np.concatenate([np.zeros(3), BOARD.points.mean(axis=0)])) @ half
+    T[:3, 3] -= T[:3, :3] @ board.points.mean(axis=0)
+    seen = sighting_of(board, with_board(flat, board, T, printed(board, has_markers=has_markers)))
+    assert seen is not None
+    off = twist_between(invert_transform(frame.T_world_camera) @ T, seen.T_camera_board)
+    assert np.linalg.norm(off[3:]) < 0.01 and np.linalg.norm(off[:3]) < np.radians(3)
+    assert seen.depth_ratio == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("text", ["9x6", "9x6:", "2x6:0.025", "9x6:25", "9*6:0.025", "9x6:-1"])
+def test_what_is_no_board_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="expected inner corners") as refusal:
+        board_of(text)
+    assert "9x6:0.025" in (refusal.value.remedy or "")
