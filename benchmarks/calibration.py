@@ -16,9 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.open3d_multiway import multiway
 from benchmarks.random_tabletop import random_things
 from benchmarks.scenes import SAMPLE, sample_robot
 from splatctrl_cli.calibration.unknowns import transform_of, twist_between
+from splatctrl_cli.calibration.views import still_frame
 from splatctrl_cli.cli.common import table
 from splatctrl_cli.errors import NotEvaluableError
 from splatctrl_cli.geometry import invert_transform, look_at
@@ -39,6 +41,7 @@ from splatctrl_cli.simulate.recording import (
     Transform,
 )
 from splatctrl_cli.simulate.render import Renderer
+from splatctrl_cli.sources.source import open_source
 
 OPTIONS = RecordingOptions(duration_s=6.0, fps=5.0, color_rays=0)
 OFF = (np.radians(1.5), 0.02)  # [rad], [m]: standard deviations of recorded poses, about and along each axis
@@ -51,7 +54,8 @@ WRIST = "wrist"
 T_HAND_WRIST = np.array([[0, -1, 0, 0.08], [1, 0, 0, 0], [0, 0, 1, 0.02], [0, 0, 0, 1.0]]) @ transform_of(
     np.array([0.0, -0.25, 0.0, 0.0, 0.0, 0.0])
 )
-KINDS = ("robot", "cameras alone", "wrist")
+ALONE, OPEN3D = "cameras alone", "cameras alone, Open3D"
+KINDS = ("robot", ALONE, "wrist", OPEN3D)
 UNITS = {"position": ("mm", 1e3), "rotation": ("deg", 180 / np.pi), "clock": ("ms", 1e3), "depth scale": ("%", 1e2)}
 
 
@@ -184,17 +188,36 @@ def errors(kind: str, setup: SetUp, result: CalibrateResult) -> Iterator[Error]:
         yield Error(**named, camera="", unknown="clock", axis=0, error=error, sigma=sigma)
 
 
+def errors_of_open3d(setup: SetUp, log: Path) -> Iterator[Error]:
+    """Of Open3D's multiway registration of what each camera sees in most frames; it states no sigma."""
+    frames = [record for record in open_source(log).records() if isinstance(record, RgbdFrame)]
+    still = [still_frame([frame for frame in frames if frame.camera == name]) for name in setup.names]
+    for camera, T in list(zip(setup.cameras, multiway(still), strict=True))[1:]:
+        twist = twist_between(camera.T_world_camera, T)
+        for unknown, values in (("position", twist[3:]), ("rotation", twist[:3])):
+            for axis, error in enumerate(values.tolist()):
+                yield Error(
+                    kind=OPEN3D,
+                    seed=setup.options.seed,
+                    camera=camera.name,
+                    unknown=unknown,
+                    axis=axis,
+                    error=error,
+                    sigma=np.nan,
+                )
+
+
 def trial(kind: str, seed: int, folder: Path) -> list[Error]:
     """One set-up of a kind. Raises NotEvaluableError where `calibrate` refuses."""
     setup = SetUp(seed, has_wrist=kind == "wrist")
-    if kind == "cameras alone":
+    if kind in (ALONE, OPEN3D):
         setup.off[setup.names[0]] = np.eye(4)
         setup.scale = 1.0  # of the camera that is held, nothing else tells it
     log = folder / "log.mcap"
     write_log(setup, log)
-    robot = (
-        {} if kind == "cameras alone" else {"urdf": SAMPLE / "robot.urdf", "spheres": SAMPLE / "robot_spheres.yaml"}
-    )
+    if kind == OPEN3D:
+        return list(errors_of_open3d(setup, log))
+    robot = {} if kind == ALONE else {"urdf": SAMPLE / "robot.urdf", "spheres": SAMPLE / "robot_spheres.yaml"}
     result = calibrate(CalibrateRequest(paths=(log,), out=folder / "calibration.toml", force=True, **robot))
     return list(errors(kind, setup, result))
 
@@ -212,8 +235,10 @@ def lines(rows: Sequence[Error]) -> Iterator[str]:
             length = np.linalg.norm(error.reshape(-1, 3 if unknown in ("position", "rotation") else 1), axis=1)
             figures = (np.median(length), np.percentile(length, 95), length.max(), np.median(sigma))
             within = int((np.abs(error) <= 2 * sigma).sum())
-            share = f"{within} of {len(some)} ({within / len(some):.1%})"
-            shown.append([kind, unknown, unit, *(f"{value:.3f}" for value in figures), share])
+            share = "-" if np.isnan(sigma).any() else f"{within} of {len(some)} ({within / len(some):.1%})"
+            shown.append(
+                [kind, unknown, unit, *("-" if np.isnan(value) else f"{value:.3f}" for value in figures), share]
+            )
     yield from table(header, shown)
 
 
@@ -221,7 +246,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Calibrate every set-up, print the table and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--setups", type=int, default=50)
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:3])
     parser.add_argument("--csv", type=Path, default=Path("bench_output/calibration.csv"))
     args = parser.parse_args(argv)
     args.csv.parent.mkdir(parents=True, exist_ok=True)
