@@ -2,7 +2,6 @@
 needs is imported when it runs, so that help answers at once.
 """
 
-import argparse
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,8 +9,6 @@ from pathlib import Path
 
 from splatctrl_cli import __version__
 from splatctrl_cli.cli.options import (
-    POSE,
-    SEVERAL_LOGS,
     add_common,
     add_gates,
     add_junit,
@@ -20,11 +17,18 @@ from splatctrl_cli.cli.options import (
     add_packages,
     add_seed,
     add_settings,
-    add_source,
     add_threads,
-    pose,
 )
 from splatctrl_cli.cli.parser import Options, Parser, real, whole
+from splatctrl_cli.cli.recording_options import (
+    calibrate_options,
+    capture_pack_options,
+    capture_unpack_options,
+    check_options,
+    info_options,
+    ingest_options,
+    simulate_options,
+)
 from splatctrl_cli.cli.replay_options import replay_options
 from splatctrl_cli.cli.run_options import batch_options, compare_options, report_options, view_options
 from splatctrl_cli.cli.scene_options import (
@@ -40,7 +44,6 @@ exit codes: 0 done; 1 a gate or check failed; 2 usage, configuration or output; 
 damaged; 4 input missing or unusable; 5 cannot be evaluated; 6 writing failed; 70 our own bug, or a card that failed;
 130 interrupted"""
 SHELLS = ("bash", "zsh", "tcsh")  # as shtab has them, which is not imported for a help text
-QUICK = 30  # images of a topic
 LOG, ROBOT = "sample_data/tabletop/log.mcap", "--urdf arm.urdf --spheres arm.yaml"  # of examples
 
 
@@ -100,91 +103,6 @@ def function_of(run: str) -> Callable[..., int]:
     module, _, name = run.partition(":")
     function: Callable[..., int] = getattr(importlib.import_module(f"splatctrl_cli.cli.{module}"), name)
     return function
-
-
-def _simulate(add: Options, parser: Parser) -> None:
-    files = "folder for log.mcap, truth.json, robot.urdf, robot_spheres.yaml"
-    add_output(add, files, default="simulated")
-    add("--urdf FILE", "another arm with collision geometry, its base on the table; spheres are fitted to it", Path)
-    add_packages(add)
-    add_seed(add, "the noise and of --human-arm")
-    add("--duration S", "length in seconds (default: 7, with --human-arm 24)", real(0.5, 600, "s"))
-    add("--free", "free space: floor and walls, no table and nothing on it")
-    add("--person", "a walking person with masks, instead of the standing cylinder")
-    shared = "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal"
-    add("--human-arm", shared, ("near-pickup", "near-goal"))
-    add(
-        "--dtu",
-        "write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in IDR's, with masks"
-        " of its things",
-    )
-    add("--fps HZ", "frames a second", real(0.1, 60, "Hz"), 5.0)
-    add("--width PX", "image width", whole(16, 4096, "px"), 320)
-    add("--height PX", "image height", whole(16, 4096, "px"), 240)
-    add("--noise", "depth noise", ("none", "realsense"), "realsense")
-
-
-def _ingest(add: Options, parser: Parser) -> None:
-    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, folder of a dataset, or .toml of an image folder"
-    add("SOURCE", f"{kinds}; {SEVERAL_LOGS}", Path, nargs="+")
-    add_output(add, "capture folder", default="NAME.capture in this folder, NAME that of SOURCE")
-    add("--resume", "continue an interrupted run, if there is one, to the same bytes")
-    add_source(add)
-
-
-def _info(add: Options, parser: Parser) -> None:
-    add("PATH", "file or folder", Path)
-    add_source(add)
-
-
-def _check(add: Options, parser: Parser) -> None:
-    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, capture, folder of a dataset, or .toml of an image folder"
-    add("SOURCE", f"{kinds}; {SEVERAL_LOGS}", Path, nargs="+")
-    fatal = "exit with 1 where a finding is as bad as this"
-    add("--fail-on", fatal, ("error", "warning", "never"), "error")
-    add(
-        "--quick N",
-        f"read the first N images of a topic only (default of N: {QUICK})",
-        _num_images,
-        nargs="?",
-        const=QUICK,
-    )
-    add("--urdf FILE", "compare joint states and depth with this robot (with --spheres: the log's own)", Path)
-    add("--spheres FILE", "its spheres (default: those of the URDF)", Path)
-    more = add.group("robot")
-    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
-    add_lock(more)
-    add_source(add)
-
-
-def _calibrate(add: Options, parser: Parser) -> None:
-    kinds = ".mcap, .bag, .db3, ROS 2 bag folder, capture, folder of a dataset, or .toml of an image folder"
-    add("SOURCE", f"the recording to calibrate: {kinds}; {SEVERAL_LOGS}", Path, nargs="+")
-    add_output(add, "TOML file that commands take as --calibration", default="calibration.toml")
-    add("--urdf FILE", "place the cameras by this robot's surface, where its joint states have it", Path)
-    add(
-        "--hold CAMERA",
-        "what stays as recorded (default: the robot's base, without --urdf the first camera)",
-    )
-    add(
-        "--board COLUMNSxROWS:M",
-        "begin where a board of so many inner corners (chessboard or ChArUco), squares of M metres, has the cameras",
-    )
-    add("--allow-unobserved", "write what the recording says, although not all can be told from it")
-    more = add.group("robot")
-    more("--spheres FILE", "its spheres (default: those of the URDF), for links without geometry", Path)
-    more(f"--base {POSE}", "pose of the URDF's root in the world (default: at its origin)", pose)
-    add_packages(more)
-    add_lock(more)
-    add_source(add)
-
-
-def _num_images(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        hint = f"put it behind the input, or write --quick={QUICK}"
-        raise argparse.ArgumentTypeError(f"expected a number of images, got {text!r}: {hint}") from None
 
 
 def _config(add: Options, parser: Parser) -> None:
@@ -249,47 +167,37 @@ def _robot_info(add: Options, parser: Parser) -> None:
     add_lock(add)
 
 
-def _capture_pack(add: Options, parser: Parser) -> None:
-    add("CAPTURE", "capture folder", Path)
-    add_output(add, "MCAP file", default="CAPTURE.mcap")
-
-
-def _capture_unpack(add: Options, parser: Parser) -> None:
-    add("PACKED", "MCAP file", Path)
-    add_output(add, "capture folder", default="PACKED.capture")
-
-
 COMMANDS = {
     "simulate": Command(
         summary="write a recorded log (ROS 2 MCAP) of an arm at a table, with its truth",
         examples=("simulate -o out/log", "simulate --urdf fr3.urdf --packages franka_description -o out/fr3"),
         run="demo:run_simulate",
-        options=_simulate,
+        options=simulate_options,
     ),
     "ingest": Command(
         summary="turn a log or image folder into a capture folder",
         examples=(f"ingest {LOG} -o out/x.capture", "ingest run1.bag run2.bag --cameras front,wrist"),
         run="recordings:run_ingest",
-        options=_ingest,
+        options=ingest_options,
     ),
     "info": Command(
         summary="describe a log, capture, scene, grid, robot or other file",
         examples=(f"info {LOG}", "info out/scene --json"),
         run="check:run_info",
-        options=_info,
+        options=info_options,
     ),
     "check": Command(
         summary="say what is wrong with a log, capture or image folder",
         examples=(f"check {LOG} {ROBOT}", "check run.bag --quick --fail-on warning"),
         run="check:run",
         judges=True,
-        options=_check,
+        options=check_options,
     ),
     "calibrate": Command(
         summary="place cameras against each other and the robot, from what they recorded",
         examples=(f"calibrate {LOG} {ROBOT}", "calibrate two_cameras.toml --hold front -o rig.toml"),
         run="calibrate:run",
-        options=_calibrate,
+        options=calibrate_options,
     ),
     "reconstruct": Command(
         summary="fit splats to a log, a capture or a DTU scan",
@@ -426,11 +334,13 @@ COMMANDS = {
         summary="pack a capture into one MCAP that viewers open, and unpack it",
         examples=("capture pack out/x.capture -o x.mcap", "capture unpack x.mcap -o back.capture"),
         actions={
-            "pack": Command(summary="write a capture as one MCAP", run="recordings:run_pack", options=_capture_pack),
+            "pack": Command(
+                summary="write a capture as one MCAP", run="recordings:run_pack", options=capture_pack_options
+            ),
             "unpack": Command(
                 summary="write the capture that `pack` made an MCAP of",
                 run="recordings:run_unpack",
-                options=_capture_unpack,
+                options=capture_unpack_options,
             ),
         },
     ),
