@@ -7,6 +7,7 @@ import os
 import re
 import socket
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
@@ -19,7 +20,7 @@ from splatctrl_cli.files.output import sha256, write_durably
 
 NAME, OWNERS = "ledger.sqlite", ".owners"
 VERSION = 1  # of the tables
-BUSY_S = 30.0  # to wait for another process that writes
+BUSY_S, WAIT_S = 30.0, 0.02  # to wait for another process that writes, and before it is asked again
 _COMPARISON = re.compile(r"(\w+)\s*(!=|>=|<=|==?|>|<)\s*(.*)")
 _PATTERN = {"=": "GLOB", "==": "GLOB", "!=": "NOT GLOB"}  # of texts with a *
 
@@ -76,19 +77,30 @@ class Ledger:
         self._owner = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
         self._lock: TextIO | None = None
         try:
-            self._base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
-            self._base.row_factory = sqlite3.Row
-            version = int(self._base.execute("PRAGMA user_version").fetchone()[0])
-            if version > VERSION:
-                raise InputError(
-                    f"{self.path}: is of version {version}, expected {VERSION}", remedy="use a newer splatctrl"
-                )
-            self._base.execute("PRAGMA journal_mode = WAL")
-            self._base.execute("PRAGMA synchronous = NORMAL")
-            self._base.executescript(_TABLES)
-            self._base.execute(f"PRAGMA user_version = {VERSION}")
+            self._base = self._opened()
         except sqlite3.DatabaseError as error:
             raise InputError(f"{self.path}: is no ledger: {error}", remedy="move it away; outputs stay") from None
+
+    def _opened(self) -> sqlite3.Connection:
+        base = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
+        base.row_factory = sqlite3.Row
+        version = int(base.execute("PRAGMA user_version").fetchone()[0])
+        if version > VERSION:
+            raise InputError(
+                f"{self.path}: is of version {version}, expected {VERSION}", remedy="use a newer splatctrl"
+            )
+        until = time.monotonic() + BUSY_S
+        while base.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+            try:
+                base.execute("PRAGMA journal_mode = WAL")
+            except sqlite3.OperationalError:  # for which sqlite waits for no other, as it does for all else
+                if time.monotonic() > until:
+                    raise
+                time.sleep(WAIT_S)
+        base.execute("PRAGMA synchronous = NORMAL")
+        base.executescript(_TABLES)
+        base.execute(f"PRAGMA user_version = {VERSION}")
+        return base
 
     def close(self) -> None:
         """Give up what is claimed."""

@@ -1,7 +1,9 @@
 """The ledger: what ran, asked by column, and files that are none."""
 
 import sqlite3
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -95,3 +97,26 @@ def test_what_is_no_ledger_is_refused_and_left_alone(tmp_path: Path) -> None:
     base.close()
     with pytest.raises(InputError, match=f"is of version {VERSION + 1}, expected {VERSION}; use a newer"):
         Ledger(newer)
+
+
+class Refusing(sqlite3.Connection):
+    """Refuses to change the journal twice, as where another process changes it at that moment."""
+
+    refusals = 2
+
+    def execute(self, sql: str, *given: Any) -> sqlite3.Cursor:
+        if sql.endswith("= WAL") and self.refusals:
+            self.refusals -= 1
+            raise sqlite3.OperationalError("database is locked")
+        return super().execute(sql, *given)
+
+
+def test_ledgers_that_open_at_one_moment_wait_for_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sqlite3.connect", partial(sqlite3.connect, factory=Refusing))
+    with Ledger(tmp_path) as ledger:
+        assert ledger.claim("a")
+    with sqlite3.connect(tmp_path / NAME) as base:
+        assert base.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
+    monkeypatch.setattr("splatctrl_cli.jobs.batches.ledger.BUSY_S", 0.0)
+    with pytest.raises(InputError, match="database is locked"):
+        Ledger(tmp_path / "busy")
