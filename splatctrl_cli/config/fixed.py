@@ -70,6 +70,8 @@ SPLIT_PARTS = 2  # Gaussians that a split one becomes (the baseline 3dgs)
 
 # Map: occupancy, and which pixels are the robot's
 NARROW_HOLE = 2.0  # [voxels] holes that are not wider are common beside edges
+NARROW_GAP = 4.0  # [voxels] gaps between two objects before a far background that are not wider are common
+GAP_DIRECTIONS = 3  # of four in which a gap has an object on both sides: two are common above a horizon
 CONTACT_REACH = 0.02  # [m] an object so near to the robot may touch it where the robot hides it
 CONTACT_THICKNESS = 0.2  # [m] of a link at most: so far behind what a camera sees of it something may touch it
 WELL_INSIDE = 0.005  # [m] below the robot's surface; what nothing shows to be an object there is the robot's

@@ -1,41 +1,73 @@
 """Space that cameras looked into and got no depth from: a dark, shiny or clear thing in full view leaves only a hole.
 
-A hole is a group of pixels without depth that has depth all around it. What is in it stands somewhere on its rays,
-before what is seen beside it. Other cameras and later images that see through these rays clear them; what is left is
-where the thing may be.
+A hole is a group of pixels without depth that has depth all around it. Where there is no depth behind the thing
+either, as before a far background, it is a wide gap between objects instead. What is in it stands somewhere on its
+rays, before what is seen beside it. Other cameras and later images that see through these rays clear them; what is
+left is where the thing may be.
 """
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import cv2
 import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.config.fixed import NARROW_HOLE
+from splatctrl_cli.config.fixed import GAP_DIRECTIONS, NARROW_GAP, NARROW_HOLE
 from splatctrl_cli.geometry import back_project_pixels, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame, UInt8
 
+NOTHING, OBJECT, BLANK = 0, 1, 2  # what a pixel shows: nothing that counts, an object, or no depth
 MOST_POINTS = 1 << 18  # at a time: fine voxels and a large hole come to a hundred million
 
 
 def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyConfig) -> Iterator[Float64]:
-    """Points (K, 3) [m], world, on the rays of a frame's holes, half a voxel [m] apart along each; some at a time.
+    """Points (K, 3) [m], world, on the rays of a frame's holes and gaps, half a voxel [m] apart along each; some at a
+    time, some of them twice.
 
     From `min_range` before the camera to the depth that is seen nearest to the pixel, on rays about a voxel apart;
-    holes up to `NARROW_HOLE` voxels wide do not count. robot_depth (H, W) [m]: of the rendered robot, 0 = none; a gap
-    beside the robot may show what is far behind it, and is not a hole.
+    holes up to `NARROW_HOLE` and gaps up to `NARROW_GAP` voxels wide do not count. robot_depth (H, W) [m]: of the
+    rendered robot, 0 = none; beside it what is far behind may show, so that it bounds neither.
     """
-    blank = _holes(frame, robot_depth)
-    if not blank.any():
+    is_blank = frame.depth <= 0
+    if not 0 < np.count_nonzero(is_blank) < is_blank.size:
         return
-    voxel = config.voxel
     behind = _nearest_depth(frame.depth)
-    width = voxel * frame.intrinsics.fx / float(np.median(behind[blank]))  # pixels
-    narrow, apart = int(NARROW_HOLE * width) | 1, max(int(width), 1)  # OpenCV shifts an even window
-    wide = cv2.morphologyEx(blank.view(np.uint8), cv2.MORPH_OPEN, np.ones((narrow, narrow), np.uint8))
-    v, u = np.nonzero(wide[::apart, ::apart])
+    is_end = cv2.dilate(robot_depth, np.ones((5, 5), np.uint8)) > 0
+    if frame.valid is not None:
+        is_end |= ~frame.valid
+    holes = _holes(is_blank, is_end)
+    if holes.any():
+        width = _voxel_width(frame, behind[holes], config)
+        yield from _on_rays(frame, _wide(holes, NARROW_HOLE * width), behind, max(int(width), 1), config)
+    width = _voxel_width(frame, behind[is_blank], config)
+    step = max(int(0.5 * width), 1)  # as fine as is needed for something so wide
+    every = slice(None, None, step)
+    is_end = cv2.dilate(is_end.view(np.uint8), np.ones((step, step), np.uint8)) > 0  # narrow parts too
+    gaps = np.zeros_like(is_blank)
+    gaps[every, every] = _wide(_gaps(is_blank[every, every], is_end[every, every]), NARROW_GAP * width / step)
+    yield from _on_rays(frame, gaps, behind, step, config)
+
+
+def _voxel_width(frame: RgbdFrame, depths: Float32, config: OccupancyConfig) -> float:
+    """How many pixels wide a voxel is at the median of depths (K,) [m]."""
+    return config.voxel * frame.intrinsics.fx / float(np.median(depths))
+
+
+def _wide(pixels: Bool, width: float) -> Bool:
+    """Those of pixels (H, W) that lie in a square of them of this width."""
+    side = int(width) | 1  # OpenCV shifts an even window
+    opened = cv2.morphologyEx(pixels.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
+    return np.asarray(opened.view(bool))
+
+
+def _on_rays(
+    frame: RgbdFrame, pixels: Bool, behind: Float32, apart: int, config: OccupancyConfig
+) -> Iterator[Float64]:
+    """Points (K, 3) [m], world, before the depth behind (H, W) [m] of every pixel that is `apart` from the last."""
+    v, u = np.nonzero(pixels[::apart, ::apart])
     v, u = v * apart, u * apart
-    depths = np.arange(config.min_range, behind[v, u].max(initial=config.min_range), 0.5 * voxel)
+    depths = np.arange(config.min_range, behind[v, u].max(initial=config.min_range), 0.5 * config.voxel)
     rays = back_project_pixels(frame.intrinsics, u, v, np.ones(len(u)))
     num = max(MOST_POINTS // max(len(depths), 1), 1)  # rays at a time
     for some in (slice(first, first + num) for first in range(0, len(u), num)):
@@ -43,19 +75,30 @@ def unanswered_points(frame: RgbdFrame, robot_depth: Float32, config: OccupancyC
         yield transform_points(frame.T_world_camera, (rays[some, None] * depths[:, None])[is_before])
 
 
-def _holes(frame: RgbdFrame, robot_depth: Float32) -> Bool:
-    """Pixels (H, W) without depth in groups that have depth of objects all around: neither the image's border nor
-    the robot nor what the lens did not see.
-    """
-    blank = (frame.depth <= 0).view(np.uint8)
-    if not blank.any():
-        return blank.view(bool)
-    _, groups = cv2.connectedComponents(blank, connectivity=8)
-    beside_robot = cv2.dilate(robot_depth, np.ones((5, 5), np.uint8)) > 0
-    open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[beside_robot]]
-    if frame.valid is not None:
-        open_groups.append(groups[~frame.valid])
+def _holes(is_blank: Bool, is_end: Bool) -> Bool:
+    """Pixels (H, W) without depth in groups that meet neither the image's border nor an end."""
+    _, groups = cv2.connectedComponents(is_blank.view(np.uint8), connectivity=8)
+    open_groups = [groups[0], groups[-1], groups[:, 0], groups[:, -1], groups[is_end]]
     return np.isin(groups, np.concatenate([[0], *open_groups]), invert=True)
+
+
+def _gaps(is_blank: Bool, is_end: Bool) -> Bool:
+    """Pixels (H, W) without depth between two objects in `GAP_DIRECTIONS` of the image's four directions: across, up
+    and down, and the diagonals.
+    """
+    kinds = np.pad(np.where(is_end, NOTHING, np.where(is_blank, BLANK, OBJECT)).astype(np.uint8), 1)
+    sees = [_sees_object(kinds, shift) & _sees_object(kinds[::-1, ::-1], shift)[::-1, ::-1] for shift in (-1, 0, 1)]
+    sees.append((_sees_object(kinds.T, 0) & _sees_object(kinds.T[::-1], 0)[::-1]).T)
+    is_between = np.sum(sees, axis=0) >= GAP_DIRECTIONS
+    return np.ascontiguousarray((is_between & (kinds == BLANK))[1:-1, 1:-1])
+
+
+def _sees_object(kinds: UInt8, shift: int) -> Bool:
+    """Pixels (H, W) that show an object, or do so where a path up, by -shift columns a row, first meets depth."""
+    met = kinds.copy()
+    for above, row in pairwise(met):
+        np.copyto(row, np.roll(above, shift), where=row == BLANK)
+    return np.asarray(met == OBJECT)
 
 
 def _nearest_depth(depth: Float32) -> Float32:

@@ -32,6 +32,17 @@ def dark_block(x: float) -> RgbdFrame:
     return seen
 
 
+def before_a_far_background(*dark: tuple[slice, slice], things: tuple[tuple[slice, slice], ...] = ()) -> RgbdFrame:
+    """The floor below a horizon, things that rise above it, and none of the dark pixels' depth."""
+    seen = frame()
+    seen.depth[:20] = 0.0
+    for thing in things:
+        seen.depth[thing] = 0.8
+    for pixels in dark:
+        seen.depth[pixels] = 0.0
+    return seen
+
+
 def points_of(seen: RgbdFrame, robot: Float32 = NOBODY) -> Float64:
     return np.concatenate([np.empty((0, 3)), *unanswered_points(seen, robot, CONFIG)])
 
@@ -79,8 +90,17 @@ def unseen_by_the_lens() -> Bool:
         pytest.param(frame(), NOBODY, id="no hole"),
         pytest.param(dark(columns=slice(60, 80)), NOBODY, id="at the border"),
         pytest.param(dark(columns=slice(30, 32)), NOBODY, id="narrower than two voxels"),
-        pytest.param(dark(), robot_beside(), id="beside the robot"),
+        pytest.param(dark(columns=slice(44, 50)), robot_beside(), id="the robot's shadow"),
         pytest.param(replace(dark(), valid=~unseen_by_the_lens()), NOBODY, id="not in the lens"),
+        pytest.param(before_a_far_background(), NOBODY, id="a background without depth"),
+        pytest.param(
+            before_a_far_background(things=((slice(5, 30), slice(20, 30)), (slice(5, 30), slice(36, 46)))),
+            NOBODY,
+            id="the background between two things",
+        ),
+        pytest.param(
+            before_a_far_background((slice(20, 40), slice(30, 36))), NOBODY, id="narrow before the background"
+        ),
     ],
 )
 def test_other_gaps_are_no_holes(seen: RgbdFrame, robot: Float32) -> None:
@@ -93,6 +113,26 @@ def test_a_dark_block_is_where_all_cameras_look_in_vain() -> None:
     marked = [[is_marked(grid, at) for at in (top, above)] for grid in (one, three)]
     assert marked == [[True, True], [True, False]]  # the others see through the space above it
     assert 0 < (three.last_seen == UNANSWERED).sum() < 0.75 * (one.last_seen == UNANSWERED).sum()
+
+
+def test_a_dark_thing_before_a_far_background_is_a_gap() -> None:
+    points = points_of(before_a_far_background((slice(14, 45), slice(30, 50))))  # the horizon is in row 20
+    depth = HEIGHT - points[:, 2]
+    u = INTRINSICS.fx * points[:, 0] / depth + INTRINSICS.cx
+    v = -INTRINSICS.fy * points[:, 1] / depth + INTRINSICS.cy
+    assert u.min() > 29.9 and u.max() < 49.1 and v.min() > 19.9 and v.max() < 44.1
+    assert len(np.unique(np.round([u, v], 3), axis=1).T) > 100
+
+
+def test_patches_that_return_depth_leave_the_gap_around_them() -> None:
+    dark = slice(20, 45), slice(28, 52)
+    seen = before_a_far_background(dark)
+    seen.depth[24:27, 30:33] = 0.8
+    assert len(points_of(seen)) > 0.7 * len(points_of(before_a_far_background(dark))) > 0
+
+
+def test_a_dark_thing_beside_the_robot_is_a_gap() -> None:
+    assert len(points_of(dark(), robot_beside()))
 
 
 def is_marked(grid: OccupancyMap, point: tuple[float, float, float]) -> bool:
