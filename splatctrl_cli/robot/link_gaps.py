@@ -2,7 +2,7 @@
 enough apart, else exact between triangles (coal). T postures, J joints, S spheres, K pairs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
 import coal
@@ -20,6 +20,9 @@ from splatctrl_cli.robot.srdf import DisabledPair
 
 Int64 = NDArray[np.int64]
 LinkNames = tuple[str, str]
+Depth = Callable[[Float64], Float64]
+
+FLAT = 1e-9  # of a solid's size, by which a vertex may stick out of a face's plane: rounding
 
 
 class LinkSurface:
@@ -39,7 +42,7 @@ class LinkSurface:
         self.triangles.endModel()
         self._closed = [solid for solid in solids if solid.is_closed]
         self._boxes = [(s.surface.vertices.min(axis=0), s.surface.vertices.max(axis=0)) for s in self._closed]
-        self._distance: SolidDistance | None = None
+        self._depths: list[Depth] = []
 
     def depth(self, points: Float64) -> float:
         """How deep [m] points (Q, 3), in the link's frame, lie in it at most; 0 outside, or in an open surface."""
@@ -48,9 +51,23 @@ class LinkSurface:
             is_near |= np.all((points >= lower) & (points <= upper), axis=1)
         if not is_near.any():
             return 0.0
-        if self._distance is None:
-            self._distance = SolidDistance(self._closed)
-        return max(0.0, -float(np.min(self._distance(points[is_near]))))
+        self._depths = self._depths or [depth_in(solid) for solid in self._closed]
+        return max(0.0, *(float(depth(points[is_near]).max()) for depth in self._depths))
+
+
+def depth_in(solid: Solid) -> Depth:
+    """How deep (Q,) [m] points (Q, 3) lie in a closed solid, negative outside: in a convex one the least depth below
+    the planes of its faces, which is the distance to its surface and takes a tenth of the time.
+    """
+    corners = solid.surface.corners
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    heights = np.einsum("fa,fa->f", normals, corners[:, 0])
+    above = (solid.surface.vertices @ normals.T - heights).max()
+    if solid.ball is None and above <= FLAT * np.ptp(solid.surface.vertices, axis=0).max():
+        return lambda points: np.asarray((heights - points @ normals.T).min(axis=1))
+    distance = SolidDistance([solid])
+    return lambda points: -distance(points)
 
 
 def surface_gap(a: LinkSurface, b: LinkSurface, T_a_b: Float64) -> float:

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from splatctrl_cli.config.fixed import LEAST_OVERLAP
-from splatctrl_cli.mesh_distance import TriangleMesh
+from splatctrl_cli.mesh_distance import MeshDistance, TriangleMesh
 from splatctrl_cli.records import Float64, SphereSet
-from splatctrl_cli.robot.link_gaps import LinkSurface, SelfSurfaces, surface_gap
+from splatctrl_cli.robot.link_gaps import LinkSurface, SelfSurfaces, depth_in, surface_gap
 from splatctrl_cli.robot.link_meshes import Solid, read_solids
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.robot.self_collision import random_postures
@@ -75,6 +75,19 @@ def test_a_link_inside_another_overlaps_it_by_its_depth(tmp_path: Path) -> None:
     for a, b in ((large, small), (small, large)):
         assert surface_gap(a, b, np.eye(4)) == pytest.approx(-0.19, abs=1e-9)
     assert surface_gap(large, small, at((0.195, 0, 0))) == pytest.approx(-0.015, abs=1e-9)
+
+
+def test_the_depth_in_a_solid_is_the_distance_to_its_surface(tmp_path: Path) -> None:
+    mesh, rng = l_shape(), np.random.default_rng(3)
+    bent = TriangleMesh(vertices=np.array(mesh.vertices), faces=np.array(mesh.faces), is_closed=True)
+    hook = Solid(link="a", surface=bent, slack=0.0, body=bent)
+    rod = '<cylinder radius="0.05" length="0.3"/>'
+    for solid in (*solids_of(tmp_path, rod), *solids_of(tmp_path, '<box size="0.2 0.3 0.02"/>'), hook):
+        corners = solid.surface.vertices
+        points = rng.uniform(corners.min(axis=0), corners.max(axis=0), (300, 3))
+        expected = -MeshDistance(solid.surface).signed(points)
+        assert np.count_nonzero(expected > 0) > 30
+        np.testing.assert_allclose(np.maximum(depth_in(solid)(points), 0), np.maximum(expected, 0), atol=1e-12)
 
 
 def test_round_shapes_are_never_said_to_be_farther_apart_than_they_are(tmp_path: Path) -> None:
