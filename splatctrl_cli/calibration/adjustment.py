@@ -23,7 +23,8 @@ class Rows:
     """Residuals (M,) [m] of one pair of views, or of one frame and the robot, with what each may err by, sigma (M,);
     jacobian (M, 17) by the unknowns of the two cameras and the clock, which stand in `columns` (17,). between: whose
     they are; clusters (M,): residuals of one number, of all rows of one word `alike`, err alike; num_laid: points
-    that should lie on what the other sees, those beyond the reach included.
+    that should lie on what the other sees, those beyond the reach included; num_hidden: of these, those before which
+    something else stands.
     """
 
     between: tuple[str, str]
@@ -34,6 +35,7 @@ class Rows:
     jacobian: Float64
     columns: Index
     clusters: Index
+    num_hidden: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +156,7 @@ class Adjustment:
         most = fixed.CALIBRATION_CUT**2
         for rows in self.rows(estimate, reach):
             own = float(np.minimum(np.square(rows.residual / rows.sigma), most).sum())
-            own += most * (rows.num_laid - len(rows.residual))
+            own += most * max(0, rows.num_laid - len(rows.residual))
             sums[rows.between] = sums.get(rows.between, 0.0) + own
             laid[rows.between] = laid.get(rows.between, 0) + rows.num_laid
         means = [sums[key] / laid[key] for key in sums if laid[key] >= fixed.CALIBRATION_FEWEST]
@@ -162,12 +164,12 @@ class Adjustment:
 
     def distance(self, estimate: Estimate) -> float | None:
         """How far [m] the points of a camera lie from what another, or the robot, shows there: the median of the
-        worst two, at most the first reach; None where nothing can be compared.
+        worst two, at most the first reach; None where nothing can be compared. What hides the robot does not count.
         """
         reach = fixed.CALIBRATION_REACHES[0]
         between: dict[tuple[str, str], list[Float64]] = {}
         for rows in self.rows(estimate, reach):
-            beyond = np.full(rows.num_laid - len(rows.residual), reach)
+            beyond = np.full(max(0, rows.num_laid - rows.num_hidden - len(rows.residual)), reach)
             between.setdefault(rows.between, []).extend([np.abs(rows.residual), beyond])
         laid = [np.concatenate(parts) for parts in between.values()]
         return max((float(np.median(one)) for one in laid if len(one) >= fixed.CALIBRATION_FEWEST), default=None)
@@ -254,7 +256,8 @@ class Adjustment:
         found = self.evidence.arm.rows(depth, frame.intrinsics, T, twist, stamp_ns, reach)
         if found is None:
             return None
-        some = slice(None, None, max(1, len(found.residual) // fixed.CALIBRATION_ARM_POINTS))
+        step = max(1, len(found.residual) // fixed.CALIBRATION_ARM_POINTS)
+        some = slice(None, None, step)
         z = found.points[some, 2]
         slope = np.einsum("ki,ki->k", found.normals[some], found.points[some]) / z
         jacobian = np.zeros((len(z), 2 * OF_CAMERA + 1))
@@ -264,7 +267,7 @@ class Adjustment:
         return Rows(
             between=(frame.camera, ROBOT),
             alike=frame.camera,
-            num_laid=found.num_seen * len(z) // max(len(found.residual), 1),
+            num_laid=found.num_seen // step,
             residual=found.residual[some],
             sigma=np.hypot(slope * depth_sigma(z), fixed.CALIBRATION_NOISE[0]),
             jacobian=jacobian,
@@ -272,6 +275,7 @@ class Adjustment:
                 [self.unknowns.columns(frame.camera), np.full(OF_CAMERA, -1), [self.unknowns.clock_column]]
             ),
             clusters=found.links[some] * int(np.prod(fixed.CALIBRATION_TILES)) + found.tiles[some],
+            num_hidden=found.num_hidden // step,
         )
 
 

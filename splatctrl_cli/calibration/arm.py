@@ -22,7 +22,8 @@ STEP_NS = 10_000_000  # [ns] before and after, from which a velocity is taken: l
 class ArmRows:
     """Distances of M measured points from the robot's surface: residual (M,) [m], positive outside; jacobian (M, 6)
     by a turn and a move of the camera in its own frame; clock (M,) [m/s], the derivative by the clock; points and
-    normals (M, 3), in the camera's frame; links, tiles (M,). num_seen: pixels that should show the robot's surface.
+    normals (M, 3), in the camera's frame; links, tiles (M,). num_seen: pixels that should show the robot's surface;
+    num_hidden: of these, those that show something by more than `width` before it.
     """
 
     residual: Float64
@@ -33,6 +34,7 @@ class ArmRows:
     links: NDArray[np.int64]
     tiles: Index
     num_seen: int
+    num_hidden: int
 
 
 class Arm:
@@ -107,6 +109,7 @@ class Arm:
             links=link,
             tiles=tiles_of((v + corner[0]) * depth.shape[1] + u + corner[1], depth.shape),
             num_seen=int(is_used.sum()),
+            num_hidden=int(np.count_nonzero(is_used & (depths < near - width))),
         )
 
     def mount_of(self, poses: list[tuple[int, Float64]]) -> tuple[str, Float64] | None:
