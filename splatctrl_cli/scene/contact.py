@@ -85,13 +85,13 @@ def contact_seeds(
 def hidden_objects(
     buffer: SplatBuffer, robot: RobotPosture | None, seen: Seen, config: OccupancyConfig
 ) -> NDArray[np.intp]:
-    """Slots (K,) of objects within `CONTACT_REACH` of the moving robot that no pixel shows.
+    """Slots (K,) of objects within `CONTACT_REACH` of the robot, its base included, that no pixel shows.
 
     What an image shows there is the robot; fitting them to it would pull them out of their object.
     """
     if robot is None:
         return np.zeros(0, np.intp)
     slots = np.flatnonzero(buffer.is_alive & (buffer.labels != Label.ROBOT))
-    slots = slots[is_in_contact(buffer.centers[slots], robot)]
+    slots = slots[robot.distance(buffer.centers[slots]) < CONTACT_REACH]
     is_hidden = shown_kinds(buffer.centers[slots], seen, config) != PixelKind.OBJECT
     return np.asarray(slots[is_hidden], np.intp)

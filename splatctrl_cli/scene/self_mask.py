@@ -46,8 +46,8 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     rendered robot has within a few pixels: as many as the tolerance is wide at the robot's depth, so that a slanted
     surface and an outline that is off by the calibration are explained too. Spheres that stand for a link enclose its
     surface and are not it, as boxes do what it carries: what lies inside them is robot. At the outline, what is
-    behind the robot and before everything that is seen beside it is mixed: the pixel sees both. Everything else with
-    a depth is an object.
+    behind the robot and before everything that is seen beside it is mixed: the pixel sees both; and so is, before the
+    robot's surface, one pixel by itself: noise, where two links meet. Everything else with a depth is an object.
     """
     surface, T_world_link = robot.seen_at(frame.stamp_ns)
     shown = surface.render(
@@ -77,6 +77,7 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
     kinds[is_explained] = PixelKind.ROBOT
     core = cv2.erode(is_robot.view(np.uint8), _window(reach)).view(bool)
     kinds[_mixed(depth, has_depth & ~is_explained, nearest, core, tolerance, reach)] = PixelKind.MIXED
+    kinds[is_robot & _alone(kinds == PixelKind.OBJECT)] = PixelKind.MIXED
     offset = depth - rendered
     is_told = core & has_depth & (np.abs(offset) <= MASK_FAR_OFF) & (link < len(surface.links) - surface.num_carried)
     is_inside = core & (kinds == PixelKind.OBJECT) & (inside >= 0)
@@ -87,6 +88,12 @@ def self_mask(frame: RgbdFrame, robot: RobotPosture, config: OccupancyConfig) ->
             name: len(found) for name, found in _by_link(inside[is_inside], inside[is_inside], surface.links).items()
         },
     )
+
+
+def _alone(chosen: Bool) -> Bool:
+    """Those of chosen pixels (H, W) with no other among the eight about them."""
+    around = cv2.boxFilter(chosen.view(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(chosen & (around == 1))
 
 
 def _by_link(values: NDArray[Any], links: NDArray[np.int16], names: Sequence[str]) -> dict[str, NDArray[Any]]:

@@ -77,3 +77,6 @@ def test_what_the_robot_hides_of_an_object_is_not_fitted_to_the_robot() -> None:
     slots.labels[2] = Label.ROBOT
     assert hidden_objects(slots, robot, seen, OccupancyConfig()).tolist() == [0]
     assert hidden_objects(slots, None, seen, OccupancyConfig()).tolist() == []
+    assert robot.surface is not None
+    base = replace(robot, surface=replace(robot.surface, fixed=("arm",)))
+    assert hidden_objects(slots, base, seen, OccupancyConfig()).tolist() == [0]  # what it stands on, too

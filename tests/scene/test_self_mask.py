@@ -115,6 +115,18 @@ def test_a_lone_depth_at_the_rim_before_nothing_is_mixed_and_a_thin_thing_there_
     assert (kinds(depth)[60 : 60 + rows, rim] == kind).all()
 
 
+@pytest.mark.parametrize(("columns", "kind"), [(1, PixelKind.MIXED), (2, PixelKind.OBJECT)])
+def test_one_pixel_before_the_robot_is_noise_and_two_are_a_thing(columns: int, kind: PixelKind) -> None:
+    depth = ball_depth()
+    depth[60, 79 : 79 + columns] += [0.012, -0.012][columns - 1]
+    found = kinds(depth)
+    assert (found[60, 79 : 79 + columns] == kind).all()
+    assert (found[SHOWN] == PixelKind.ROBOT).sum() == SHOWN.sum() - columns
+    depth = np.full(SHOWN.shape, FLOOR)
+    depth[20, 20] = 0.8
+    assert kinds(depth)[20, 20] == PixelKind.OBJECT  # beside the robot it may be all that is seen of a thing
+
+
 def test_points_inside_the_robot_are_counted_by_link_and_are_no_robot() -> None:
     depth = ball_depth()
     depth[55:65, 75:85] += 0.05
