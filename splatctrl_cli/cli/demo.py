@@ -22,6 +22,7 @@ from splatctrl_cli.jobs.ingest import IngestResult
 from splatctrl_cli.jobs.reconstruct import ReconstructResult
 from splatctrl_cli.jobs.score import ScoreResult
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
+from splatctrl_cli.simulate.environments import ENVIRONMENT_S
 from splatctrl_cli.simulate.recording import RecordingOptions
 from splatctrl_cli.simulate.shared_workspace import DURATION_S
 
@@ -72,8 +73,8 @@ def run_simulate(args: argparse.Namespace) -> int:
     """Record a log, and return the exit code."""
     console = Console(args)
     given = {"duration_s": args.duration, "with_person": args.person, "is_free": args.free}
-    if args.duration is None and args.human_arm is not None:
-        given["duration_s"] = DURATION_S
+    if args.duration is None and (args.human_arm is not None or args.environment is not None):
+        given["duration_s"] = DURATION_S if args.environment is None else ENVIRONMENT_S
     options = request_of(RecordingOptions, args, **{name: v for name, v in given.items() if v is not None})
     request = request_of(SimulateRequest, args, out=args.out or Path("simulated"), options=options)
     result = simulate(request, console)

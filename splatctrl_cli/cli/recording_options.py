@@ -23,12 +23,19 @@ def simulate_options(add: Options, parser: Parser) -> None:
     add_output(add, files, default="simulated")
     add("--urdf FILE", "another arm with collision geometry, its base on the table; spheres are fitted to it", Path)
     add_packages(add)
-    add_seed(add, "the noise and of --human-arm")
-    add("--duration S", "length in seconds (default: 7, with --human-arm 24)", real(0.5, 600, "s"))
+    add_seed(add, "the noise, of --environment and of --human-arm")
+    add(
+        "--duration S",
+        "length in seconds (default: 7; with --environment 12, with --human-arm 24)",
+        real(0.5, 600, "s"),
+    )
     add("--free", "free space: floor and walls, no table and nothing on it")
     add("--person", "a walking person with masks, instead of the standing cylinder")
     shared = "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal"
     add("--human-arm", shared, ("near-pickup", "near-goal"))
+    drawn = "things on one or two tables, a shelf, or one without a divider, by the seed, and a way through it"
+    add("--environment", drawn, ("tabletop", "cubby", "merged-cubby"))
+    add("--num-cameras N", "with --environment: 2 to 6 about the arm", whole(2, 6), 4)
     add(
         "--dtu",
         "write PATH/dtu and PATH/idr too: a DTU scan of a static scene, in MVSNet's layout and in IDR's, with masks"

@@ -179,6 +179,12 @@ SIMULATED_NEARINGS = 10  # times: to a fifth of it
 SIMULATED_SAMPLES = 25  # of a leg whose clearance is looked at
 SIMULATED_CLEARANCE = 0.05  # [m] that a leg should keep: twice the margin and what a map errs by
 SIMULATED_SHORTFALL = 20.0  # [rad] longer, a leg without any clearance
+TASK_CLEARANCE = 0.03  # [m] that a way through a drawn environment keeps: the margin, and what a map errs by
+TASK_SPARE = 0.002  # [m] more of start and goal
+TASK_ENVIRONMENTS = 50  # drawn until one has a way
+TASK_GUESSES = 24  # random postures that the search for a place begins with
+TASK_POSTURES = 4  # at a goal
+TASK_APART = 0.20  # [m] of start and goal
 
 # Robot: its spheres, and what they leave uncovered
 DEFICIT_GAP = 1e-5  # [m] between the proven and the found deficit

@@ -10,6 +10,7 @@ from splatctrl_cli.datasets.idr import write_idr
 from splatctrl_cli.files.output import Stopwatch, output_path, sha256, write_json, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.simulated_arm import adapted_motion, copied_arm
+from splatctrl_cli.jobs.simulated_task import task_of
 from splatctrl_cli.logs.mcap_writer import mcap_log
 from splatctrl_cli.records import JointState
 from splatctrl_cli.robot.model import RobotModel
@@ -96,15 +97,23 @@ def _record(folder: Path, request: SimulateRequest, progress: Progress) -> tuple
 def _recording(folder: Path, request: SimulateRequest, progress: Progress) -> Recording:
     """The scene and the arm in it, whose files are written."""
     options = request.options
+    surfaces = None
     if request.urdf is None:
         urdf, spheres = folder / "robot.urdf", folder / "robot_spheres.yaml"
         urdf.write_text(arm_urdf(), encoding="utf-8")
         spheres.write_text(arm_spheres_yaml(), encoding="utf-8")
-        return Recording(options, RobotModel.from_urdf(urdf, spheres))
-    progress.log(f"simulate: fitting spheres to {request.urdf.name}")
-    (robot, surfaces), scene = copied_arm(request.urdf, request.packages, folder), Scene.of(options)
-    progress.log("simulate: looking for a way through the scene")
-    return Recording(options, robot, replace(scene, motion=adapted_motion(scene, robot, surfaces)))
+        robot = RobotModel.from_urdf(urdf, spheres)
+    else:
+        progress.log(f"simulate: fitting spheres to {request.urdf.name}")
+        robot, surfaces = copied_arm(request.urdf, request.packages, folder)
+    if options.environment is not None:
+        progress.log(f"simulate: looking for a way through the {options.environment}")
+        return Recording(options, robot, task_of(options.environment, options.seed, robot).scene(robot, options))
+    scene = Scene.of(options)
+    if surfaces is not None:
+        progress.log("simulate: looking for a way through the scene")
+        scene = replace(scene, motion=adapted_motion(scene, robot, surfaces))
+    return Recording(options, robot, scene)
 
 
 def _truth(folder: Path, recording: Recording, contrast: Mapping[str, float]) -> Truth:

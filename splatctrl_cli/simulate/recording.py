@@ -11,9 +11,10 @@ from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import Float32, Float64, JointState, Record, RgbdFrame, UInt8, by_stamp
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate import shared_workspace, tabletop
+from splatctrl_cli.simulate.environments import ENVIRONMENTS
 from splatctrl_cli.simulate.motion import Motion
 from splatctrl_cli.simulate.primitives import Primitive
-from splatctrl_cli.simulate.render import DepthNoise, Renderer
+from splatctrl_cli.simulate.render import Camera, DepthNoise, Renderer
 from splatctrl_cli.simulate.truth import distance_to
 
 START_NS = 1_700_000_000_000_000_000
@@ -30,7 +31,8 @@ class RecordingOptions:
 
     with_person: a walking person with masks, instead of the standing cylinder. human_arm: one of
     `shared_workspace.PLACES`, instead of both: the table shared with a person's arm, whose visit the seed draws.
-    is_free: floor and walls alone, without the table and what is on it.
+    is_free: floor and walls alone, without the table and what is on it. environment: one of `ENVIRONMENTS`, which the
+    seed draws, seen by `num_cameras`.
     color_rays: 0 to 4 rays for a pixel's colour beside the one for its depth.
     """
 
@@ -43,6 +45,8 @@ class RecordingOptions:
     with_person: bool = False
     human_arm: str | None = None
     is_free: bool = False
+    environment: str | None = None
+    num_cameras: int = 4
     color_rays: int = 4
 
     def __post_init__(self) -> None:
@@ -60,19 +64,25 @@ class RecordingOptions:
             raise UsageError(f"--human-arm: expected one of {places}, without --person, got {self.human_arm}")
         if self.is_free and (self.with_person or self.human_arm is not None):
             raise UsageError("--free: expected neither --person nor --human-arm, who stand about the table")
+        if self.environment is not None and (self.with_person or self.human_arm is not None or self.is_free):
+            raise UsageError("--environment: expected neither --person, --human-arm nor --free, which have their own")
+        if self.environment not in (None, *ENVIRONMENTS) or not 2 <= self.num_cameras <= 6:
+            kinds = ", ".join(ENVIRONMENTS)
+            raise UsageError(f"--environment: expected one of {kinds}, and 2 to 6 --num-cameras")
         if self.seed < 0:
             raise UsageError(f"--seed: expected 0 or more, got {self.seed}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What stands there (`primitives`, the last of them, `temporary`, for a while only), and the motion of the
-    simulated arm among it.
+    """What stands there (`primitives`, the last of them, `temporary`, for a while only), the motion of an arm among
+    it, and cameras other than those of the table.
     """
 
     primitives: tuple[Primitive, ...]
     temporary: tuple[Primitive, ...]
     motion: Motion
+    cameras: tuple[Camera, ...] = ()
 
     @classmethod
     def of(cls, options: RecordingOptions) -> "Scene":
@@ -107,7 +117,7 @@ class Recording:
         self.robot = robot
         scene = Scene.of(options) if scene is None else scene
         self.start_ns, self.end_ns = START_NS, START_NS + round(options.duration_s * 1e9)
-        self.cameras = tabletop.cameras(options.width, options.height)
+        self.cameras = scene.cameras or tabletop.cameras(options.width, options.height)
         self.primitives, self._temporary, self._motion = scene.primitives, scene.temporary, scene.motion
         self._meshes = tabletop.arm_meshes(robot.surface) if robot.urdf.meshes else None
 
