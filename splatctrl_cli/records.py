@@ -195,6 +195,12 @@ class Columns:
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
+    def joined(self, *others: Self) -> Self:
+        """These items, and then those of the others."""
+        names = [column.name for column in fields(self)]
+        parts = {name: [getattr(one, name) for one in (self, *others)] for name in names}
+        return replace(self, **{name: np.concatenate(arrays) for name, arrays in parts.items()})
+
     def select(self, which: Bool | NDArray[np.integer]) -> Self:
         """The items where a mask (N,) is true, in order, or those of an index (K,)."""
         return replace(self, **{column.name: getattr(self, column.name)[which] for column in fields(self)})

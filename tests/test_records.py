@@ -2,10 +2,11 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.records import Box, by_stamp
+from splatctrl_cli.records import Box, PointCloud, by_stamp
 
 
 def test_a_box_is_read_lower_corner_first() -> None:
@@ -26,3 +27,11 @@ def test_of_one_stamp_the_items_of_an_earlier_stream_come_first_each_in_its_own_
     streams = [[(1, "a"), (3, "b"), (3, "c")], [(3, "d"), (4, "e")], [(0, "f"), (3, "g")]]
     merged = by_stamp(*([SimpleNamespace(stamp_ns=stamp, name=name) for stamp, name in items] for items in streams))
     assert "".join(item.name for item in merged) == "fabcdge"
+
+
+def test_columns_that_are_joined_are_those_of_each_in_order() -> None:
+    one, two, none = (PointCloud(points=np.ones((n, 3), np.float32) * n, colors=np.eye(3)[:n]) for n in (1, 2, 0))
+    both = two.joined(none, one)
+    assert (len(both), both.points[:, 0].tolist(), both.points.dtype) == (3, [2, 2, 1], np.float32)
+    assert both.colors.tolist() == [*np.eye(3)[:2].tolist(), np.eye(3)[0].tolist()]
+    assert one.joined().points.tolist() == one.points.tolist()

@@ -38,15 +38,16 @@ def obstacle_spheres(
         return ObstacleSpheres(splats=field_splats(splats, labels), index=np.flatnonzero(is_chosen))
     check_labels(splats)
     count, chosen = int(kept.sum()), splats.select(is_chosen)
-    both = SplatSet(
-        centers=np.concatenate([chosen.centers, balls.centers[kept]]),
-        radii=np.concatenate([chosen.radii, np.full(count, balls.radius, np.float32)]),
-        colors=np.concatenate([chosen.colors, np.full((count, 3), 0.5, np.float32)]),
-        opacities=np.concatenate([chosen.opacities, np.ones(count, np.float32)]),
-        labels=np.concatenate([chosen.labels, balls.labels[kept]]),
-        density=np.concatenate([chosen.density, np.zeros(count, np.float32)]),
+    added = SplatSet(
+        centers=balls.centers[kept],
+        radii=np.full(count, balls.radius, np.float32),
+        colors=np.full((count, 3), 0.5, np.float32),
+        opacities=np.ones(count, np.float32),
+        labels=balls.labels[kept],
+        density=np.zeros(count, np.float32),
     )
-    return ObstacleSpheres(splats=both, index=np.concatenate([np.flatnonzero(is_chosen), np.full(count, NO_SPLAT)]))
+    index = np.concatenate([np.flatnonzero(is_chosen), np.full(count, NO_SPLAT)])
+    return ObstacleSpheres(splats=chosen.joined(added), index=index)
 
 
 def field_splats(splats: SplatSet, labels: Collection[Label] = DEFAULT_LABELS) -> SplatSet:

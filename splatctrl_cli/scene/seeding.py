@@ -128,14 +128,8 @@ def seeds_at(
     points, colors, pixel = _joined(sources)
     levels = cube_levels(points, colors, density.edge, SEED_LEVELS)
     chosen = leaves(levels, density.tolerance)
-    parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)][
-        ::-1
-    ]
-    return Seeds(
-        centers=np.concatenate([part.centers for part in parts]),
-        radii=np.concatenate([part.radii for part in parts]),
-        colors=np.concatenate([part.colors for part in parts]),
-    )
+    parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)]
+    return parts[-1].joined(*parts[-2::-1])
 
 
 def gap_seeds(
