@@ -66,6 +66,7 @@ def _lines(result: ReconstructResult) -> list[str]:
     columns = {
         **{name.replace("_", " "): metrics[name] for name in ("time_steps", "splats")},
         "robot": metrics["robot_splats"],
+        "shell": metrics["shell_splats"],
         **{name: metrics[name] for name in ("added", "relocated", "unmet")},
         **_quality(metrics, sum(result.seconds.values())),
     }

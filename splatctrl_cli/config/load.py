@@ -56,6 +56,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "lambda_reg": 0.02,
             "lambda_opacity": 0.0,
             "depth_loss": "printed",
+            "shell": 0.0,
             "background": "black",
             "hole_opacity": 0.0,
             "min_depth_error": 0.0,

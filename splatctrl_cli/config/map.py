@@ -45,6 +45,10 @@ class SceneConfig(Section, section="scene"):
     lambda_reg: Annotated[float, Within(0, 100, "", "weight of the mean opacity; the paper's 0.02 costs 0.3 dB")] = (
         0.005
     )
+    shell: Annotated[
+        float,
+        Within(0, 1, "", "share of max_splats, beside these, for what lies beyond a robot's reach: rendered only"),
+    ] = 0.1
     background: Annotated[
         str, OneOf(("median", "black"), "colour behind the splats: median of pixels without depth nearby, or black")
     ] = "median"

@@ -31,11 +31,11 @@ from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
 from splatctrl_cli.jobs.simulate import SimulateRequest, SimulateResult, simulate
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.records import JointState, RgbdFrame, SplatSet
+from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, field_slice_picture
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene.render import render
-from splatctrl_cli.scene_files.scene_folder import open_scene
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, open_scene
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_source
 
@@ -256,8 +256,8 @@ def _draw(data: Path, out: Path, threads: int) -> None:
             joints = record
         else:
             newest[record.camera] = record
-    splats = open_scene(out / "scene").splats()
-    rows = [_comparison(frame, splats, threads) for frame in newest.values()]
+    scene = open_scene(out / "scene")
+    rows = [_comparison(frame, scene, threads) for frame in newest.values()]
     comparison_picture(out / "renders.png", rows)
     model = RobotModel.from_urdf(data / "robot.urdf", data / "robot_spheres.yaml")
     assert joints is not None
@@ -273,14 +273,19 @@ def _draw(data: Path, out: Path, threads: int) -> None:
     )
 
 
-def _comparison(frame: RgbdFrame, splats: SplatSet, threads: int) -> ComparisonRow:
-    view = render(splats, frame.intrinsics, frame.T_world_camera, threads=threads)
-    figure = psnr(view.color, frame.color / 255.0, view.opacity >= 0.5)
+def _comparison(frame: RgbdFrame, scene: SceneFolder, threads: int) -> ComparisonRow:
+    camera, splats, shell = (frame.intrinsics, frame.T_world_camera), scene.splats(), scene.shell_at(None)
+    view = render(splats, *camera, threads=threads)
+    is_mapped, depth = view.opacity >= 0.5, view.normalised_depth()
+    if shell is not None:
+        view = render(splats.joined(shell), *camera, threads=threads)
+    view = view.before(scene.background)
+    figure = psnr(view.color, frame.color / 255.0, is_mapped)
     return ComparisonRow(
         title=f"{frame.camera} ({'scoring only' if frame.camera in SCORING else 'training'})",
         figures=f"{figure:.1f} dB on mapped pixels",
         photo=frame.color,
         render=view.color,
         photo_depth=frame.depth,
-        render_depth=view.normalised_depth(),
+        render_depth=depth,
     )

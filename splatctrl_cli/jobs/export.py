@@ -19,7 +19,14 @@ from splatctrl_cli.scene.gaussians import render_gaussians
 from splatctrl_cli.scene.render import Rendering, render
 from splatctrl_cli.splat_files.splat_format import Differences, differences, refuse
 from splatctrl_cli.splat_files.splat_formats import FORMATS, REFERENCE_PLY, SplatFormat, format_of, read_splats
-from splatctrl_cli.splat_files.splats import as_gaussians, as_splats, nearest_splats, read_ply, write_ply
+from splatctrl_cli.splat_files.splats import (
+    as_gaussians,
+    as_splats,
+    check_no_shell,
+    nearest_splats,
+    read_ply,
+    write_ply,
+)
 
 LAYOUT_COMMENTS = frozenset({"splat", "label"})  # say how a PLY holds its values: not true of the next file
 IMAGE_SIZE = (320, 240)
@@ -97,6 +104,7 @@ def export(request: ExportRequest, progress: Progress = SILENT) -> ExportResult:
     if os.path.realpath(out) == os.path.realpath(source):
         raise UsageError(f"{out}: is the input itself", remedy="give another --out")
     splats, comments = read_splats(source)
+    check_no_shell(source, comments)  # most formats would lose what tells it from surfaces
     _check_colors(source, splats)
     selected = splats if request.labels is None else splats.select(np.isin(splats.labels, list(request.labels)))
     if not len(selected):

@@ -219,21 +219,17 @@ class Reconstruction:
 
     def _refine(self, fitter: SceneFitter, console: Progress) -> None:
         total = self.config.scene.refine_iterations
-
         wait = Wait(console, "refines", "iterations", total).announce()
         fitter.descent.heard = wait.step
-
-        def progress(done: int) -> None:
-            self._save_if_due()
-
-        self._record(fitter.refine(total, progress))
+        self._record(fitter.refine(total, lambda _: self._save_if_due()))
         self.snapshot(self.rows[-1].stamp_ns)
         self.is_refined = True
 
     def finish(self) -> None:
         """Write what the end of the log left."""
         assert self.fitter is not None
-        self.writer.finish(self.rows[-1].stamp_ns, self.fitter.splats(), self.fitter.known_voxels())
+        fitter, stamp_ns = self.fitter, self.rows[-1].stamp_ns
+        self.writer.finish(stamp_ns, fitter.splats(), fitter.known_voxels(), fitter.shell_splats())
         self._save(is_last=True)
 
     def metrics(self) -> dict[str, object]:
@@ -252,6 +248,7 @@ class Reconstruction:
             "iterations": self.fitter.descent.num_iterations,
             "splats": last.alive,
             "robot_splats": last.robot,
+            "shell_splats": len(self.fitter.shell_splats() or ()),
             "added": sum(row.added for row in self.rows),
             "relocated": sum(row.relocated for row in self.rows),
             "robot_joints": None if self.robot is None else list(self.robot.joint_names),
@@ -295,7 +292,7 @@ class Reconstruction:
         assert self.fitter is not None
         known, thresholds = self.fitter.known_voxels(), self.config.occupancy
         states = known.grid.states(thresholds.free_below, thresholds.occupied_above)
-        self.writer.snapshot(stamp_ns, self.fitter.splats(), known, states)
+        self.writer.snapshot(stamp_ns, self.fitter.splats(), known, states, self.fitter.shell_splats())
 
     def _save_if_due(self) -> None:
         period = self.config.scene.checkpoint_period
@@ -363,9 +360,10 @@ class Reconstruction:
 
     def _new_fitter(self, workspace: Box) -> SceneFitter:
         scene = self.config.scene if self.source.has_clock else self.config.scene.derived(fill=1.0)
-        human = self.config.human
+        human, seed, threads = self.config.human, self.request.seed, self.request.threads
+        has_shell = self.robot is not None and scene.shell > 0
         return SceneFitter(
-            scene, self.config.occupancy, workspace, human=human, seed=self.request.seed, threads=self.request.threads
+            scene, self.config.occupancy, workspace, human=human, seed=seed, threads=threads, has_shell=has_shell
         )
 
     def _needs_depth(self) -> bool:

@@ -65,8 +65,9 @@ class Scorer:
         stamps = sorted(snapshot.stamp_ns for snapshot in scene.snapshots) if has_clock else []
 
         @lru_cache(maxsize=1)  # a snapshot is read once for all the views it serves
-        def splats_at(stamp_ns: int | None) -> SplatSet | GaussianSet:
-            return final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
+        def splats_at(stamp_ns: int | None) -> tuple[SplatSet | GaussianSet, SplatSet | None]:
+            splats = final_splats(scene) if stamp_ns is None else scene.splats_at(stamp_ns)
+            return splats, scene.shell_at(stamp_ns)
 
         scores = Scores(has_clock=has_clock)
         views = views_to_score(
@@ -91,8 +92,8 @@ class Scorer:
                 scores.skipped.append(view.name)
                 continue
             with stopwatch.stage("score"):
-                splats = splats_at(stamps[num_known - 1] if has_clock and self.newest else None)
-                self._score_one(scores, doubts, view, splats)
+                shown = splats_at(stamps[num_known - 1] if has_clock and self.newest else None)
+                self._score_one(scores, doubts, view, *shown)
             wait.at(len(scores.views))
         self._check(scores)
         scores.doubts += [*self.reference.doubts, *doubts.lines()]
@@ -118,13 +119,15 @@ class Scorer:
                 remedy="is it the same world and the same scene? give the recording that reconstruct was given",
             )
 
-    def _score_one(self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet) -> None:
+    def _score_one(
+        self, scores: Scores, doubts: Doubts, view: View, splats: SplatSet | GaussianSet, shell: SplatSet | None
+    ) -> None:
         frame = view.frame
-        score, row = self._compared(view, frame, splats)
+        score, row = self._compared(view, frame, splats, shell)
         doubts.look(view, row.render, row.mask)
         if self.scene.corrections:
             there = corrected_among(frame, view.training, self.scene.corrections)
-            score = replace(score, corrected=self._compared(view, there, splats)[0])
+            score = replace(score, corrected=self._compared(view, there, splats, shell)[0])
         scores.views.append(score)
         scores.training = view.training
         rank = score.all.psnr if isnan(score.seen.psnr) else score.seen.psnr
@@ -136,13 +139,16 @@ class Scorer:
         scores.extremes[frame.camera] = ends
 
     def _compared(
-        self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet
+        self, view: View, frame: RgbdFrame, splats: SplatSet | GaussianSet, shell: SplatSet | None
     ) -> tuple[ViewScore, ComparisonRow]:
         """What a view comes to where `frame` stands for it."""
         protocol = self.reference.protocol
-        rendering = rendered(splats, frame.intrinsics, frame.T_world_camera, self.threads)
-        rendering = rendering.before(self.scene.background)
+        camera = frame.intrinsics, frame.T_world_camera
+        rendering = rendered(splats, *camera, self.threads)
         depth = rendering.normalised_depth()
+        if isinstance(splats, SplatSet) and shell is not None:  # which has colour and no depth
+            rendering = rendered(splats.joined(shell), *camera, self.threads)
+        rendering = rendering.before(self.scene.background)
         mask = None if self.reference.mask is None else self.reference.mask(frame)
         score = score_view(
             view=view.name,

@@ -38,6 +38,8 @@ def fitter_state(fitter: SceneFitter) -> dict[str, NDArray[np.generic]]:
     arrays |= {"people/voxels": fitter.people.voxels, "people/stamps_ns": fitter.people.stamps_ns}
     arrays["refined"] = _refined_array(fitter.refined)
     arrays |= {f"mounted/{camera}": mask for camera, mask in fitter.mounted.items()}
+    if fitter.shell is not None:
+        arrays |= {f"shell/{name}": array for name, array in fitter.shell.arrays().items()}
     if fitter.descent.background is not None:
         arrays["background"] = np.array(fitter.descent.background)
     if fitter.density is not None:
@@ -63,6 +65,8 @@ def restore_fitter(fitter: SceneFitter, arrays: Arrays) -> None:
     fitter.refined = _refined(arrays["refined"])
     masks = {name.removeprefix("mounted/"): array for name, array in arrays.items() if name.startswith("mounted/")}
     fitter.mounted = {camera: np.asarray(mask, bool) for camera, mask in masks.items()}
+    if fitter.shell is not None:
+        fitter.shell.restore({name.removeprefix("shell/"): a for name, a in arrays.items() if name[:6] == "shell/"})
     if "background" in arrays:
         red, green, blue = (float(value) for value in arrays["background"])
         fitter.descent.background = (red, green, blue)

@@ -25,7 +25,7 @@ from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_con
 from splatctrl_cli.scene.depth_holes import unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.eviction import room_for
-from splatctrl_cli.scene.keyframes import View, Window, halved, make_view
+from splatctrl_cli.scene.keyframes import View, Window, all_halved, make_view
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
@@ -55,8 +55,9 @@ from splatctrl_cli.scene.self_mask import (
     self_mask,
     without_mixed,
 )
+from splatctrl_cli.scene.shell import Shell
 from splatctrl_cli.scene.unrepresented import bare_voxels, unrepresented_voxels
-from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid
+from splatctrl_cli.voxels import Balls, KnownVoxels
 
 
 class SceneFitter:
@@ -75,6 +76,7 @@ class SceneFitter:
         seed: int = 0,
         threads: int = 0,
         device: DeviceFit | None = None,
+        has_shell: bool = False,
     ) -> None:
         check_voxel(config, occupancy)
         self.config = config
@@ -86,6 +88,7 @@ class SceneFitter:
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
         self.people = PeopleMemory((human or HumanConfig()).memory)
         self.window = Window(config)
+        self.shell = Shell(config, occupancy, workspace, seed, self.num_threads) if has_shell else None
         self.num_steps = 0
         self.density: SeedDensity | None = None  # chosen by the first time step that has anything to seed
         self.posture: RobotPosture | None = None
@@ -124,12 +127,14 @@ class SceneFitter:
         hidden = hidden_objects(self.buffer, robot, seen, self.occupancy.config)
         as_they_were = self.buffer.parameters[hidden].copy()
         num_coarse = round(self.config.coarse_share * num_iterations) if is_first else 0
-        self.descent.run(_halved(self.window.schedule(num_coarse, rng)), self.descent.settings())
+        self.descent.run(all_halved(self.window.schedule(num_coarse, rng)), self.descent.settings())
         terms = self.descent.run(self.window.schedule(num_iterations - num_coarse, rng), self.descent.settings())
         self.buffer.parameters[hidden] = as_they_were
         self._prune(robot, views, seen, removed)
         filled += self._show_contact(robot, views, seen)
         filled += self._fill_gaps(views, masks, removed, half=self.num_steps % 2 if self.num_steps else None)
+        if self.shell is not None:
+            self.shell.step(self.window, self.mounted, self.descent.background)
         self.num_steps += 1
         return replace(self._audit(views, filled, removed, terms), **audited(masks))
 
@@ -181,9 +186,9 @@ class SceneFitter:
         """The live splats."""
         return self.buffer.splats(self.num_threads)
 
-    def occupancy_grid(self) -> OccupancyGrid:
-        """The occupancy grid as it is now."""
-        return self.occupancy.grid()
+    def shell_splats(self) -> SplatSet | None:
+        """What lies beyond the workspace, for pictures alone; None without a shell."""
+        return None if self.shell is None else self.shell.splats()
 
     @property
     def unrepresented(self) -> Balls:
@@ -393,8 +398,3 @@ class SceneFitter:
             loss=None if loss is None else round(loss + c.lambda_reg * opacity, 6),
             psnr=None if psnr is None else round(psnr, 4),
         )
-
-
-def _halved(views: Sequence[View]) -> list[View]:
-    small = {id(view): halved(view) for view in views}
-    return [small[id(view)] for view in views]

@@ -74,6 +74,12 @@ def halved(view: View) -> View:
     return View(frame=view.frame, camera=camera, target=halved_target, reach=view.reach)
 
 
+def all_halved(views: Sequence[View]) -> list[View]:
+    """The views, with repetitions, each halved once."""
+    small = {id(view): halved(view) for view in views}
+    return [small[id(view)] for view in views]
+
+
 def _quads(image: NDArray[np.generic]) -> Float32:
     """(..., H, W) -> (..., H / 2, 2, W / 2, 2) float32."""
     height, width = image.shape[-2] // 2, image.shape[-1] // 2

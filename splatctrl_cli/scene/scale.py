@@ -55,7 +55,7 @@ def fitted_to(config: Config, depth: RecordedDepth) -> Config:
     """
     is_found = config.scene.scale == 0
     scale = depth.median / SCALE_DEPTH if is_found else config.scene.scale
-    scene, occupancy = _scaled(config.scene, scale), _scaled(config.occupancy, scale)
+    scene, occupancy = scaled(config.scene, scale), scaled(config.occupancy, scale)
     values: dict[str, float] = {"scale": scale}
     if is_found and scene.radius_depth == 0:
         values["radius_depth"] = depth.median
@@ -68,7 +68,8 @@ def fitted_to(config: Config, depth: RecordedDepth) -> Config:
     return config.derived(scene=scene.derived(**values), occupancy=occupancy.derived(**ranges))
 
 
-def _scaled(section: Lengths, scale: float) -> Lengths:
+def scaled(section: Lengths, scale: float) -> Lengths:
+    """What was left at its default multiplied by the power of `scale` that a length has there."""
     powers, default = POWERS[section.section], type(section)()
     kept = {key: getattr(section, key) for key in powers}
     return section.derived(

@@ -1,6 +1,7 @@
 """Reads the ``scene/`` folder that `SceneWriter` writes.
 
-splats.ply  occupancy.npz  audit.jsonl  snapshots.csv  snapshots/NNNNNN.ply and .npz  checkpoint/state.npz  run.json
+splats.ply  shell.ply  occupancy.npz  audit.jsonl  snapshots.csv  checkpoint/state.npz  run.json
+snapshots/NNNNNN.ply, .shell.ply and .npz
 """
 
 import csv
@@ -27,10 +28,11 @@ from splatctrl_cli.scene_files.voxel_file import (
     read_unrepresented,
 )
 from splatctrl_cli.splat_files.gaussian_ply import read_gaussian_ply
-from splatctrl_cli.splat_files.splats import read_world_splats
+from splatctrl_cli.splat_files.splats import read_shell, read_world_splats
 from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid, SeenVoxels
 
 FORMAT = "splatctrl-scene 1"
+SHELL_FILE = "shell.ply"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +68,11 @@ class Snapshot:
     def splats(self) -> SplatSet:
         """The splats of that moment."""
         return read_world_splats(self._checked(self.path))
+
+    @property
+    def shell_path(self) -> Path:
+        """What lay beyond the robot's reach then; not there where nothing did."""
+        return self.path.with_suffix(f".{SHELL_FILE}")
 
     @property
     def _has_voxels(self) -> bool:
@@ -301,6 +308,13 @@ class SceneFolder:
             return self.snapshot_at(stamp_ns).unrepresented()
         path = self.path / "occupancy.npz"
         return read_unrepresented(self.parts.checked(path)) if self.parts.has(path) else None
+
+    def shell_at(self, stamp_ns: int | None) -> SplatSet | None:
+        """What lay beyond the robot's reach, for pictures alone, of `snapshot_at` or (None) at the end; None where
+        nothing did, and in a scene of an older version.
+        """
+        path = self.path / SHELL_FILE if stamp_ns is None else self.snapshot_at(stamp_ns).shell_path
+        return read_shell(self.parts.checked(path)) if self.parts.has(path) else None
 
     def splats_at(self, stamp_ns: int) -> SplatSet:
         """The splats of `snapshot_at`."""

@@ -15,9 +15,9 @@ from splatctrl_cli.files.arrays import read_arrays, savez
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import flush, sha256, write_durably
 from splatctrl_cli.records import SplatSet, UInt8
-from splatctrl_cli.scene_files.scene_folder import Snapshot
+from splatctrl_cli.scene_files.scene_folder import SHELL_FILE, Snapshot
 from splatctrl_cli.scene_files.voxel_file import write_occupancy, write_states
-from splatctrl_cli.splat_files.splats import write_ply
+from splatctrl_cli.splat_files.splats import SHELL, write_ply
 from splatctrl_cli.voxels import KnownVoxels
 
 CHECKPOINT = "checkpoint/state.npz"
@@ -82,6 +82,7 @@ class SceneWriter:
         self._num_flushed = len(self.snapshots)
         kept = {self._audit, self.folder / CHECKPOINT}
         kept |= {path for s in self.snapshots for path in (s.path, s.occupancy_path)}
+        kept |= {self.folder / name for name in checkpoint.parts or {}}
         missing = sorted(path.name for path in kept if not path.is_file())
         if missing or self._audit.stat().st_size < checkpoint.audit_bytes:
             raise InputError(
@@ -112,18 +113,26 @@ class SceneWriter:
         """The rows written so far."""
         return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
 
-    def snapshot(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8) -> None:
-        """Write the splats as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels known then."""
+    def snapshot(
+        self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, states: UInt8, shell: SplatSet | None = None
+    ) -> None:
+        """Write the splats and the shell as they are at `stamp_ns`, and the `states` (X, Y, Z) of the voxels then."""
         snapshot = Snapshot(stamp_ns=stamp_ns, path=self._place(len(self.snapshots)), num_splats=len(splats))
         write_ply(snapshot.path, splats, self.comments | {"stamp_ns": str(stamp_ns)})
         write_states(snapshot.occupancy_path, known, states)
+        self._write_shell(snapshot.shell_path, stamp_ns, shell)
         self.snapshots.append(snapshot)
+
+    def _write_shell(self, path: Path, stamp_ns: int, shell: SplatSet | None) -> None:
+        """A file of its own: what reads splats does not meet it."""
+        if shell is not None and len(shell):
+            write_ply(path, shell, self.comments | SHELL | {"stamp_ns": str(stamp_ns)})
 
     def checkpoint(self, progress: Mapping[str, Any], state: State, *, is_last: bool = False) -> None:
         """Replace the checkpoint in one step, when all that it counts on is on disk; the last is compressed."""
         flush(self._audit)
         for snapshot in self.snapshots[self._num_flushed :]:
-            for path in (snapshot.path, snapshot.occupancy_path):
+            for path in filter(Path.is_file, (snapshot.path, snapshot.occupancy_path, snapshot.shell_path)):
                 flush(path)
                 self._digests[path.relative_to(self.folder).as_posix()] = sha256(path)
         self._num_flushed = len(self.snapshots)
@@ -136,9 +145,10 @@ class SceneWriter:
         arrays = {"progress": np.array(json.dumps(header)), **state}
         write_durably(self.folder / CHECKPOINT, lambda path: savez(path, arrays, level=1 if is_last else 0))
 
-    def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels) -> None:
-        """Write the final splats, the occupancy grid and the index of snapshots."""
+    def finish(self, stamp_ns: int, splats: SplatSet, known: KnownVoxels, shell: SplatSet | None = None) -> None:
+        """Write the final splats and shell, the occupancy grid and the index of snapshots."""
         write_ply(self.folder / "splats.ply", splats, self.comments | {"stamp_ns": str(stamp_ns)})
+        self._write_shell(self.folder / SHELL_FILE, stamp_ns, shell)
         write_occupancy(self.folder / "occupancy.npz", known)
         with (self.folder / "snapshots.csv").open("w", newline="", encoding="utf-8") as stream:
             table = csv.writer(stream, lineterminator="\n")

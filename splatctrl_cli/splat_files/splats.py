@@ -25,6 +25,7 @@ NAMES = (
 DTYPE = np.dtype([*((name, "<f4") for name in NAMES), ("label", "u1"), ("density", "<f4")])
 REQUIRED = tuple(name for name in NAMES if name not in {"nx", "ny", "nz"} and not name.startswith("rot_"))
 METRES = ("m", "metre", "metres", "meter", "meters")
+SHELL = {"shell": "beyond the robot's reach, rendered only: no surface that distances are kept to"}
 HEADER_COMMENTS = {
     "frame": "world",
     "units": "metre",
@@ -134,7 +135,10 @@ def read_world_splats(path: Path) -> SplatSet:
 
 
 def check_world(path: Path, comments: Mapping[str, str]) -> None:
-    """Raise InputError for comments that name other units than metres or another frame than the world."""
+    """Raise InputError for comments that name other units than metres or another frame than the world, or that tell
+    of splats that have no distances: those of a shell.
+    """
+    check_no_shell(path, comments)
     for key, known in (("units", METRES), ("frame", ("world",))):
         said = comments.get(key)
         if said is not None and said.lower() not in known:
@@ -142,6 +146,23 @@ def check_world(path: Path, comments: Mapping[str, str]) -> None:
                 f"{path}: comment '{key}: {said}': expected {known[0]}",
                 remedy="distances are in metres in the world: transform the splats, and correct the comment",
             )
+
+
+def check_no_shell(path: Path, comments: Mapping[str, str]) -> None:
+    """Raise InputError where the comments tell that the splats are rendered only."""
+    if SHELL.keys() & comments.keys():
+        raise InputError(
+            f"{path}: the shell beyond the robot's reach, which is rendered only and has no distances",
+            remedy="give the scene's folder, or its splats.ply",
+        )
+
+
+def read_shell(path: Path) -> SplatSet:
+    """The splats of a shell. Raises as `read_ply`, and InputError for splats that are none."""
+    splats, comments = read_ply(path)
+    if not SHELL.keys() <= comments.keys():
+        raise InputError(f"{path}: expected a shell, got other splats", remedy="reconstruct the scene again")
+    return splats
 
 
 def splats_of(ply: PlyFile) -> SplatSet:

@@ -89,6 +89,9 @@ class FakeScene:
     def unrepresented_at(self, stamp_ns: int | None) -> None:
         return None
 
+    def shell_at(self, stamp_ns: int | None) -> SplatSet | None:
+        return None
+
     def splats(self) -> SplatSet:
         return wall()
 

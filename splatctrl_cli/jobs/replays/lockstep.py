@@ -213,7 +213,7 @@ class Lockstep:
         num_taken, known = self._known
         if num_taken != len(self._fitted.rows):
             assert self._fitted.fitter is not None
-            known = known_space(self._fitted.fitter.occupancy_grid())
+            known = known_space(self._fitted.fitter.occupancy.grid())
             self._known = len(self._fitted.rows), known
         return known(points)
 

@@ -1,0 +1,151 @@
+"""The shell: coarse splats of what lies beyond the robot's reach, which is rendered and nothing else.
+
+The map of the workspace leaves out the pixels whose depth lies beyond it. The shell is fitted to these alone and
+beside the map: it has a budget of its own and no occupancy, and the map has the same bytes without it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.config.fixed import SCALE_DEPTH, SHELL_ITERATIONS, SHELL_UNMET
+from splatctrl_cli.records import Bool, Box, SplatSet
+from splatctrl_cli.scene.buffer import COLOR, SplatBuffer
+from splatctrl_cli.scene.descent import Descent
+from splatctrl_cli.scene.keyframes import View, Window
+from splatctrl_cli.scene.removal import seen_through
+from splatctrl_cli.scene.render import Color
+from splatctrl_cli.scene.scale import scaled
+from splatctrl_cli.scene.seeding import (
+    Candidates,
+    SeedDensity,
+    add_mask,
+    candidates,
+    density_for,
+    seeds_at,
+    thinned,
+    thinning,
+)
+
+Masked = Sequence[tuple[View, Bool]]
+
+
+def beyond(view: View, min_range: float, mounted: Bool | None = None) -> Bool:
+    """Pixels (H, W) whose depth, of `min_range` [m] or more, the map leaves out: it lies outside the workspace. Those
+    that show what is `mounted` on the camera are not among them.
+    """
+    depth = view.target.depth
+    left_out = (depth > 0) & (depth >= min_range) & (view.target.counted == 0)
+    return np.asarray(left_out if mounted is None else left_out & ~mounted)
+
+
+class Shell:
+    """`scene.shell` of `scene.max_splats`, beside these, for what the views show beyond the workspace.
+
+    Its lengths are those of a map of what lies as far away as the first such pixels do in the median (`scale`).
+    """
+
+    def __init__(
+        self, config: SceneConfig, occupancy: OccupancyConfig, workspace: Box, seed: int, num_threads: int
+    ) -> None:
+        self.config = config.derived(max_splats=max(round(config.shell * config.max_splats), 1))
+        self.occupancy, self.workspace = occupancy, workspace
+        self.buffer = SplatBuffer(self.config.max_splats)
+        self.num_steps = 0
+        self._seed, self._num_threads, self._see_through = seed, num_threads, occupancy.see_through
+        self._begin(0.0, None)
+
+    def _begin(self, depth: float, density: SeedDensity | None, num_iterations: int = 0) -> None:
+        """Choose the lengths by the median depth [m], 0 where nothing was seen yet, and how densely to seed."""
+        self._depth, self._density, config = depth, density, self.config
+        if density is not None:
+            config = scaled(config, depth / SCALE_DEPTH).derived(radius_depth=depth)
+            least, most = config.min_radius, config.max_radius  # of which either may have been set
+            widest = max(least, most, config.radius_per_edge * density.edge)  # else far walls have holes
+            config = config.derived(max_radius=widest)
+            self._see_through = scaled(self.occupancy, depth / SCALE_DEPTH).see_through
+        self._scaled = config
+        self._descent = Descent(config, self.buffer, self._seed, self._num_threads)
+        self._descent.num_iterations = num_iterations
+
+    def step(self, views: Window, mounted: Mapping[str, Bool], background: Color | None) -> None:
+        """Take in the views of a time step: remove by the newest, add, optimise. The views stay as they are."""
+        rng = np.random.default_rng([self._seed, self.num_steps])
+        self.num_steps += 1
+        self._remove(views.newest)
+        every = [*views.newest, *views.keyframes]
+        masks = [beyond(view, self.occupancy.min_range, mounted.get(view.frame.camera)) for view in every]
+        shown = [(view, mask) for view, mask in zip(every, masks, strict=True) if mask.any()]
+        if not shown:
+            return
+        config, is_first = self.config, self._density is None
+        self._add(shown)
+        iterations = round(SHELL_ITERATIONS * (config.first_iterations if is_first else config.iterations_per_step))
+        far = Window(config)
+        far.newest = [replace(v, target=replace(v.target, counted=m.astype(np.uint8))) for v, m in shown]
+        self._descent.background = background
+        self._descent.run(far.schedule(iterations, rng), self._descent.settings())
+        self._remove(views.newest)
+
+    def splats(self) -> SplatSet:
+        """Those that stand, none of them with its centre in the workspace."""
+        return self.buffer.splats(self._num_threads)
+
+    def _add(self, shown: Masked) -> None:
+        """Put splats where the shell explains nothing; where too many find no slot it begins again, coarser, over all
+        that is in view and what it holds of what no longer is.
+        """
+        asked = [(view, add_mask(view.frame, self._descent.rendering(view), m, self._scaled)) for view, m in shown]
+        most = SHELL_UNMET * self.config.max_splats
+        if self._density is not None and self._fill(_sources(asked), self._density) <= most:
+            return
+        stands = self.buffer.is_alive.copy()
+        held = Candidates(
+            points=self.buffer.centers[stands],
+            colors=self.buffer.parameters[stands, COLOR],
+            pixels=self.buffer.radii[stands],
+        )
+        self.buffer.kill(stands)
+        depth = float(np.median(np.concatenate([view.target.depth[mask] for view, mask in shown])))
+        sources, config = [*_sources(shown), held], scaled(self.config, depth / SCALE_DEPTH)
+        density = density_for(sources, max(int(config.fill * config.max_splats), 1), config)
+        self._begin(depth, density, self._descent.num_iterations)
+        self._fill(sources, density)
+
+    def _fill(self, sources: Sequence[Candidates], density: SeedDensity) -> int:
+        """Put splats on the sources, and say how many found no slot."""
+        if not any(len(source) for source in sources):
+            return 0
+        seeds = seeds_at(sources, self.buffer.centers[self.buffer.is_alive], density, self._scaled)
+        return self.buffer.fill(seeds, self.config.initial_opacity).unmet
+
+    def _remove(self, views: Sequence[View]) -> None:
+        """Those that moved into the workspace, became faint, or that some view sees through."""
+        gone = self.workspace.contains(self.buffer.centers) | (self.buffer.opacities < self.config.min_opacity)
+        for view in views:
+            gone |= seen_through(self.buffer.centers, view.frame, self._see_through, view.nearest)
+        self.buffer.kill(self.buffer.is_alive & gone)
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Its whole state, by name."""
+        d = self._density
+        density = (0.0, 0.0, 0) if d is None else (d.edge, d.tolerance, d.num_candidates)
+        counters = (self.num_steps, self._descent.num_iterations)
+        return self.buffer.arrays() | {"begun": np.array([*counters, self._depth, *density])}
+
+    def restore(self, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+        """Take over the state of a shell with the same configuration, seed and workspace."""
+        for name, array in self.buffer.arrays().items():
+            array[...] = arrays[name]
+        num_steps, num_iterations, depth, edge, tolerance, num_candidates = (float(x) for x in arrays["begun"])
+        self.num_steps = int(num_steps)
+        density = SeedDensity(edge=edge, tolerance=tolerance, num_candidates=int(num_candidates))
+        self._begin(depth, density if edge else None, int(num_iterations))
+
+
+def _sources(masked: Masked) -> list[Candidates]:
+    every = thinning(mask for _, mask in masked)
+    return [candidates(view.frame, thinned(mask, every)) for view, mask in masked]
