@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from splatctrl_cli.calibration.pose_refinement import gray_view, on_surface, overlapping, scaled
+from splatctrl_cli.calibration.gray_views import gray_view, on_surface, overlapping, scaled
 from splatctrl_cli.calibration.views import depth_sigma
 from splatctrl_cli.config import fixed
 from splatctrl_cli.geometry import invert_transform, project

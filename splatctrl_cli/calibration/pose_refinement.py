@@ -1,35 +1,22 @@
-"""The poses of views of a still scene, put right by what the views see of each other: depth and colour together.
+"""The poses of views of a still scene and the bends of their depths, put right by what the views see of each other.
 
-Gauss-Newton on all views at once, in float64: distances of the points of one view from the surface of another (Chen
-and Medioni, Object modelling by registration, 1992), and differences of their grey values (Park, Zhou and Koltun,
-Colored point cloud registration revisited, 2017), each weighed by Tukey's biweight.
+Gauss-Newton on all views at once, in float64, of depth and colour together: distances of the points of one view
+from the surface of another (Chen and Medioni, Object modelling by registration, 1992), and differences of their
+grey values (Park, Zhou and Koltun, Colored point cloud registration revisited, 2017), each weighed by Tukey's
+biweight.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 
-from splatctrl_cli.calibration.unknowns import POSE, transform_of, twist_between
-from splatctrl_cli.calibration.views import DepthView, by_twists, depth_sigma, landed
+from splatctrl_cli.calibration.depth_bend import BentViews, unbent
+from splatctrl_cli.calibration.gray_views import GrayView, gray_view, on_surface, overlapping, rows_of, scaled
+from splatctrl_cli.calibration.unknowns import HELD, POSE, transform_of, twist_between
 from splatctrl_cli.config import fixed
-from splatctrl_cli.geometry import invert_transform, project, strided_lens, transform_points
-from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
-
-EVERY = slice(None)
-
-
-@dataclass(frozen=True, kw_only=True)
-class GrayView:
-    """A view whose lengths are divided by the recording's scale: grey values (h, w) in [0, 1], their slope (h, w, 2)
-    by pixel, and the grey values of the view's points (K,).
-    """
-
-    depth: DepthView
-    gray: Float32
-    slope: Float32
-    points_gray: Float64
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.records import Bool, Float64, RgbdFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,70 +74,81 @@ def refined_poses(frames: Sequence[RgbdFrame], scale: float = 1.0, free: Bool | 
     )  # fmt: skip
 
 
-def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
-    """The view of a frame at no more than about `REFINE_ROWS` rows."""
-    stride = max(1, round(frame.depth.shape[0] / fixed.REFINE_ROWS))
-    depth = cv2.medianBlur(np.ascontiguousarray(frame.depth / np.float32(scale)), 5)
-    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
-    gray = cv2.GaussianBlur(gray, (0, 0), fixed.REFINE_BLUR * stride)
-    gray, depth = (np.ascontiguousarray(image[::stride, ::stride]) for image in (gray, depth))
-    small = replace(
-        frame,
-        depth=np.asarray(depth, np.float32),
-        color=np.zeros((*depth.shape, 3), np.uint8),
-        intrinsics=strided_lens(frame.intrinsics, stride),
-        human=None,
-        valid=None,
-    )
-    view = DepthView.of(small, fixed.REFINE_POINTS, 2)
-    slope = np.stack([cv2.Sobel(gray, cv2.CV_32F, dx, 1 - dx, ksize=3) / 8 for dx in (1, 0)], axis=-1)
-    u, v = np.round(project(view.lens, view.points)).astype(np.int64).T
-    return GrayView(
-        depth=view, gray=np.asarray(gray, np.float32), slope=slope, points_gray=gray[v, u].astype(np.float64)
-    )
+@dataclass(frozen=True, kw_only=True)
+class FoundBends:
+    """By camera, the bend of its depth, offsets of disparity (rows, columns) [1/m]; none where it does not tell.
+
+    gains: by how much, as shares, the bend that each half of the views tells brings the other half together. unlike:
+    the cameras of which the halves tell different ones.
+    """
+
+    grids: Mapping[str, Float64] = field(default_factory=dict)
+    gains: tuple[float, ...] = ()
+    unlike: tuple[str, ...] = ()
 
 
-def scaled(T: Float64, factor: float) -> Float64:
-    """A pose (4, 4) whose lengths are multiplied."""
-    there = T.copy()
-    there[:3, 3] *= factor
-    return there
+def depth_bends(frames: Sequence[RgbdFrame], refined: RefinedPoses, scale: float = 1.0) -> FoundBends:
+    """The bends of the cameras' depths, solved for with the poses, once these are `refined`.
+
+    A bend counts where it also holds for views that it was not found from: every second view of a camera tells one,
+    and the others must lie nearer each other by `BEND_GAIN` with it than with poses alone; and the other way round.
+    Cameras of fewer than `BEND_VIEWS` views, and those of which the halves tell bends less alike than `BEND_ALIKE`,
+    have none.
+    """
+    views = [replace(f, T_world_camera=T) for f, T in zip(frames, refined.T_world_camera, strict=True)]
+    views = [view for view, held in zip(views, refined.is_held, strict=True) if not held]
+    names = [view.camera for view in views]
+    rank = np.array([names[:k].count(name) for k, name in enumerate(names)])
+    chosen = [name for name in dict.fromkeys(names) if names.count(name) >= fixed.BEND_VIEWS]
+    if not chosen or refined.after < fixed.BEND_FROM * fixed.SCALE_DEPTH * scale:
+        return FoundBends()
+    halves = [[view for view, of_half in zip(views, rank % 2 == k, strict=True) if of_half] for k in (0, 1)]
+    told = [_joint(half, chosen, scale) for half in halves]
+    alike = {name: _likeness(told[0][name], told[1][name]) for name in chosen}
+    unlike = tuple(name for name in chosen if alike[name] < fixed.BEND_ALIKE)
+    chosen = [name for name in chosen if name not in unlike]
+    if not chosen:
+        return FoundBends(unlike=unlike)
+    gains = []
+    for half, grids in zip(halves, reversed(told), strict=True):
+        kept = {name: grids[name] for name in chosen}
+        without, with_ = (refined_poses(part, scale).after for part in (half, freed(half, kept)))
+        gains.append(1 - with_ / without if without else 0.0)
+    is_told = min(gains) > fixed.BEND_GAIN
+    return FoundBends(grids=_joint(views, chosen, scale) if is_told else {}, gains=tuple(gains), unlike=unlike)
 
 
-def overlapping(
-    views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool
-) -> list[tuple[int, int]]:
-    """Of each view among those that take part, those others that see most of its points; one of the two is free."""
-    chosen = np.flatnonzero(among).tolist()
-    middles = np.array([transform_points(poses[i], np.median(views[i].depth.points, axis=0)[None])[0]
-                        if len(views[i].depth.points) else np.full(3, np.inf) for i in chosen])  # fmt: skip
-    pairs: list[tuple[int, int]] = []
-    for number, i in enumerate(chosen):
-        apart = np.linalg.norm(middles - middles[number], axis=1)
-        near = [
-            j for j in (chosen[k] for k in np.argsort(apart, kind="stable")) if j != i and (is_free[i] or is_free[j])
-        ][: fixed.REFINE_ASKED]
-        shares = np.array([_share(views[i], views[j], poses[i], poses[j]) for j in near])
-        best = np.argsort(-shares, kind="stable")[: fixed.REFINE_NEIGHBOURS]
-        pairs += [(i, near[k]) for k in best if shares[k] > fixed.REFINE_OVERLAP]
-    return pairs
+def freed(frames: Sequence[RgbdFrame], grids: Mapping[str, Float64]) -> list[RgbdFrame]:
+    """The frames, their depth freed of the bends of their cameras, where there is one."""
+    return [unbent(frame, grids[frame.camera]) if frame.camera in grids else frame for frame in frames]
 
 
-def _share(a: GrayView, b: GrayView, T_a: Float64, T_b: Float64) -> float:
-    """Of some points of view a, how many land near the surface of view b."""
-    points = transform_points(invert_transform(T_b) @ T_a, a.depth.points[::8])
-    lands, surface, _ = landed(points, b.depth)
-    return (
-        float(np.mean(lands & (np.abs(points[:, 2] - surface[:, 2]) < fixed.REFINE_FARTHEST[0])))
-        if len(points)
-        else 0.0
-    )
+def _joint(frames: Sequence[RgbdFrame], cameras: Sequence[str], scale: float) -> dict[str, Float64]:
+    """The bends (rows, columns) [1/m] of some cameras, with the poses of all frames solved for at once."""
+    views = [gray_view(frame, scale) for frame in frames]
+    poses = [scaled(frame.T_world_camera, 1 / scale) for frame in frames]
+    every = np.ones(len(views), np.bool_)
+    numbers = [cameras.index(frame.camera) if frame.camera in cameras else HELD for frame in frames]
+    bends = BentViews(recorded=views, cameras=numbers)
+    _solved(views, poses, overlapping(views, poses, every, every), every, bends)
+    return dict(zip(cameras, np.round(bends.grids / scale, 7), strict=True))
+
+
+def _likeness(a: Float64, b: Float64) -> float:
+    """The cosine between two grids."""
+    return float(np.vdot(a, b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
 def _solved(
-    views: Sequence[GrayView], recorded: Sequence[Float64], pairs: Sequence[tuple[int, int]], is_free: Bool
+    views: Sequence[GrayView],
+    recorded: Sequence[Float64],
+    pairs: Sequence[tuple[int, int]],
+    is_free: Bool,
+    bends: BentViews | None = None,
 ) -> list[Float64]:
-    """The poses after rounds in which the residuals that count get smaller."""
+    """The poses after rounds in which the residuals that count get smaller; of the views freed of `bends`, which are
+    solved with them.
+    """
     poses, column = list(recorded), np.cumsum(is_free) - 1
     size = POSE * int(is_free.sum())
     prior = np.tile(np.repeat(1 / np.square(fixed.REFINE_PRIOR), 3), int(is_free.sum()))
@@ -161,82 +159,33 @@ def _solved(
         for k, i in enumerate(free):
             g[POSE * k : POSE * (k + 1)] = twist_between(recorded[i], poses[i])
         g *= prior
+        bent = None if bends is None else bends.equations(size, len(pairs))
+        now = views if bends is None else bends.now
         for i, j in pairs:
-            J, r = _rows(views[i], views[j], invert_transform(poses[j]) @ poses[i], width)
+            rows = rows_of(now[i], now[j], invert_transform(poses[j]) @ poses[i], width)
             own, other = (POSE * column[k] + np.arange(POSE) for k in (i, j))
             keep = np.repeat([is_free[i], is_free[j]], POSE)
-            columns, J = np.concatenate([own, other])[keep], J[:, keep]
+            columns, J = np.concatenate([own, other])[keep], rows.by_twists[:, keep]
             H[np.ix_(columns, columns)] += J.T @ J
-            g[columns] += J.T @ r
-        step = -np.linalg.solve(H, g).reshape(-1, POSE)
+            g[columns] += J.T @ rows.residuals
+            if bent is not None:
+                bent.add(i, j, rows, columns, J)
+        if bent is not None:
+            H, g = bent.joined(H, g)
+        step = -np.asarray(np.linalg.solve(H, g), np.float64)
         for k, i in enumerate(free):
-            poses[i] = poses[i] @ transform_of(step[k])
-        if number >= len(fixed.REFINE_WIDTHS) and np.abs(step).max() < fixed.REFINE_STILL:
+            poses[i] = poses[i] @ transform_of(step[POSE * k : POSE * (k + 1)])
+        if bends is not None:
+            bends.move(step[size:])
+        if number >= len(fixed.REFINE_WIDTHS) and np.abs(step[:size]).max() < fixed.REFINE_STILL:
             break
     return poses
-
-
-def _rows(a: GrayView, b: GrayView, T: Float64, width: float) -> tuple[Float64, Float64]:
-    """Derivatives (R, 12) by a turn and move of view a and of view b, and residuals (R,), in sigmas and weighed, of
-    every second point of view a that lands on view b, at T (4, 4) from there.
-    """
-    points = a.depth.points[::2]
-    there, lands, surface, normals, distance = on_surface(a, b, T, slice(None, None, 2))
-    sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(points[:, 2]))
-    lands &= np.abs(distance) < width * sigma
-    own, there, normals, surface = points[lands], there[lands], normals[lands], surface[lands]
-    sigma, distance = sigma[lands], distance[lands]
-    weight = (1 - np.square(distance / (width * sigma))) / sigma
-    J, r = by_twists(own, there, normals, T) * weight[:, None], distance * weight
-    if width > fixed.REFINE_COLOR_FROM or len(own) < fixed.REFINE_FEWEST:
-        return J, r
-    z = there[:, 2]
-    exact = project(b.depth.lens, there)
-    u, v = np.round(exact).astype(np.int64).T
-    slope = b.slope[v, u].astype(np.float64)
-    value = b.gray[v, u] + np.einsum("ki,ki->k", slope, exact - np.stack([u, v], axis=1))
-    difference = _alike(value, a.points_gray[::2][lands])
-    lens = b.depth.lens
-    along = slope * [lens.fx, lens.fy] / z[:, None]
-    gradient = np.column_stack([along, -np.einsum("ki,ki->k", along, there[:, :2]) / z])
-    deviation = difference / fixed.REFINE_COLOR
-    counts = np.abs(deviation) < fixed.REFINE_CUT
-    weight = np.where(counts, 1 - np.square(deviation / fixed.REFINE_CUT), 0.0) / fixed.REFINE_COLOR
-    return (
-        np.vstack([J, by_twists(own, there, gradient, T) * weight[:, None]]),
-        np.concatenate([r, difference * weight]),
-    )
-
-
-def on_surface(
-    a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
-) -> tuple[Float64, Bool, Float64, Float64, Float64]:
-    """Of some points of view a, at T (4, 4) from view b: where they are there (K, 3), which of them land on a surface
-    that faces as theirs (K,), its points and normals (K, 3), and their distances (K,) from it.
-    """
-    there = transform_points(T, a.depth.points[which])
-    lands, surface, normals = landed(there, b.depth)
-    lands &= np.einsum("ki,ki->k", a.depth.point_normals[which] @ T[:3, :3].T, normals) > fixed.REFINE_ALIKE
-    return there, lands, surface, normals, np.asarray(np.einsum("ki,ki->k", there - surface, normals))
-
-
-def _alike(value: Float64, other: Float64) -> Float64:
-    """Differences (K,) of grey values, less a gain and an offset between the two images, found robustly."""
-    gain, offset = 1.0, float(np.median(value - other))
-    for _ in range(2):
-        near = np.abs(value - gain * other - offset) < fixed.REFINE_CUT * fixed.REFINE_COLOR
-        if near.sum() < fixed.REFINE_FEWEST:
-            break
-        x, y = other[near] - other[near].mean(), value[near] - value[near].mean()
-        gain = float(np.clip((x @ y) / max(x @ x, 1e-9), *fixed.REFINE_GAINS))
-        offset = float(np.median(value[near] - gain * other[near]))
-    return value - gain * other - offset
 
 
 def _distances(
     views: Sequence[GrayView], poses: Sequence[Float64], pairs: Sequence[tuple[int, int]], *, odd: bool
 ) -> float:
-    """The median distance of points from the surfaces of other views: those that `_rows` leaves out where `odd`."""
+    """The median distance of points from the surfaces of other views: those that `rows_of` leaves out where `odd`."""
     found = [np.zeros(0)]
     for i, j in pairs:
         T = invert_transform(poses[j]) @ poses[i]

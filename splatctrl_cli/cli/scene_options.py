@@ -55,7 +55,7 @@ def reconstruct_options(add: Options, parser: Parser) -> None:
     )
     add_declare(more)
     add_disagreement(more)
-    more("--refine-poses", "put the views of a still scene where they see the same surfaces, by depth and colour")
+    more("--refine-poses", "put views of a still scene where they show the same surfaces; free depth of its bend")
     more("--refine-exposure", "give the views of a still scene one brightness and white balance")
     add_device(parser)
 

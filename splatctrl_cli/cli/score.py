@@ -119,7 +119,10 @@ def _lines_of_views(report: Mapping[str, Any]) -> list[str]:
     if "chamfer" in metrics:
         lines += _cloud_lines(metrics, report["protocol"]["definitions"]["cloud"])
     if "psnr_all_corrected" in columns:
-        lines.append("corrected: all pixels, at the pose and exposure that the view has among the training views")
+        lines.append(
+            "corrected: all pixels, at the pose and exposure that the view has among the training views, its depth"
+            " freed of the bend that theirs was"
+        )
     lines.append("in front: share of the pixels seen whose rendered depth is over 3 cm before the recorded one")
     if metrics["free_mass"] is not None:
         lines.append(f"{100 * metrics['free_mass']:.2f}% of the splats' mass is in space observed free")

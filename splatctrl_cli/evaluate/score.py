@@ -47,7 +47,7 @@ PROTOCOL = {
     "lpips": "of the whole view, colours scaled to [-1, 1]; lpips_published: with render and photo set to one colour "
     "outside the mask",
     "corrected": "the same figures with the view's pose or exposure corrected by depth and colour of the training "
-    "views, where theirs were; the render takes no part in it",
+    "views, and its depth freed of its camera's bend, where theirs were; the render takes no part in it",
     "free_mass": "share of the mass of the final splats (opacity times radius squared, the robot's left out) whose "
     "centre lies in a voxel that was observed free; null where the scene has no occupancy grid",
 }
@@ -78,7 +78,7 @@ REGION = {
     "in_front": BAD_SHARE,
 }  # of the pixels of a region
 REGIONS = ("seen", "all", "masked")
-CORRECTED = "_corrected"  # of a figure of a view whose pose or exposure was
+CORRECTED = "_corrected"  # of a figure of a view whose pose, exposure or depth was
 CORRECTABLE = tuple(f"{name}_{region}" for name in REGION if name != "depth_pixels" for region in REGIONS)
 
 
@@ -89,7 +89,7 @@ class ViewScore:
     Where there is a mask: `masked` is its region, ssim_published and lpips_published are those of the view with the
     rest filled; without one, ssim_published is there where the protocol has one. lpips where weights were given.
     size: width and height [px]. corrected: the same view at
-    its corrected pose and exposure.
+    its corrected pose and exposure, its depth freed of its camera's bend.
     """
 
     view: str

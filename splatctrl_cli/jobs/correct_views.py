@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from splatctrl_cli.calibration.depth_bend import largest_share, unbent
 from splatctrl_cli.calibration.exposure import exposed, exposure_gains
-from splatctrl_cli.calibration.pose_refinement import refined_poses
+from splatctrl_cli.calibration.pose_refinement import FoundBends, depth_bends, freed, refined_poses
 from splatctrl_cli.config import fixed
+from splatctrl_cli.datasets.folder_views import HOLDOUT
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs.progress import Progress
 from splatctrl_cli.records import Float64, RecordSource, RgbdFrame
@@ -41,8 +43,11 @@ class Corrections:
                 remedy="leave it out; 'splatctrl calibrate' places the cameras of a log",
             )
 
-    def of(self, frames: Sequence[RgbdFrame], name: str, console: Progress) -> tuple[list[RgbdFrame], dict[str, Any]]:
-        """The corrected frames, and what ``run.json`` says of it. name: of the recording.
+    def of(
+        self, frames: Sequence[RgbdFrame], name: str, console: Progress, *, has_robot: bool = False
+    ) -> tuple[list[RgbdFrame], dict[str, Any]]:
+        """The corrected frames, and what ``run.json`` says of it. name: of the recording. has_robot: what is judged
+        by the map, so that depth stays as it was measured.
 
         Raises InputError where there is no depth that could tell.
         """
@@ -55,7 +60,7 @@ class Corrections:
         rows = [{"camera": frame.camera, "stamp_ns": frame.stamp_ns} for frame in frames]
         moved = list(frames)
         if self.poses:
-            moved, poses = _posed(moved, scale, console)
+            moved, poses = _posed(moved, scale, has_robot, console)
             told |= poses
             rows = [
                 row | {"T_world_camera": f.T_world_camera.ravel().tolist()}
@@ -69,9 +74,16 @@ class Corrections:
         return moved, told | {"corrected_views": rows}
 
 
-def _posed(frames: list[RgbdFrame], scale: float, console: Progress) -> tuple[list[RgbdFrame], dict[str, Any]]:
-    found = refined_poses(frames, scale)
-    before, after, median = (1e3 * value for value in (found.before, found.after, float(np.median(found.moved))))
+def _posed(
+    recorded: list[RgbdFrame], scale: float, has_robot: bool, console: Progress
+) -> tuple[list[RgbdFrame], dict[str, Any]]:
+    found, frames = refined_poses(recorded, scale), recorded
+    recorded_apart, apart = found.before, found.after  # of the depths as recorded
+    bends = FoundBends() if has_robot else depth_bends(frames, found, scale)
+    if bends.grids:
+        frames = freed(recorded, bends.grids)
+        found = refined_poses(frames, scale)
+    before, after, median = (1e3 * value for value in (recorded_apart, found.after, float(np.median(found.moved))))
     if found.is_better:
         console.log(
             f"poses: {len(frames)} views moved by {median:.1f} mm in the median, at most"
@@ -80,18 +92,42 @@ def _posed(frames: list[RgbdFrame], scale: float, console: Progress) -> tuple[li
         )
     else:
         console.log(
-            f"poses: stay as recorded: surfaces of two views are {before:.2f} mm apart, and no move betters it"
+            f"poses: stay as recorded: surfaces of two views are {after:.2f} mm apart, and no move betters it"
         )
     return [replace(f, T_world_camera=T) for f, T in zip(frames, found.T_world_camera, strict=True)], {
         "pose_residual": found.after,
         "poses": {
-            "residual_before": found.before,
+            "residual_before": recorded_apart,
             "moved_median": float(np.median(found.moved)),
             "moved_max": float(found.moved.max()),
             "turned_max": float(found.turned.max()),
             "held": [f"{f.camera} at {f.stamp_ns}" for f, held in zip(frames, found.is_held, strict=True) if held],
         },
+    } | ({} if has_robot else _told(bends, scale, apart, found.after, console))
+
+
+def _told(bends: FoundBends, scale: float, apart: float, after: float, console: Progress) -> dict[str, Any]:
+    """What is said of the bends; apart, after [m]: the views by poses alone, and with the bends."""
+    depth = scale * fixed.SCALE_DEPTH
+    rows = {
+        camera: {
+            "largest": largest_share(grid, depth),
+            "residual_before": apart,
+            "residual_after": after,
+            "gains": list(bends.gains),
+            "offsets": grid.tolist(),
+        }
+        for camera, grid in bends.grids.items()
     }
+    for camera, row in rows.items():
+        console.log(
+            f"depth: {camera}: freed of a bend, the same in all its views, of at most {100 * row['largest']:.1f} % at"
+            f" {depth:.2f} m: surfaces of two views are {1e3 * after:.2f} mm apart, {1e3 * apart:.2f} by poses alone"
+        )
+    if not rows and (bends.gains or bends.unlike):
+        console.log("depth: stays as recorded: no bend that one half of the views tells holds for the other")
+    largest = max((row["largest"] for row in rows.values()), default=0.0)
+    return {"depth_bend": largest} | ({"depth_bends": rows} if rows else {})
 
 
 def _gains(frames: list[RgbdFrame], scale: float, console: Progress) -> Float64:
@@ -123,6 +159,8 @@ def corrected_among(
         return frame
     scale, free = depth.median / fixed.SCALE_DEPTH, np.arange(len(others) + 1) == 0
     respects = next(iter(corrections.values()))
+    bend = _bend_of(frame, others, corrections)
+    frame = frame if bend is None else unbent(frame, bend)
     if respects.T_world_camera is not None:
         T = refined_poses([frame, *others], scale, free).T_world_camera[0]
         frame = replace(frame, T_world_camera=T)
@@ -131,6 +169,16 @@ def corrected_among(
     return frame
 
 
+def _bend_of(
+    frame: RgbdFrame, others: Sequence[RgbdFrame], corrections: Mapping[tuple[str, int], ViewCorrection]
+) -> Float64 | None:
+    """That of the frame's own camera; of a view held out, that of the only camera with its intrinsics."""
+    cameras = {other.camera for other in others if other.intrinsics == frame.intrinsics}
+    camera = frame.camera if frame.camera != HOLDOUT or len(cameras) != 1 else cameras.pop()
+    return next((row.bend for (name, _), row in corrections.items() if name == camera), None)
+
+
 def _applied(frame: RgbdFrame, row: ViewCorrection) -> RgbdFrame:
+    frame = frame if row.bend is None else unbent(frame, row.bend)
     frame = frame if row.T_world_camera is None else replace(frame, T_world_camera=row.T_world_camera)
     return frame if row.gain is None else exposed(frame, row.gain)

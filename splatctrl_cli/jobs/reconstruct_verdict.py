@@ -24,6 +24,7 @@ GATED = {
     "self_mask_residual_mm": Scale(unit="mm", better=Better.LOWER, absolute=0.5, relative=0.02),
     "inside_robot_points": FAULTS,
     "pose_residual": Scale(unit="m", better=Better.LOWER, absolute=5e-4, relative=0.05),
+    "depth_bend": DESCRIBES,
     "exposure_spread": DESCRIBES,
     "loss": Scale(better=Better.LOWER, absolute=1e-3, relative=0.02),
     "psnr": DECIBELS,
@@ -57,6 +58,7 @@ def reconstruct_verdict(made: Reconstructed, require: Sequence[str]) -> Verdict:
         [
             *reasons,
             *_held(metrics),
+            *_unbent(metrics),
             *loss_notes(made.loss),
             *gate_reasons(require, {name: metrics[name] for name in GATED}, counts),
         ],
@@ -85,6 +87,12 @@ def _held(metrics: Mapping[str, Any]) -> Iterator[Reason]:
     if held:
         shown = ", ".join(held[:3]) + (f" and {len(held) - 3} more" if len(held) > 3 else "")
         yield noted("poses", f"not put right, too far off or seen by no other view: {shown}")
+
+
+def _unbent(metrics: Mapping[str, Any]) -> Iterator[Reason]:
+    """The cameras whose depth is not what they measured, and by how much."""
+    for camera, bend in metrics.get("depth_bends", {}).items():
+        yield noted("depth", f"{camera}: freed of a bend of at most {100 * bend['largest']:.1f} % of the depth")
 
 
 def loss_notes(loss: LossReport) -> Iterator[Reason]:

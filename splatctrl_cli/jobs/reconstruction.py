@@ -182,7 +182,9 @@ class Reconstruction:
                 self.first_frames[frame.camera] = first_frame(frame).as_dict()
         if self.fitter is None:
             self._fit_to(RecordedDepth.of(step.frames), console)
-            frames, self.corrected = self.request.corrections.of(step.frames, self.source.name, console)
+            frames, self.corrected = self.request.corrections.of(
+                step.frames, self.source.name, console, has_robot=self.robot is not None
+            )
             step = replace(step, frames=tuple(frames))
         self.agreement.check(step, self.config.occupancy, console)
         if self.fitter is None:
@@ -264,7 +266,7 @@ class Reconstruction:
             "mounted_share": {camera: float(mask.mean()) for camera, mask in self.fitter.mounted.items()},
             "frames_without_depth": sum(row.without_depth for row in self.rows),
             "disagreement": self.agreement.disagreement,
-            **dict.fromkeys(("pose_residual", "exposure_spread")),
+            **dict.fromkeys(("pose_residual", "depth_bend", "exposure_spread")),
             **self.corrected,
             **self_mask_metrics(self.rows),
             "carried": self.declared.carried_uses(),

@@ -7,7 +7,7 @@ snapshots/NNNNNN.ply, .shell.ply and .npz
 import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from splatctrl_cli.config import fixed
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.digests import Parts
 from splatctrl_cli.files.output import PARTIAL
@@ -84,12 +85,14 @@ class Snapshot:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCorrection:
-    """Where a training view is instead of where it was recorded, T_world_camera (4, 4), and by what its red, green
-    and blue are divided, gain (3,); None where they were taken as recorded.
+    """Where a training view is instead of where it was recorded, T_world_camera (4, 4), by what its red, green and
+    blue are divided, gain (3,), and of what its depth was freed, bend (rows, columns) [1/m]; None where they were
+    taken as recorded.
     """
 
     T_world_camera: Float64 | None
     gain: Float64 | None
+    bend: Float64 | None = None
 
 
 T = TypeVar("T")
@@ -138,6 +141,13 @@ def _corrections(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, int], Vie
     }
 
 
+def _bends(bends: Mapping[str, Mapping[str, Any]]) -> dict[str, Float64]:
+    grids = {str(camera): np.array(bend["offsets"], np.float64) for camera, bend in bends.items()}
+    if any(grid.shape != fixed.BEND_GRID or not np.isfinite(grid).all() for grid in grids.values()):
+        raise ValueError(f"not {fixed.BEND_GRID} finite offsets")
+    return grids
+
+
 def _inside(name: str) -> str:
     """The name itself. Raises ValueError where it leads out of its folder."""
     if Path(name).is_absolute() or ".." in Path(name).parts:
@@ -176,12 +186,13 @@ class SceneFolder:
 
     @property
     def made_from(self) -> dict[str, Any]:
-        """Digests of the files that were read (`inputs`), the first frame of each camera, and the robot's joints and
-        links: what tells whether it belongs to a log and a robot.
+        """Digests of the files that were read (`inputs`), the first frame of each camera, the robot's joints and
+        links, and by how much depth was corrected, where it was: what tells whether it belongs to a log and a robot.
         """
         metrics = self.run.get("metrics", {})
+        bend = {"depth_bend": metrics["depth_bend"]} if metrics.get("depth_bend") else {}
         kept = {name: metrics[name] for name in ("first_frames", "robot_joints", "robot_links") if name in metrics}
-        return {"inputs": self.run.get("inputs", {}), **kept}
+        return {"inputs": self.run.get("inputs", {}), **kept, **bend}
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -216,7 +227,8 @@ class SceneFolder:
     @property
     def corrections(self) -> dict[tuple[str, int], ViewCorrection]:
         """Of training views, by camera and stamp; empty where they were taken as recorded."""
-        return self._metric("corrected_views", _corrections, ())
+        rows, bends = self._metric("corrected_views", _corrections, ()), self._metric("depth_bends", _bends, {})
+        return {key: replace(row, bend=bends.get(key[0])) for key, row in rows.items()}
 
     @property
     def is_anisotropic(self) -> bool:

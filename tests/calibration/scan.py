@@ -1,4 +1,4 @@
-"""The views of the sample's scan, and the same with poses that are off."""
+"""The views of the sample's scan, and the same with poses that are off and depths that are bent."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from splatctrl_cli.calibration.depth_bend import bends_alone, unbent
 from splatctrl_cli.calibration.unknowns import transform_of
+from splatctrl_cli.config import fixed
 from splatctrl_cli.jobs.open_recording import RecordingRequest, open_to_train
 from splatctrl_cli.records import Float64, RgbdFrame
 
@@ -34,3 +36,17 @@ def gains_of(num: int) -> Float64:
     rng = np.random.default_rng(5)
     gains = np.exp(rng.uniform(-0.2, 0.2, (num, 1)) + rng.uniform(-0.05, 0.05, (num, 3)))
     return np.asarray(gains / np.exp(np.log(gains).mean(axis=0)))
+
+
+def a_bend(largest: float) -> Float64:
+    """A bend (rows, columns), a saddle, of so much [1/m] at most."""
+    rows, columns = fixed.BEND_GRID
+    v, u = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
+    alone = bends_alone()
+    shape = alone @ (alone.T @ (u * u - 0.5 * v * v + 0.5 * u * v).ravel())
+    return (largest * shape / np.abs(shape).max()).reshape(rows, columns)
+
+
+def bent(views: Sequence[RgbdFrame], bend: Float64) -> list[RgbdFrame]:
+    """The views as a camera with that bend would have recorded them."""
+    return [unbent(view, -bend) for view in views]

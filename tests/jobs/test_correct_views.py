@@ -6,19 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.calibration.depth_bend import unbent
 from splatctrl_cli.calibration.exposure import exposed
 from splatctrl_cli.config import load_config
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.jobs import score_reference
-from splatctrl_cli.jobs.correct_views import Corrections
+from splatctrl_cli.jobs.correct_views import Corrections, corrected, corrected_among
 from splatctrl_cli.jobs.open_recording import RecordingRequest
 from splatctrl_cli.jobs.reconstruct import reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.score import ScoreRequest, score
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.scene_files.scene_folder import SceneFolder
-from tests.calibration.scan import disturbed, gains_of, views_of
+from splatctrl_cli.scene_files.scene_folder import SceneFolder, ViewCorrection
+from tests.calibration.scan import a_bend, bent, disturbed, gains_of, views_of
 from tests.jobs.wall import FakeSource
 
 SMALL = [
@@ -63,6 +64,49 @@ def test_a_view_held_out_is_scored_where_it_was_recorded_and_where_it_belongs(
     scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
     assert scored.metrics["psnr_all_corrected"] > scored.metrics["psnr_all"] + 2.0  # type: ignore[operator]
     assert scored.metrics["depth_median_all_corrected"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+
+
+def test_a_bent_depth_is_freed_in_the_map_and_in_the_corrected_figures_alone(
+    views: list[RgbdFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    off = held_out(bent(views, a_bend(0.05)))
+    result = reconstruct(request(off, tmp_path / "scene"))
+    bend = result.metrics["depth_bends"]["camera"]
+    assert result.metrics["depth_bend"] == bend["largest"] > 0.02
+    assert bend["residual_after"] < 0.1 * bend["residual_before"]
+    assert any("freed of a bend of at most" in reason.sentence for reason in result.verdict.reasons)
+    scene = SceneFolder(tmp_path / "scene")
+    assert scene.made_from["depth_bend"] == bend["largest"]
+    for frame in off:
+        if frame.camera != "holdout":
+            free = corrected(frame, scene.corrections)
+            assert np.array_equal(free.depth, unbent(frame, np.array(bend["offsets"])).depth)
+    monkeypatch.setattr(score_reference, "open_source", lambda *_, **__: FakeSource(frames=off, has_clock=False))
+    scored = score(ScoreRequest(scene=tmp_path / "scene", recording=RecordingRequest(path=tmp_path)))
+    assert scored.metrics["depth_median_all_corrected"] < 0.5 * scored.metrics["depth_median_all"]  # type: ignore[operator]
+
+
+def test_where_a_robot_is_judged_depth_stays_as_it_was_recorded(
+    views: list[RgbdFrame], tmp_path: Path, sample_data: Path
+) -> None:
+    asked = request(bent(views, a_bend(0.05)), tmp_path / "scene")
+    robot = sample_data / "tabletop"
+    result = reconstruct(replace(asked, urdf=robot / "robot.urdf", spheres=robot / "robot_spheres.yaml"))
+    assert result.metrics["pose_residual"] > 0
+    assert result.metrics["depth_bend"] is None
+    assert "depth_bends" not in result.metrics
+
+
+def test_of_a_camera_that_did_not_train_no_bend_is_known(views: list[RgbdFrame]) -> None:
+    other = replace(views[0], camera="other")
+    bend = ViewCorrection(T_world_camera=None, gain=None, bend=a_bend(0.05))
+    known = {(view.camera, view.stamp_ns): bend for view in views[1:]}
+    assert np.array_equal(corrected_among(other, views[1:], known).depth, other.depth)
+    held = replace(other, camera="holdout")
+    assert np.array_equal(corrected_among(held, views[1:], known).depth, unbent(held, a_bend(0.05)).depth)
+    rig = [replace(view, camera=f"cam{k % 2}") for k, view in enumerate(views[1:])]
+    of_rig = {(view.camera, view.stamp_ns): bend for view in rig}
+    assert np.array_equal(corrected_among(held, rig, of_rig).depth, held.depth)
 
 
 def test_right_views_give_the_same_splats_with_and_without(views: list[RgbdFrame], tmp_path: Path) -> None:

@@ -1,0 +1,171 @@
+"""What views of a still scene see of each other, by depth and by grey value, and what it changes with."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from splatctrl_cli.calibration.views import DepthView, Index, by_twists, depth_sigma, landed
+from splatctrl_cli.config import fixed
+from splatctrl_cli.geometry import invert_transform, project, strided_lens, transform_points
+from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
+
+EVERY = slice(None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrayView:
+    """A view whose lengths are divided by the recording's scale: grey values (h, w) in [0, 1], their slope (h, w, 2)
+    by pixel, and the grey values of the view's points (K,).
+    """
+
+    depth: DepthView
+    gray: Float32
+    slope: Float32
+    points_gray: Float64
+
+
+def gray_view(frame: RgbdFrame, scale: float) -> GrayView:
+    """The view of a frame at no more than about `REFINE_ROWS` rows."""
+    stride = max(1, round(frame.depth.shape[0] / fixed.REFINE_ROWS))
+    depth = cv2.medianBlur(np.ascontiguousarray(frame.depth / np.float32(scale)), 5)
+    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
+    gray = cv2.GaussianBlur(gray, (0, 0), fixed.REFINE_BLUR * stride)
+    gray, depth = (np.ascontiguousarray(image[::stride, ::stride]) for image in (gray, depth))
+    small = replace(
+        frame,
+        depth=np.asarray(depth, np.float32),
+        color=np.zeros((*depth.shape, 3), np.uint8),
+        intrinsics=strided_lens(frame.intrinsics, stride),
+        human=None,
+        valid=None,
+    )
+    view = DepthView.of(small, fixed.REFINE_POINTS, 2)
+    slope = np.stack([cv2.Sobel(gray, cv2.CV_32F, dx, 1 - dx, ksize=3) / 8 for dx in (1, 0)], axis=-1)
+    u, v = np.round(project(view.lens, view.points)).astype(np.int64).T
+    return GrayView(
+        depth=view, gray=np.asarray(gray, np.float32), slope=slope, points_gray=gray[v, u].astype(np.float64)
+    )
+
+
+def scaled(T: Float64, factor: float) -> Float64:
+    """A pose (4, 4) whose lengths are multiplied."""
+    there = T.copy()
+    there[:3, 3] *= factor
+    return there
+
+
+def overlapping(
+    views: Sequence[GrayView], poses: Sequence[Float64], among: Bool, is_free: Bool
+) -> list[tuple[int, int]]:
+    """Of each view among those that take part, those others that see most of its points; one of the two is free."""
+    chosen = np.flatnonzero(among).tolist()
+    middles = np.array([transform_points(poses[i], np.median(views[i].depth.points, axis=0)[None])[0]
+                        if len(views[i].depth.points) else np.full(3, np.inf) for i in chosen])  # fmt: skip
+    pairs: list[tuple[int, int]] = []
+    for number, i in enumerate(chosen):
+        apart = np.linalg.norm(middles - middles[number], axis=1)
+        near = [
+            j for j in (chosen[k] for k in np.argsort(apart, kind="stable")) if j != i and (is_free[i] or is_free[j])
+        ][: fixed.REFINE_ASKED]
+        shares = np.array([_share(views[i], views[j], poses[i], poses[j]) for j in near])
+        best = np.argsort(-shares, kind="stable")[: fixed.REFINE_NEIGHBOURS]
+        pairs += [(i, near[k]) for k in best if shares[k] > fixed.REFINE_OVERLAP]
+    return pairs
+
+
+def _share(a: GrayView, b: GrayView, T_a: Float64, T_b: Float64) -> float:
+    """Of some points of view a, how many land near the surface of view b."""
+    points = transform_points(invert_transform(T_b) @ T_a, a.depth.points[::8])
+    lands, surface, _ = landed(points, b.depth)
+    return (
+        float(np.mean(lands & (np.abs(points[:, 2] - surface[:, 2]) < fixed.REFINE_FARTHEST[0])))
+        if len(points)
+        else 0.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """Residuals (R,), in sigmas and weighed, and how they change with a turn and move of view a and of view b (R,
+    12), and with the logarithm of the depth of view a's point number `own` (R,) and of view b's pixel number
+    `other` (R,).
+    """
+
+    residuals: Float64
+    by_twists: Float64
+    own: Index
+    by_own: Float64
+    other: Index
+    by_other: Float64
+
+
+def rows_of(a: GrayView, b: GrayView, T: Float64, width: float) -> Rows:
+    """Of every second point of view a that lands on view b, at T (4, 4) from there."""
+    number = np.arange(0, len(a.depth.points), 2)
+    there, lands, surface, normals, distance = on_surface(a, b, T, slice(None, None, 2))
+    sigma = np.hypot(depth_sigma(there[:, 2]), depth_sigma(a.depth.points[number, 2]))
+    lands &= np.abs(distance) < width * sigma
+    number, there, normals, surface = number[lands], there[lands], normals[lands], surface[lands]
+    own, sigma, distance = a.depth.points[number], sigma[lands], distance[lands]
+    weight = (1 - np.square(distance / (width * sigma))) / sigma
+    lens, z = b.depth.lens, there[:, 2]
+    exact = project(lens, there)
+    u, v = np.round(exact).astype(np.int64).T
+    depth = Rows(
+        residuals=distance * weight,
+        by_twists=by_twists(own, there, normals, T) * weight[:, None],
+        own=number,
+        by_own=_stretched(own, normals, T) * weight,
+        other=v * b.gray.shape[1] + u,
+        by_other=-np.einsum("ki,ki->k", normals, surface) * weight,
+    )
+    if width > fixed.REFINE_COLOR_FROM or len(own) < fixed.REFINE_FEWEST:
+        return depth
+    slope = b.slope[v, u].astype(np.float64)
+    value = b.gray[v, u] + np.einsum("ki,ki->k", slope, exact - np.stack([u, v], axis=1))
+    difference = _alike(value, a.points_gray[number])
+    along = slope * [lens.fx, lens.fy] / z[:, None]
+    gradient = np.column_stack([along, -np.einsum("ki,ki->k", along, there[:, :2]) / z])
+    deviation = difference / fixed.REFINE_COLOR
+    counts = np.abs(deviation) < fixed.REFINE_CUT
+    weight = np.where(counts, 1 - np.square(deviation / fixed.REFINE_CUT), 0.0) / fixed.REFINE_COLOR
+    return Rows(
+        residuals=np.concatenate([depth.residuals, difference * weight]),
+        by_twists=np.vstack([depth.by_twists, by_twists(own, there, gradient, T) * weight[:, None]]),
+        own=np.tile(depth.own, 2),
+        by_own=np.concatenate([depth.by_own, _stretched(own, gradient, T) * weight]),
+        other=np.tile(depth.other, 2),
+        by_other=np.concatenate([depth.by_other, np.zeros(len(own))]),
+    )
+
+
+def _stretched(own: Float64, gradient: Float64, T: Float64) -> Float64:
+    """How a value with a gradient (K, 3), T (4, 4) from there, changes with the logarithm of points' depth (K,)."""
+    return np.asarray(np.einsum("ki,ki->k", gradient @ T[:3, :3], own))
+
+
+def on_surface(
+    a: GrayView, b: GrayView, T: Float64, which: slice = EVERY
+) -> tuple[Float64, Bool, Float64, Float64, Float64]:
+    """Of some points of view a, at T (4, 4) from view b: where they are there (K, 3), which of them land on a surface
+    that faces as theirs (K,), its points and normals (K, 3), and their distances (K,) from it.
+    """
+    there = transform_points(T, a.depth.points[which])
+    lands, surface, normals = landed(there, b.depth)
+    lands &= np.einsum("ki,ki->k", a.depth.point_normals[which] @ T[:3, :3].T, normals) > fixed.REFINE_ALIKE
+    return there, lands, surface, normals, np.asarray(np.einsum("ki,ki->k", there - surface, normals))
+
+
+def _alike(value: Float64, other: Float64) -> Float64:
+    """Differences (K,) of grey values, less a gain and an offset between the two images, found robustly."""
+    gain, offset = 1.0, float(np.median(value - other))
+    for _ in range(2):
+        near = np.abs(value - gain * other - offset) < fixed.REFINE_CUT * fixed.REFINE_COLOR
+        if near.sum() < fixed.REFINE_FEWEST:
+            break
+        x, y = other[near] - other[near].mean(), value[near] - value[near].mean()
+        gain = float(np.clip((x @ y) / max(x @ x, 1e-9), *fixed.REFINE_GAINS))
+        offset = float(np.median(value[near] - gain * other[near]))
+    return value - gain * other - offset
