@@ -92,6 +92,10 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda s: of_run(s, metrics={"robot_joints": JOINTS, "robot_links": {"cell": [0, 0, 0, 1, 1, 1, 6]}}),
         "another robot, with link cell, which this one lacks",
     ),
+    "depth that no sensor measured": (
+        lambda s: of_run(s, metrics={"depth_bend": 0.02}),
+        "depth corrected by up to 2.0 %",
+    ),
     "robot of an earlier version": (lambda s: of_run(s, metrics={"robot_joints": JOINTS}), "kept the joints alone"),
     "with a calibration": (
         lambda s: of_run(s, inputs={"--calibration cell.toml": "1" * 64}),

@@ -68,7 +68,7 @@ def made_from_mismatches(
     """How a scene or a field made from that (`SceneFolder.made_from`) does not belong to a log and a robot.
 
     By the digests of files of the same names and of the calibration, each training camera's first frame, and the
-    joints and links of the robot that it was told apart from.
+    joints and links of the robot that it was told apart from; and whether it rests on depth as it was recorded.
     """
     files, digests = made_from.get("inputs", {}), source.digests()
     other, recorded = changed_files(files, digests), made_from.get("first_frames")
@@ -86,6 +86,12 @@ def made_from_mismatches(
     if other:
         yield Mismatch(
             sentence=f"{path} was made from another recording: {'; '.join(other[:3])}", remedy="reconstruct this log"
+        )
+    if made_from.get("depth_bend"):
+        yield Mismatch(
+            sentence=f"{path} rests on depth corrected by up to {100 * made_from['depth_bend']:.1f} %, which no"
+            " sensor measured",
+            remedy="reconstruct with --urdf or without --refine-poses: depth stays as recorded",
         )
     if robot := _robot_difference(made_from, model):
         yield Mismatch(
