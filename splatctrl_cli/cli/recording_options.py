@@ -11,6 +11,7 @@ from splatctrl_cli.cli.options import (
     add_packages,
     add_seed,
     add_source,
+    numbers,
     pose,
 )
 from splatctrl_cli.cli.parser import Options, Parser, real, whole
@@ -31,6 +32,8 @@ def simulate_options(add: Options, parser: Parser) -> None:
     )
     add("--free", "free space: floor and walls, no table and nothing on it")
     add("--person", "a walking person with masks, instead of the standing cylinder")
+    cylinder = "where the standing cylinder is, and its radius [m] (default: 0.42,0.08,0.06)"
+    add("--visitor X,Y,RADIUS", cylinder, numbers)
     shared = "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal"
     add("--human-arm", shared, ("near-pickup", "near-goal"))
     drawn = "things on one or two tables, a shelf, or one without a divider, by the seed, and a way through it"

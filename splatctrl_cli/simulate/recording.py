@@ -32,7 +32,7 @@ class RecordingOptions:
     with_person: a walking person with masks, instead of the standing cylinder. human_arm: one of
     `shared_workspace.PLACES`, instead of both: the table shared with a person's arm, whose visit the seed draws.
     is_free: floor and walls alone, without the table and what is on it. environment: one of `ENVIRONMENTS`, which the
-    seed draws, seen by `num_cameras`.
+    seed draws, seen by `num_cameras`. visitor: x, y and radius [m] of the standing cylinder.
     color_rays: 0 to 4 rays for a pixel's colour beside the one for its depth.
     """
 
@@ -47,6 +47,7 @@ class RecordingOptions:
     is_free: bool = False
     environment: str | None = None
     num_cameras: int = 4
+    visitor: tuple[float, ...] = tabletop.VISITOR
     color_rays: int = 4
 
     def __post_init__(self) -> None:
@@ -69,6 +70,12 @@ class RecordingOptions:
         if self.environment not in (None, *ENVIRONMENTS) or not 2 <= self.num_cameras <= 6:
             kinds = ", ".join(ENVIRONMENTS)
             raise UsageError(f"--environment: expected one of {kinds}, and 2 to 6 --num-cameras")
+        if len(self.visitor) != 3 or not 0.001 <= self.visitor[2] <= 1 or max(map(abs, self.visitor[:2])) > 5:
+            given = ",".join(f"{value:g}" for value in self.visitor)
+            raise UsageError(f"--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got {given}")
+        has_none = self.with_person or self.human_arm is not None or self.is_free or self.environment is not None
+        if self.visitor != tabletop.VISITOR and has_none:
+            raise UsageError("--visitor: expected no --person, --human-arm, --free or --environment")
         if self.seed < 0:
             raise UsageError(f"--seed: expected 0 or more, got {self.seed}")
 
@@ -98,7 +105,9 @@ class Scene:
         span = round(options.duration_s * 1e9)
         third = (START_NS + span // 3, START_NS + 2 * span // 3)
         num_steps = max(round(options.duration_s * options.fps / 3), 1)
-        temporary = tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third)]
+        temporary = (
+            tabletop.person(*third, num_steps) if options.with_person else [tabletop.visitor(*third, options.visitor)]
+        )
         return cls._with(tabletop.furniture(), tabletop.things(), temporary, motion)
 
     @classmethod

@@ -34,6 +34,7 @@ WAYPOINTS = (
     (0.80, 0.30, 0.00, -2.00, 0.00, 2.30, 1.57),
 )
 
+VISITOR = (0.42, 0.08, 0.06)  # [m] x, y and radius of the cylinder that stands there for a while
 NUM_VIEWS = 8
 VIEW_SIZE = (256, 208)  # width, height [px]
 MIDDLE = (0.60, 0.02, 0.06)  # [m] the middle of the things
@@ -61,11 +62,11 @@ def things() -> list[Primitive]:
     ]
 
 
-def visitor(from_ns: int, to_ns: int) -> Primitive:
-    """The obstacle that is there for a while only."""
-    return _cylinder(
-        "visitor", 0.06, 0.30, (0.42, 0.08, 0.15), _texture("stripes", 0.06, "grape", 2), from_ns=from_ns, to_ns=to_ns
-    )
+def visitor(from_ns: int, to_ns: int, place: Sequence[float] = VISITOR) -> Primitive:
+    """The obstacle that is there for a while only; place: x, y and radius [m]."""
+    x, y, radius = place
+    texture = _texture("stripes", 0.06, "grape", 2)
+    return _cylinder("visitor", radius, 0.30, (x, y, 0.15), texture, from_ns=from_ns, to_ns=to_ns)
 
 
 def person(from_ns: int, to_ns: int, num_steps: int) -> list[Primitive]:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,6 +80,15 @@ def test_the_visitor_comes_after_a_third_and_leaves_after_two(exact: Recording) 
     stamps = [exact.start_ns + int(second * 1e9) for second in (0.9, 1.1, 1.9, 2.1)]
     inside = [bool(distance_to(exact.primitives, middle, stamp)[0] < 0) for stamp in stamps]
     assert inside == [False, True, True, False]
+
+
+def test_the_visitor_stands_where_it_is_asked_to(robot: RobotModel) -> None:
+    options = RecordingOptions(visitor=(0.5, -0.1, 0.09))
+    visitor = Recording(options, robot).primitives[-1]
+    assert (visitor.T_world_shape[:3, 3].tolist(), visitor.size) == ([0.5, -0.1, 0.15], (0.09, 0.30))
+    assert [p.name for p in Recording(options, robot).primitives] == [
+        p.name for p in Recording(RecordingOptions(), robot).primitives
+    ]
 
 
 def test_training_images_have_contrast_and_the_arm_is_in_sight(exact: Recording, frames: list[RgbdFrame]) -> None:
@@ -178,11 +188,14 @@ def test_textures_stay_between_their_colours_and_are_smooth(pattern: str) -> Non
         ({"width": 8}, "--width: expected 16 to 4096 px, got 8"),
         ({"noise": "loud"}, "--noise: expected one of none, realsense, got loud"),
         ({"seed": -1}, "--seed"),
+        ({"visitor": (0.4, 0.1)}, "--visitor: expected X,Y within 5 m and RADIUS from 0.001 to 1 m, got 0.4,0.1"),
+        ({"visitor": (0.4, 0.1, 0.0)}, "--visitor: expected X,Y"),
+        ({"visitor": (0.4, 0.1, 0.1), "is_free": True}, "--visitor: expected no --person"),
     ],
 )
-def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
+def test_options_out_of_range_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        RecordingOptions(**options)  # type: ignore[arg-type]
+        RecordingOptions(**options)
 
 
 def truth_of(recording: Recording, path: Path) -> Truth:
