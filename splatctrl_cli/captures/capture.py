@@ -26,7 +26,7 @@ from splatctrl_cli.logs.joint_topics import (
 )
 from splatctrl_cli.logs.messages import metres
 from splatctrl_cli.logs.robot_description import RobotDescription
-from splatctrl_cli.logs.source_options import CALIBRATION, SourceOptions
+from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask
 from splatctrl_cli.records import (
@@ -64,7 +64,8 @@ class CaptureSource:
         self.world_frame = str(header["world_frame"])
         self.has_clock = bool(header["has_clock"])
         self.made_of = frozenset(header["sources"].values())  # sha256
-        self._calibration = {name: value for name, value in header["sources"].items() if name.startswith(CALIBRATION)}
+        applied = (CALIBRATION, PERTURB)
+        self._applied = {name: value for name, value in header["sources"].items() if name.startswith(applied)}
         self.joint_names = tuple(header["joint_names"])
         self._cameras: dict[str, dict[str, Any]] = header["cameras"]
         self.cameras = tuple(self._cameras) if options.cameras is None else options.cameras
@@ -109,8 +110,8 @@ class CaptureSource:
         return ((int(row["stamp_ns"]), row["camera"], _pose(row)) for row in self._rows)
 
     def digests(self) -> dict[str, str]:
-        """sha256 of SHA256SUMS, which covers every file, and of the calibration that is applied."""
-        return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS"), **self._calibration}
+        """sha256 of SHA256SUMS, which covers every file, and what was applied to it."""
+        return {f"{self.name}/SHA256SUMS": sha256(self._path / "SHA256SUMS"), **self._applied}
 
     def __len__(self) -> int:
         """Frames that `stored_at` knows."""

@@ -107,6 +107,8 @@ def add_source(add: Options) -> None:
     add("--depth-scale M", "metres per count of depth (default: 0.001)", real(1e-9, 1e3, "m"))
     add("--pairing-tolerance S", "colour to depth, seconds", real(0, 3600, "s"), 0.02)
     add("--calibration FILE.toml", "what calibrate wrote: poses, depths and clock of this recording", Path)
+    errors = "read frames with errors: depth-noise (m at 1 m), pose-error (m), pose-turn (degrees); seed of these"
+    add("--perturb NAME=VALUE ...", errors)
     add("--stamps", "a log's times: those of the headers, or of logging", ("header", "log"), "header")
     add("--joint-topic TOPIC", "JointState topic (default: /joint_states)")
     add("--root DIR", "folder of the images that a .toml describes", Path)
@@ -173,19 +175,21 @@ def source_options(args: argparse.Namespace) -> SourceOptions:
         intrinsics=dict(_intrinsics(text) for text in args.intrinsics),
         pairing_tolerance_s=args.pairing_tolerance,
         holdout=_names(args.holdout),
+        perturb=dict(_number_of("--perturb", text) for text in args.perturb),
     )
 
 
 def locked_joints(args: argparse.Namespace) -> dict[str, float]:
     """Values by joint of ``--lock JOINT=VALUE``. Raises UsageError for a value that is not a number."""
-    locked = {}
-    for assignment in args.lock:
-        name, _, text = assignment.partition("=")
-        value = several(text)
-        if len(value) != 1:
-            raise UsageError(f"--lock {assignment}: expected JOINT=VALUE, got {text!r} for the value")
-        locked[name] = value[0]
-    return locked
+    return dict(_number_of("--lock", text, "JOINT") for text in args.lock)
+
+
+def _number_of(option: str, assignment: str, what: str = "NAME") -> tuple[str, float]:
+    name, _, text = assignment.partition("=")
+    value = several(text)
+    if len(value) != 1:
+        raise UsageError(f"{option} {assignment}: expected {what}=VALUE, got {text!r} for the value")
+    return name, value[0]
 
 
 def names_of(text: str, choices: Mapping[str, Any] | tuple[str, ...], option: str) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
-from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_journal import JOURNAL, read_identity
 from splatctrl_cli.captures.capture_pack import pack_capture, unpack_capture
 from splatctrl_cli.captures.capture_writer import CaptureSummary, write_capture
@@ -18,9 +17,8 @@ from splatctrl_cli.evaluate.verdict import DAMAGED
 from splatctrl_cli.files.output import Stopwatch, output_path, partial_path, write_run
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.jobs.resume import check_same_run, told_how_to_go_on
-from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.sources.calibrated import CalibratedSource
+from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.sources.source import logged_descriptions, open_session
 
 
@@ -90,7 +88,7 @@ def ingest(request: IngestRequest, progress: Progress = SILENT) -> IngestResult:
     with stopwatch.stage("survey"):
         source = open_session(request.paths, options)
         topics = None
-        if isinstance(source, RosLogSource | CaptureSource | CalibratedSource):
+        if isinstance(source, LOGGED):
             topics = source.joint_topics
     if set(source.cameras) == {HOLDOUT}:
         given = ",".join(options.cameras or ())

@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.progress import SILENT, Progress
 from splatctrl_cli.logs.robot_description import NAME, RobotDescription
-from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.model_difference import model_difference
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
-from splatctrl_cli.sources.calibrated import CalibratedSource
+from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.sources.source import logged_descriptions
 from splatctrl_cli.states.state_source import StateSource
 
@@ -43,8 +41,7 @@ def urdf_of(given: Path | None, paths: Sequence[Path], progress: Progress = SILE
 
 def other_frame(file: UrdfFile, source: RecordSource | StateSource) -> str:
     """In words, that the poses of a log or capture are in another frame than the robot's root; empty where not."""
-    logged = RosLogSource | CaptureSource | CalibratedSource
-    if not isinstance(source, logged) or source.world_frame == file.root:
+    if not isinstance(source, LOGGED) or source.world_frame == file.root:
         return ""
     return f"the poses are in the frame '{source.world_frame}', not in that of its root '{file.root}'"
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from splatctrl_cli.errors import InputError
 
 CALIBRATION = "--calibration "  # begins the name of a calibration among the files that were read
+PERTURB = "--perturb "  # likewise, what was done to them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,7 @@ class SourceOptions:
     pixel shows a person. intrinsics: fx, fy, cx, cy [px] by camera name, instead of those recorded. depth_scale:
     [m per count] of depth images. root: folder of an image folder's files. holdout: frames (index or name) of an
     image folder that become camera `holdout`. stamps: ``header``, or ``log`` for the times of logging. calibration:
-    what `calibrate` wrote of the recording.
+    what `calibrate` wrote of the recording. perturb: what is done to its frames, by name (`sources.perturbed`).
     """
 
     world_frame: str | None = None
@@ -57,6 +58,7 @@ class SourceOptions:
     holdout: tuple[str, ...] | None = None
     stamps: str = "header"
     calibration: Path | None = None
+    perturb: Mapping[str, float] = field(default_factory=dict)
 
     def refuse(self, names: tuple[str, ...], kind: str, path: Path) -> None:
         """Raise InputError where a person gave an option that means nothing for this kind of input."""

@@ -30,6 +30,7 @@ from splatctrl_cli.records import (
     RgbdFrame,
     by_stamp,
 )
+from splatctrl_cli.sources.perturbed import PerturbedSource, perturbed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,11 +113,14 @@ def correction_of(options: SourceOptions, where: str) -> Correction | None:
 
 
 def calibrated(source: FrameSource, options: SourceOptions) -> FrameSource:
-    """The source, corrected where the options have a calibration. Raises InputError where that is not of it."""
+    """The source, corrected where the options have a calibration, then perturbed where they ask for it.
+
+    Raises InputError where the calibration is not of it.
+    """
     correction = correction_of(options, source.name)
-    if correction is None:
-        return source
-    return CalibratedSource(source, correction, round(options.pose_tolerance_s * SECOND_NS))
+    if correction is not None:
+        source = CalibratedSource(source, correction, round(options.pose_tolerance_s * SECOND_NS))
+    return perturbed(source, options.perturb)
 
 
 class CalibratedSource:
@@ -237,6 +241,9 @@ class CalibratedSource:
                 yield stamp, camera, T
                 if len(seen) == len(self.cameras):
                     return
+
+
+LOGGED = RosLogSource | CaptureSource | CalibratedSource | PerturbedSource  # a log's or a capture's records
 
 
 def _between(stamps: list[int], poses: list[Float64], stamp_ns: int, tolerance_ns: int) -> Float64 | None:

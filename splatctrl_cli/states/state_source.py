@@ -28,7 +28,7 @@ from splatctrl_cli.states.state_table import ARRAY_FILES, dataset_track, describ
 
 _FOR_CAMERAS = (
     *("cameras", "camera_topics", "camera_poses", "camera_pose_topics"),
-    *("human_topics", "depth_scale", "world_frame", "calibration"),
+    *("human_topics", "depth_scale", "world_frame", "calibration", "perturb"),
 )
 _NOT_FOR_TABLES = (*_FOR_CAMERAS, "joint_topic", "root", "holdout")
 

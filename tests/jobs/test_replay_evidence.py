@@ -101,6 +101,10 @@ NOT_ITS_OWN: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda s: of_run(s, inputs={"--calibration cell.toml": "1" * 64}),
         "was made with cell.toml, this log is read without one",
     ),
+    "with errors of its frames": (
+        lambda s: of_run(s, inputs={"--perturb pose-error=0.01": "pose-error=0.01"}),
+        "was made with --perturb pose-error=0.01, this log is read without one",
+    ),
     "no digests": (without_digests, "is of an earlier version"),
     "millimetres": (lambda s: splats_changed(s, lambda splats: moved(splats, 1e3)), "splats and occupancy disagree"),
     "moved by 3 m": (

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import POSE_JUMP
 from splatctrl_cli.control.audit import Observed
@@ -29,13 +28,12 @@ from splatctrl_cli.jobs.replays.known_scene import (
     splat_fields,
 )
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.records import Float64, RecordSource, RgbdFrame, UInt8
 from splatctrl_cli.robot.declared_contact import Declarations
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.voxel_file import read_seen, read_unrepresented
-from splatctrl_cli.sources.calibrated import CalibratedSource
+from splatctrl_cli.sources.calibrated import LOGGED
 from splatctrl_cli.splat_files.splats import read_ply
 from splatctrl_cli.states.state_source import open_states
 
@@ -251,6 +249,6 @@ def _training_source(request: ReplayRequest, model: RobotModel, source: RecordSo
         )
     if request.evidence in source.cameras:
         source = open_states(request.log, training_options(request, source.cameras), model.joint_names)
-    if not isinstance(source, RosLogSource | CaptureSource | CalibratedSource):
+    if not isinstance(source, LOGGED):
         raise UsageError(f"{request.log}: --lockstep: expected a log or a capture", remedy="give --scene or --field")
     return source

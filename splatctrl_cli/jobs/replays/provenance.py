@@ -17,7 +17,7 @@ from splatctrl_cli.config.fixed import (
     SAME_MOTION_STATES,
 )
 from splatctrl_cli.evaluate.same_recording import changed_files, differences
-from splatctrl_cli.logs.source_options import CALIBRATION
+from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB
 from splatctrl_cli.logs.state_columns import StateColumns
 from splatctrl_cli.records import RecordSource, Stamps
 from splatctrl_cli.robot.model import RobotModel
@@ -101,8 +101,12 @@ def made_from_mismatches(
 
 
 def _calibrations(files: Mapping[str, str]) -> dict[str, str]:
-    """Names by digest of the calibrations among files that were read."""
-    return {digest: name.removeprefix(CALIBRATION) for name, digest in files.items() if name.startswith(CALIBRATION)}
+    """Names by digest of the calibrations among files that were read, and of what was done to these."""
+    return {
+        digest: name.removeprefix(CALIBRATION)
+        for name, digest in files.items()
+        if name.startswith((CALIBRATION, PERTURB))
+    }
 
 
 def _robot_difference(made_from: Mapping[str, Any], model: RobotModel) -> str:
