@@ -5,7 +5,7 @@ import difflib
 import importlib
 import os
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from splatctrl_cli.jobs.batches.batch import (
     planned,
     suites_of,
 )
-from splatctrl_cli.jobs.batches.graph import Parsed, columns_of, of_shard
+from splatctrl_cli.jobs.batches.graph import TABLES, Parsed, columns_of, of_shard
 from splatctrl_cli.jobs.batches.ledger import NAME, Ledger, Run, write_csv
 from splatctrl_cli.jobs.batches.run import DONE, FAILED, told
 from splatctrl_cli.jobs.batches.suite import Table
@@ -34,6 +34,7 @@ from splatctrl_cli.jobs.batches.suite import Table
 PRELOADED = ("check", "ingest", "reconstruct", "export", "bake", "score", "replay")  # jobs of a runner
 MOST_ROWS = 40  # recordings that are all printed
 OWN = ("out", "force", "resume", "threads")  # options that a batch gives itself, where a command has them
+NOT_OF_A_NODE = (*OWN, "help", "help-all", "json", "verbose", "quiet", "junit", "preset")  # the last is in --set
 
 
 def run(args: argparse.Namespace) -> int:
@@ -87,6 +88,20 @@ class OfThisProgram:
         values = [value for name, value in vars(parsed).items() if name != "out"]
         found = [each for value in values for each in (value if isinstance(value, list) else [value])]
         return Parsed(words=tuple(words), inputs=tuple(path for path in found if isinstance(path, Path)))
+
+    def options_of(self, words: Sequence[str]) -> dict[str, Any]:
+        """The options that words say, by their long names: `parsed` gives words that say the same."""
+        parser = _parser_of(words[0])
+        found, given = dict[str, Any](), vars(parser.parse_args([*words[1:]]))
+        for action in parser._actions:
+            name = max(action.option_strings, key=len, default=action.dest).removeprefix("--")
+            value = given.get(action.dest)
+            if name in NOT_OF_A_NODE or value is None or value == action.default:
+                continue
+            if name in TABLES:
+                value = dict(text.partition("=")[::2] for text in value)
+            found[name] = list(value) if isinstance(value, tuple) else value
+        return found
 
 
 def run_words(words: list[str]) -> int:

@@ -69,16 +69,17 @@ def batch(request: BatchRequest, command_line: CommandLine, progress: Progress =
     """Run what is not done. Raises UsageError for a suite that makes no graph, InputError for files that lack."""
     suite, every, out = planned(request, command_line)
     nodes = of_shard(every, request.shard)
-    with Ledger(out) as ledger, _executor(request) as (executor, slots, hint):
-        scheduler = Scheduler(
-            ledger=ledger,
-            entry=command_line.entry,
-            executor=executor,
-            slots=slots,
-            progress=progress,
+    with (
+        Ledger(out) as ledger,
+        scheduling(
+            ledger,
+            command_line.entry,
+            progress,
+            workers=request.workers,
+            dask=request.dask,
             again=request.again,
-            hint=hint,
-        )
+        ) as scheduler,
+    ):
         progress.log(f"batch: {_counted(len(nodes), 'node')} into {out}")
         try:
             runs = list(scheduler.run(nodes).values())
@@ -222,20 +223,29 @@ def node_document(run: Run) -> dict[str, Any]:
 
 
 @contextmanager
-def _executor(request: BatchRequest) -> Iterator[tuple[Executor, int, Callable[[], str]]]:
+def scheduling(
+    ledger: Ledger, entry: str, progress: Progress, *, workers: int, dask: str | None, again: bool = False
+) -> Iterator[Scheduler]:
+    """What runs nodes: processes of this machine, or a Dask cluster. Raises UsageError where none answers."""
+    with _executor(workers, dask) as (executor, slots, hint):
+        yield Scheduler(
+            ledger=ledger, entry=entry, executor=executor, slots=slots, progress=progress, again=again, hint=hint
+        )
+
+
+@contextmanager
+def _executor(workers: int, dask: str | None) -> Iterator[tuple[Executor, int, Callable[[], str]]]:
     """What runs nodes, how many at once, and why a wait may be in vain."""
-    if request.dask is None:
-        with local_executor(request.workers) as executor:
-            yield executor, request.workers, lambda: ""
+    if dask is None:
+        with local_executor(workers) as executor:
+            yield executor, workers, lambda: ""
         return
     try:
-        client = distributed.Client(request.dask, timeout=CONNECT_S)
+        client = distributed.Client(dask, timeout=CONNECT_S)
     except ImportError:
         raise UsageError("--dask: dask is not installed", remedy="pip install 'splatctrl[dask]'") from None
     except (OSError, ValueError) as error:
-        raise UsageError(
-            f"--dask {request.dask}: no scheduler answers: {error}", remedy="check the address"
-        ) from None
+        raise UsageError(f"--dask {dask}: no scheduler answers: {error}", remedy="check the address") from None
     with client:
         slots = max(sum(client.nthreads().values()), 1)
         yield (

@@ -17,6 +17,7 @@ ENDINGS = {"ingest": ".capture", "export": ".ply"}  # of the output's name
 WITHOUT_OUTPUT = ("check", "info")
 CAPTURE, SCENE = "ingest", "reconstruct"
 ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite does not say: of a command's only job
+    "simulate": {},
     "ingest": {"source": RECORDING},
     "check": {"source": RECORDING},
     "info": {"path": RECORDING},
@@ -27,6 +28,7 @@ ROLES: Mapping[str, Mapping[str, str]] = {  # what an option is where the suite 
     "replay": {"log": CAPTURE, "scene": SCENE},
 }
 COMMANDS = tuple(ROLES)
+TABLES = ("set", "perturb")  # options of which a matrix varies one entry: set.SECTION.KEY, perturb.NAME
 _PLACE = re.compile(r"\{([\w.+-]+)\}")
 _LONGEST = 120  # characters of a node's name
 
@@ -48,6 +50,10 @@ class CommandLine(Protocol):
 
     def parsed(self, command: str, options: Table, folder: Path) -> Parsed:
         """Words for options, paths of which count from `folder`. Raises UsageError for what is not an option."""
+        ...
+
+    def options_of(self, words: Sequence[str]) -> dict[str, Any]:
+        """The options that a command's words say, as `parsed` takes them, but those that a batch gives itself."""
         ...
 
 
@@ -101,7 +107,7 @@ def columns_of(columns: Iterable[tuple[str, str]], jobs: Sequence[str]) -> list[
 def _with_roles(job: Job, jobs: Sequence[Job], recording: Recording) -> Job:
     """With the options that follow from the other jobs, where the suite does not give them."""
     given = {*job.options, *job.matrix}
-    given |= {"field"} & given and {"scene"}  # a field stands for its scene
+    given |= {"field", "lockstep"} & given and {"scene"}  # either stands for its scene
     roles = {option: role for option, role in ROLES[job.command].items() if option not in given}
     if job.command in {"reconstruct", "score"} and "dtu" in given:
         roles = {option: role for option, role in roles.items() if option == "scene"}
@@ -269,12 +275,13 @@ def _combinations(matrix: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any
 
 
 def _merged(options: Table, chosen: Variant) -> dict[str, Any]:
-    """Options with what a matrix chose; its key ``set.SECTION.KEY`` adds to the settings."""
+    """Options with what a matrix chose; its key ``set.SECTION.KEY`` adds to the settings, and so of `TABLES`."""
     merged = dict(options)
     for key, value in chosen.items():
-        if key.startswith("set."):
-            settings = merged.get("set", {})
-            merged["set"] = {**(settings if isinstance(settings, Mapping) else {}), key.removeprefix("set."): value}
+        table, dot, entry = key.partition(".")
+        if dot and table in TABLES:
+            before = merged.get(table, {})
+            merged[table] = {**(before if isinstance(before, Mapping) else {}), entry: value}
         else:
             merged[key] = value
     return merged

@@ -63,6 +63,18 @@ def test_a_matrix_makes_variants_that_go_on_in_what_needs_them(tmp_path: Path) -
     assert "--scene" not in options(of["replay"][0])
 
 
+def test_a_replay_in_lockstep_needs_no_scene_and_errors_of_its_frames_vary(tmp_path: Path) -> None:
+    jobs = f"[jobs.simulate]\n[jobs.replay]\nlog = '{{simulate}}/log.mcap'\nlockstep = true\n{ROBOT}"
+    errors = "perturb = { pose-error = 0.01 }\nmatrix = { 'perturb.depth-noise' = [0.0, 0.004] }\n"
+    found = nodes(tmp_path, RECORDINGS + jobs + errors, shard=(1, 2))
+    assert [node.name for node in found] == [
+        "a/simulate",
+        *(f"a/replay+perturb.depth-noise={v}" for v in (0.0, 0.004)),
+    ]
+    assert found[2].needs == ("a/simulate",) and found[2].words[-1] == f"{found[0].out}/log.mcap"
+    assert {"--perturb=pose-error=0.01", "--perturb=depth-noise=0.004"} <= set(found[2].words)
+
+
 def test_nodes_and_columns_come_in_the_order_of_the_suite(tmp_path: Path) -> None:
     jobs = f"[jobs.audit]\ncommand = 'replay'\n{ROBOT}[jobs.scene]\ncommand = 'reconstruct'\n"
     found = nodes(tmp_path, RECORDINGS + jobs + "[jobs.ingest]\n[jobs.check]\n")
