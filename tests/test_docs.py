@@ -48,6 +48,7 @@ TOO_LONG = {  # for a test: minutes; the page has their figures
     "score --fit --dtu sample_data/dtu --protocol holdout:2,5 -o fit/",
     "simulate --human-arm near-pickup --seed 3 -o shared",
     "reconstruct docs/examples/apc_shelf.toml --root SCENE --max-splats 10000 -o shelf",
+    "sweep demo_output/audit --over KEY=A:B",
     "score shelf --reference docs/examples/apc_shelf.toml --root SCENE",
 }
 RUN_BY_GOLDEN = ("README.md", "start.md")  # all their commands: tests/tools/test_golden.py

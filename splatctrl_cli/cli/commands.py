@@ -30,7 +30,7 @@ from splatctrl_cli.cli.recording_options import (
     simulate_options,
 )
 from splatctrl_cli.cli.replay_options import replay_options
-from splatctrl_cli.cli.run_options import batch_options, compare_options, report_options, view_options
+from splatctrl_cli.cli.run_options import batch_options, compare_options, report_options, sweep_options, view_options
 from splatctrl_cli.cli.scene_options import (
     export_options,
     query_options,
@@ -263,6 +263,15 @@ COMMANDS = {
         run="batch:run",
         options=batch_options,
         judges=True,
+    ),
+    "sweep": Command(
+        summary="say how far a replay is from the other verdict",
+        examples=(
+            "sweep out/audit --over margin=0.02:0.08 -o out/margin",
+            "sweep out/audit --over latency=0:1 --over depth-noise=0:0.02 -o out/both",
+        ),
+        run="sweep:run",
+        options=sweep_options,
     ),
     "compare": Command(
         summary="say what got worse between two runs, two batches, or since a stored baseline",

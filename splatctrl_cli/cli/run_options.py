@@ -1,10 +1,10 @@
-"""The options of ``batch``, ``compare``, ``report`` and ``view``: of many runs, and of looking at them."""
+"""The options of ``batch``, ``sweep``, ``compare``, ``report`` and ``view``: of many runs, and of looking at them."""
 
 import argparse
 from pathlib import Path
 
 from splatctrl_cli.cli.options import add_output
-from splatctrl_cli.cli.parser import Options, Parser, whole
+from splatctrl_cli.cli.parser import Options, Parser, real, whole
 
 ROOT = "folder in which the scene and robot of a replay's command line are looked for, if they were moved"
 
@@ -51,6 +51,20 @@ def _shard(text: str) -> tuple[int, int]:
     if not (index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count)):
         raise argparse.ArgumentTypeError(f"expected I/N with I from 1 to N, got {text!r}")
     return int(index), int(count)
+
+
+def sweep_options(add: Options, parser: Parser) -> None:
+    """Of ``splatctrl sweep``."""
+    add("REPLAY", "the folder that replay wrote", Path)
+    keys = (
+        "splats, cameras-out, depth-noise, pose-error, pose-turn, latency, margin, ... (docs/sweep.md), or a setting"
+    )
+    add("--over KEY=A:B ...", f"what is varied, from A to B: {keys}")
+    add("-o/--out DIR", "folder of the sweep, where it goes on (default: sweep)", Path)
+    near = "how near the two sides of a flip are to lie, as a share of the range"
+    add("--tolerance SHARE", near, real(1e-6, 0.5), 1 / 64)
+    add("--workers N", "runs at once (default: one per core)", whole(1, 256))
+    add("--dask ADDRESS", "make the runs on a Dask cluster that shares this folder")
 
 
 def compare_options(add: Options, parser: Parser) -> None:

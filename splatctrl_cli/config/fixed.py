@@ -342,3 +342,6 @@ CALIBRATION_BOARD_MOVED = 0.01  # [m] that a board which stands still is seen to
 CALIBRATION_BOARD_DEPTH = (0.75, 1.33)  # times what the size of its squares says, that depth may have a board away
 CALIBRATION_BOARD_TOGETHER_NS = 50_000_000  # [ns] between frames that show a moving board at one moment
 CALIBRATION_TRAVEL = 0.1  # [m] that some point of the robot must move, for its surface to be told from a wrong model
+SWEEP_SAMPLES = 3  # values evenly between the ends that are tried before a verdict that can turn once is bisected
+SWEEP_SEARCHED = 7  # of a verdict that may turn back; the above are among them
+SWEEP_DIRECTIONS = 8  # of quasi-random ones in which several values are changed together

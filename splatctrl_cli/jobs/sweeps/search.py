@@ -1,0 +1,143 @@
+"""Where an outcome changes: along one value by samples and bisection, over several by directions and bisection."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from splatctrl_cli.config.fixed import SWEEP_DIRECTIONS, SWEEP_SAMPLES, SWEEP_SEARCHED
+
+Judge = Callable[[Sequence[float]], Sequence[str]]  # outcomes of values, which may run side by side
+JudgeAt = Callable[[Sequence[Sequence[float]]], Sequence[str]]  # likewise of points in several values
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flip:
+    """The change nearest to the start: the last value with its outcome, and the first with another; None where all
+    values that were tried have one outcome.
+
+    outcomes: of every value tried, from the start on. is_monotone: they change once at most. spacing: the farthest
+    that two values tried before the flip, or any without one, lie apart: a narrower flip may have been missed.
+    """
+
+    last: float | None
+    first: float | None
+    outcomes: Mapping[float, str]
+    is_monotone: bool
+    spacing: float
+
+
+def find_flip(
+    judge: Judge, start: float, end: float, *, tolerance: float, is_whole: bool = False, is_monotone: bool = False
+) -> Flip:
+    """The flip nearest to `start` on the way to `end`, to within `tolerance` (of whole values: 1).
+
+    First the ends and SWEEP_SAMPLES values evenly between them are tried; SWEEP_SEARCHED where the outcome is not
+    declared monotone, or turns back among these. Then the nearest pair with different outcomes is halved.
+    """
+    known: dict[float, str] = {}
+
+    def try_all(values: Sequence[float]) -> None:
+        new = [value for value in dict.fromkeys(values) if value not in known]
+        known.update(zip(new, judge(new), strict=True) if new else ())
+
+    def value_at(share: float) -> float:
+        value = start + (end - start) * share
+        return float(round(value)) if is_whole else float(f"{value:.6g}")
+
+    def between(num: int) -> list[float]:
+        return [value_at((k + 1) / (num + 1)) for k in range(num)]
+
+    try_all([start, end, *between(SWEEP_SAMPLES if is_monotone else SWEEP_SEARCHED)])
+    if is_monotone and _num_changes(_ordered(known, start)) > 1:
+        try_all(between(SWEEP_SEARCHED))
+    ordered = _ordered(known, start)
+    tried = list(ordered)
+    index = next((k for k, value in enumerate(tried) if known[value] != known[start]), None)
+    gaps = [abs(b - a) for a, b in itertools.pairwise(tried[:index])]
+    spacing = max(gaps, default=0.0)
+    alternates = _num_changes(ordered) > 1
+    if index is None:
+        return Flip(last=None, first=None, outcomes=ordered, is_monotone=True, spacing=spacing)
+    last, first = tried[index - 1], tried[index]
+    least = 1.0 if is_whole else tolerance
+    while abs(first - last) > least * (1 + 1e-9):
+        middle = float(round((last + first) / 2)) if is_whole else float(f"{(last + first) / 2:.6g}")
+        if middle in (last, first):  # as near as six digits come
+            break
+        try_all([middle])
+        last, first = (middle, first) if known[middle] == known[start] else (last, middle)
+    return Flip(last=last, first=first, outcomes=_ordered(known, start), is_monotone=not alternates, spacing=spacing)
+
+
+def _ordered(known: Mapping[float, str], start: float) -> dict[float, str]:
+    return {value: known[value] for value in sorted(known, key=lambda value: abs(value - start))}
+
+
+def _num_changes(ordered: Mapping[float, str]) -> int:
+    """How often the outcome turns from that of the start to another, or back to it."""
+    is_first = [outcome == next(iter(ordered.values())) for outcome in ordered.values()]
+    return sum(a != b for a, b in itertools.pairwise(is_first))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastChange:
+    """Points in shares of each range, the last with the start's outcome and the first with another along one
+    direction, and the length of the latter.
+    """
+
+    last: tuple[float, ...]
+    first: tuple[float, ...]
+    length: float
+
+
+def find_least(judge: JudgeAt, alone: Sequence[float | None], *, tolerance: float) -> LeastChange | None:
+    """The shortest change of several values within the unit cube that flips the outcome of (0, ..., 0), None where
+    no direction tried has one.
+
+    alone: the share at which each value flips it alone. Tried are the diagonal and SWEEP_DIRECTIONS of Halton's
+    sequence, then the best one turned towards and away from each value, by a quarter and by an eighth: each at the
+    length of the best so far, and halved to `tolerance` where that flips.
+    """
+    num = len(alone)
+    start = judge([(0.0,) * num])[0]
+    best: LeastChange | None = None
+    axes = [(share, k) for k, share in enumerate(alone) if share is not None]
+    if axes:
+        share, k = min(axes)
+        first = tuple(share if each == k else 0.0 for each in range(num))
+        best = LeastChange(last=(0.0,) * num, first=first, length=share)
+
+    def improved(way: np.ndarray, best: LeastChange | None) -> LeastChange | None:
+        length = min(1.0 / way.max(), np.inf if best is None else best.length - tolerance)
+        if length <= 0 or judge([_point(way, length)])[0] == start:
+            return best
+        low, high = 0.0, float(length)
+        while high - low > tolerance:
+            middle = (low + high) / 2
+            low, high = (middle, high) if judge([_point(way, middle)])[0] == start else (low, middle)
+        return LeastChange(last=_point(way, low), first=_point(way, high), length=high)
+
+    for way in _directions(num):
+        best = improved(way, best)
+    for turn in (0.25, 0.125):
+        if best is not None:
+            middle = np.asarray(best.first) / best.length
+            for side in [sign * turn * axis for axis in np.eye(num) for sign in (1.0, -1.0)]:
+                way = np.maximum(middle + side, 0.0)
+                best = improved(way / np.linalg.norm(way), best)
+    return best
+
+
+def _directions(num: int) -> Iterator[np.ndarray]:
+    """Unit vectors (num,) without a negative part: the diagonal, then, evenly over all, those of Halton's points."""
+    points = qmc.Halton(num, scramble=False).random(SWEEP_DIRECTIONS + 1)[1:]
+    for way in (np.ones(num), *ndtri((1.0 + points) / 2.0)):
+        yield way / np.linalg.norm(way)
+
+
+def _point(way: np.ndarray, length: float) -> tuple[float, ...]:
+    return tuple(float(f"{value:.6g}") for value in np.minimum(way * length, 1.0))
