@@ -36,7 +36,7 @@ def simulate_options(add: Options, parser: Parser) -> None:
     add("--visitor X,Y,RADIUS", cylinder, numbers)
     shared = "a table shared with a person's arm, with masks, that works beside the arm's pickup or its goal"
     add("--human-arm", shared, ("near-pickup", "near-goal"))
-    drawn = "things on one or two tables, a shelf, or one without a divider, by the seed, and a way through it"
+    drawn = "things on tables, or a shelf, drawn by the seed, and a way through"
     add("--environment", drawn, ("tabletop", "cubby", "merged-cubby"))
     add("--num-cameras N", "with --environment: 2 to 6 about the arm", whole(2, 6), 4)
     add(
