@@ -1,7 +1,7 @@
 """Commands on an NVIDIA card: ``python -m tools.on_gpu_runs -o FILE.md [--recording NAME=SOURCE]``, for docs/gpu.md.
 
 Each recording is reconstructed on the processor and twice on the card, scored, and timed by part; then what can go
-wrong on a card. Recordings have no robot: where pinocchio is not installed, a stand-in lets the commands start.
+wrong on a card. Where pinocchio is not installed, a stand-in lets the commands start, and no recording has a robot.
 """
 
 import argparse
@@ -25,8 +25,10 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 STREAM, STILL = "sample_data/tabletop/log.mcap --cameras cam0,cam1,cam2", "--dtu sample_data/dtu --holdout 1,4"
-RECORDINGS = {"tabletop": STREAM, "dtu": STILL}
+ROBOT = "--urdf sample_data/tabletop/robot.urdf --spheres sample_data/tabletop/robot_spheres.yaml"
+RECORDINGS = {"tabletop": f"{STREAM} {ROBOT}" if importlib.util.find_spec("pinocchio") else STREAM, "dtu": STILL}
 SCORED = {"tabletop": "sample_data/tabletop/log.mcap --cameras cam3", "dtu": STILL}
+OF_THE_MAP = {"--max-splats", "--urdf", "--spheres"}  # options with a value that are not of a reference
 DEVICES = ("cpu", "cuda", "cuda")
 LIMIT_S = 240
 LEFT, MANY = 1_300_000_000, "2000000"  # bytes left free on a full card, a process takes some 500 MB; splats
@@ -116,6 +118,7 @@ def stand_ins(folder: Path, names: Sequence[str] | None = None) -> list[str]:
 
 def timed(words: Sequence[str]) -> int:
     """Run the command line; last on stderr, as JSON, the seconds of each part, without the parts within it."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line has it, before NumPy is imported
     from splatctrl_cli.cli.main import main as command
     from splatctrl_cli.scene import fitter
     from splatctrl_cli.scene.descent import Descent
@@ -195,10 +198,16 @@ def reconstructions(desk: Desk, recordings: Mapping[str, str]) -> list[str]:
     return rows + shares
 
 
+def of_reference(recording: str) -> list[str]:
+    """The words by which `score` takes a recording that `reconstruct` took."""
+    given = shlex.split(recording)
+    kept = [word for word, last in zip(given, ["", *given], strict=False) if not {word, last} & OF_THE_MAP]
+    return kept if kept[0].startswith("--") else ["--reference", *kept]
+
+
 def scored(desk: Desk, reference: str, scene: str) -> str:
     """dB and mm over the pixels seen, as two cells."""
-    is_dtu = reference.startswith("--dtu")
-    words = shlex.split(reference if is_dtu else f"--reference {reference}")
+    words = of_reference(reference)
     code, out, err, _ = desk.run(["splatctrl_cli", "score", str(desk.folder / scene), *words, "--json", "-q"])
     if code not in (0, 3):
         return f"exit {code} {err.strip()[-120:]} | -"

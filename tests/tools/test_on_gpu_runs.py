@@ -6,7 +6,7 @@ from pathlib import Path
 from tests.cli.test_reconstruct import FEW, write_folder
 from tests.scene.wall import frame
 from tools import on_gpu_runs
-from tools.on_gpu_runs import Desk, digest
+from tools.on_gpu_runs import Desk, digest, of_reference
 
 
 def test_a_recording_without_a_robot_is_reconstructed_where_there_is_no_pinocchio(tmp_path: Path) -> None:
@@ -29,3 +29,10 @@ def test_a_recording_without_a_robot_is_reconstructed_where_there_is_no_pinocchi
     assert digest(tmp_path / "scene") == before
     (tmp_path / "scene" / "splats.ply").write_bytes(b"")
     assert digest(tmp_path / "scene") != before
+
+
+def test_a_recording_is_scored_without_what_only_a_map_has() -> None:
+    assert of_reference("a/b.toml --root c --max-splats 10000 --holdout 1,2") == [
+        *("--reference", "a/b.toml", "--root", "c", "--holdout", "1,2")
+    ]
+    assert of_reference("--dtu d --holdout 1,4 --max-splats 5") == ["--dtu", "d", "--holdout", "1,4"]
