@@ -22,6 +22,7 @@ from splatctrl_cli.kernels.raster import (
     optimiser_step,
 )
 from tests.field.scenes import cloud, queries
+from tests.kernels.test_points import points_bytes
 from tests.kernels.test_raster import camera, splats
 
 
@@ -71,7 +72,7 @@ def field_bytes() -> bytes:
 
 
 def digests() -> list[str]:
-    parts = [arithmetic().encode(), fit_bytes(45, 37), fit_bytes(160, 128), field_bytes()]
+    parts = [arithmetic().encode(), fit_bytes(45, 37), fit_bytes(160, 128), field_bytes(), points_bytes()]
     return [hashlib.sha256(part).hexdigest() for part in parts]
 
 
@@ -85,4 +86,4 @@ def test_avx2_and_avx512_give_the_same_bytes() -> None:
         for kernels in ("v3", "auto")
     }
     assert of["v3"] == of["auto"]
-    assert len(of["v3"].split()) == 4
+    assert len(of["v3"].split()) == 5

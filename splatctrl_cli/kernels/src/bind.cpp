@@ -1,6 +1,10 @@
 // The module: one bind_* per kernel family. Each only checks shapes, releases the GIL and forwards.
 #include "bind.h"
 
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
+
 namespace {
 
 // 4, 3 or 0: of the x86-64 levels that a module is built for, the highest that this processor runs.
@@ -16,11 +20,21 @@ int x86_64_level() {
 #endif
 }
 
+// Images of a few MB that are freed stay with the process, up to 512 MB at the end of its heap, instead of going back
+// page by page and being faulted in again for the next.
+void keep_freed_memory() {
+#if defined(__GLIBC__)
+  mallopt(M_MMAP_THRESHOLD, 128 << 20);
+  mallopt(M_TRIM_THRESHOLD, 512 << 20);
+#endif
+}
+
 }  // namespace
 
 NB_MODULE(SPLATCTRL_MODULE, m) {
   nanobind::set_leak_warnings(false);  // an interrupted run keeps objects in its traceback; that is no leak
   m.def("x86_64_level", &x86_64_level, "4 where this processor has AVX-512, 3 where AVX2, FMA and BMI2, 0 elsewhere.");
+  m.def("keep_freed_memory", &keep_freed_memory, "For the whole process: what is freed is not given back at once.");
   splatctrl::bind_raster(m);
   splatctrl::bind_gaussians(m);
   splatctrl::bind_field(m);
@@ -28,4 +42,5 @@ NB_MODULE(SPLATCTRL_MODULE, m) {
   splatctrl::bind_edges(m);
   splatctrl::bind_occupancy(m);
   splatctrl::bind_surface(m);
+  splatctrl::bind_points(m);
 }

@@ -3,6 +3,7 @@
 #include <vector>
 
 #include "bind.h"
+#include "points.h"
 #include "surface_image.h"
 
 namespace splatctrl {
@@ -28,6 +29,18 @@ std::vector<SurfaceSolid> solids_from(const Array<const double>& rows, const Arr
 }  // namespace
 
 void bind_surface(nb::module_& m) {
+  m.def(
+      "solid_distance",
+      [](const Array<const double>& points, const Array<const double>& solids,
+         const Array<const std::int16_t>& solid_links, const Array<double>& distance, int num_threads) {
+        expect(points.size() == 3 * distance.size(), "expected points (N, 3), distance (N,)");
+        const std::vector<SurfaceSolid> shapes = solids_from(solids, solid_links);
+        const nb::gil_scoped_release release;
+        solid_distance(points.data(), static_cast<int>(distance.size()), shapes.data(),
+                       static_cast<int>(shapes.size()), distance.data(), num_threads);
+      },
+      nb::arg("points").noconvert(), nb::arg("solids").noconvert(), nb::arg("solid_links").noconvert(),
+      nb::arg("distance").noconvert(), nb::arg("num_threads"));
   m.def(
       "render_surface",
       [](const Array<const double>& intrinsics, const Array<const double>& solids,

@@ -1,5 +1,6 @@
 #include "parallel.h"
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <mutex>
@@ -16,17 +17,18 @@ class Pool {
  public:
   void run(int num_chunks, int num_threads, const std::function<void(int)>& fn) {
     const std::lock_guard<std::mutex> turn(turn_);
-    grow(num_threads - 1);
+    const int num_wanted = std::min(num_threads, num_chunks) - 1;
+    grow(num_wanted);
     next_.store(0);
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       fn_ = &fn;
       num_chunks_ = num_chunks;
-      num_wanted_ = num_threads - 1;
+      num_wanted_ = num_wanted;
       is_open_ = true;
       ++generation_;
     }
-    wake_.notify_all();
+    for (int worker = 0; worker < num_wanted; ++worker) wake_.notify_one();
     work(fn, num_chunks);
     std::unique_lock<std::mutex> lock(mutex_);
     is_open_ = false;
@@ -36,8 +38,7 @@ class Pool {
  private:
   void grow(int num_workers) {
     while (static_cast<int>(workers_.size()) < num_workers) {
-      const int index = static_cast<int>(workers_.size());
-      workers_.emplace_back([this, index] { loop(index); });
+      workers_.emplace_back([this] { loop(); });
       workers_.back().detach();
     }
   }
@@ -46,13 +47,14 @@ class Pool {
     for (int chunk = next_.fetch_add(1); chunk < num_chunks; chunk = next_.fetch_add(1)) fn(chunk);
   }
 
-  void loop(int index) {
+  void loop() {
     long seen = 0;
     for (;;) {
       std::unique_lock<std::mutex> lock(mutex_);
-      wake_.wait(lock, [&] { return generation_ != seen && index < num_wanted_; });
+      wake_.wait(lock, [&] { return generation_ != seen && num_wanted_ > 0; });
       seen = generation_;
       if (!is_open_) continue;
+      --num_wanted_;
       ++num_running_;
       const auto* fn = fn_;
       const int num_chunks = num_chunks_;

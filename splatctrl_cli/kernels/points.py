@@ -1,0 +1,111 @@
+"""What is asked of many points at once, compiled: views that see through them, their cubes, splats and solids near
+them. The same bytes at any thread count, those of the NumPy expressions in tests/reference/points.py.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatctrl_cli.kernels import native
+
+Bool = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int16 = NDArray[np.int16]
+Int64 = NDArray[np.int64]
+
+
+def back_projected(camera: Float64, depth: Float32, chosen: Bool | None = None, num_threads: int = 1) -> Float64:
+    """Points (K, 3) [m], world, of the chosen (H, W) pixels of a depth image (H, W) [m], by default all, row after
+    row; camera (18,): `pack_camera`, but with the transform from camera to world.
+    """
+    points = np.empty((depth.size if chosen is None else int(np.count_nonzero(chosen)), 3))
+    pixels = None if chosen is None else np.ascontiguousarray(chosen).view(np.uint8)
+    native.back_project(camera, np.ascontiguousarray(depth, np.float32), pixels, points, num_threads)
+    return points
+
+
+def seen_through(
+    points: Float32, cameras: Sequence[Float64], nearest: Sequence[Float32], tolerance: float, num_threads: int = 1
+) -> Bool:
+    """Points (N, 3) [m], world, nearer to a camera by more than `tolerance` [m] than the depth at their pixel; each
+    view is a `pack_camera` camera (18,) and its depths (H, W) [m], infinite where there is none.
+    """
+    out = np.empty(len(points), np.uint8)
+    points = np.ascontiguousarray(points, np.float32)
+    native.seen_through(points, list(cameras), list(nearest), tolerance, out, num_threads)
+    return out.view(bool)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CubeMeans:
+    """Of each of K cubes in the order of their places, x first: count (K,), mean center and color (K, 3), mean square
+    of color (K, 3), covariance (K, 6) xx, xy, xz, yy, yz, zz, and the index `nearest` (K,) of the point nearest to
+    the mean, the first of equals. Sums run in the order of the points.
+    """
+
+    count: Float64
+    center: Float64
+    color: Float64
+    square: Float64
+    covariance: Float64
+    nearest: Int64
+
+
+class Cubes:
+    """The K occupied cubes of edge `edge` [m] over points (N, 3) [m] with colours (N, 3)."""
+
+    def __init__(self, points: Float32, edge: float, num_threads: int) -> None:
+        self._points, self._num_threads = np.ascontiguousarray(points, np.float32), num_threads
+        self._native: Any = native.Cubes(self._points, edge, num_threads)
+
+    def __len__(self) -> int:
+        return len(self._native)
+
+    def members(self) -> tuple[NDArray[np.int32], Int64]:
+        """The cube of each point (N,), and the first point of each cube (K,)."""
+        of_point, first = np.empty(len(self._points), np.int32), np.empty(len(self), np.int64)
+        self._native.members(of_point, first, self._num_threads)
+        return of_point, first
+
+    def means(self, colors: Float32) -> CubeMeans:
+        """What the points of each cube have in common."""
+        num = len(self)
+        count, nearest, covariance = np.empty(num), np.empty(num, np.int64), np.empty((num, 6))
+        center, color, square = (np.empty((num, 3)) for _ in range(3))
+        colors = np.ascontiguousarray(colors, np.float32)
+        self._native.measure(
+            self._points, colors, count, center, color, square, covariance, nearest, self._num_threads
+        )
+        return CubeMeans(
+            count=count, center=center, color=color, square=square, covariance=covariance, nearest=nearest
+        )
+
+
+class SplatTree:
+    """Balls, centers (N, 3) and radii (N,) [m], to look for from many points. Raises ValueError where a centre is not
+    finite.
+    """
+
+    def __init__(self, centers: Float32, radii: Float32, num_threads: int) -> None:
+        self._num_threads = num_threads
+        self._native: Any = native.SplatTree(np.ascontiguousarray(centers), np.ascontiguousarray(radii))
+
+    def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
+        """Points (K, 3) further than `gap` [m] from each of the eight balls with the nearest centres."""
+        out = np.empty(len(points), np.uint8)
+        self._native.are_further(np.ascontiguousarray(points, np.float64), gap, out, self._num_threads)
+        return out.view(bool)
+
+
+def solid_distance(points: NDArray[np.floating], solids: Float64, num_threads: int = 1) -> Float64:
+    """Signed distance (N,) [m] of points (N, 3) to the nearest of solids (P, 16) as in `SurfaceScene`, negative
+    inside; infinite without any.
+    """
+    distance, links = np.empty(len(points)), np.zeros(len(solids), np.int16)
+    points = np.ascontiguousarray(points, np.float64)
+    native.solid_distance(points, np.ascontiguousarray(solids), links, distance, num_threads)
+    return distance
