@@ -17,11 +17,13 @@ from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.resume import DECIDING_OPTIONS
+from splatctrl_cli.kernels import native
 from splatctrl_cli.records import Box
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the subcommand and return its exit code."""
+    native.keep_freed_memory()
     config = load_config(args.config, args.set)  # refused before the source is opened
     if args.max_splats is not None:
         config = replace(config, scene=replace(config.scene, max_splats=args.max_splats))

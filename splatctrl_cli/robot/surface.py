@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.geometry import invert_transform, transform_points
+from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.kernels.points import solid_distance
 from splatctrl_cli.kernels.surface_image import (
     BALL,
     BOX,
@@ -181,11 +182,7 @@ class RobotSurface:
         T = T_camera_link[self.triangle_links]
         corners = np.einsum("fij,fkj->fki", T[:, :3, :3], self.triangles) + T[:, None, :3, 3]
         scene = SurfaceScene(
-            solids=np.ascontiguousarray(
-                np.column_stack(
-                    [self.kinds, T_solid_camera[:, :3, :3].reshape(-1, 9), T_solid_camera[:, :3, 3], self.sizes]
-                )
-            ),
+            solids=self._solids(T_solid_camera),
             solid_links=self.solid_links,
             triangles=np.ascontiguousarray(corners),
             triangle_links=self.triangle_links,
@@ -195,17 +192,23 @@ class RobotSurface:
         return render_surface(scene, packed, depth, tolerance=tolerance, quadratic=quadratic)
 
     def distance(
-        self, T_world_link: Float64, points_world: NDArray[np.floating], *, without: Sequence[str] = ()
+        self,
+        T_world_link: Float64,
+        points_world: NDArray[np.floating],
+        *,
+        without: Sequence[str] = (),
+        num_threads: int = 1,
     ) -> Float64:
         """Signed distance (Q,) [m] of points (Q, 3) to the nearest solid, negative inside; neither triangles nor the
         links `without` count.
         """
-        least = np.full(len(points_world), np.inf)
         T_solid_world = np.linalg.inv(T_world_link[self.solid_links] @ self.T_link_solid)
-        for kind, size, T, link in zip(self.kinds, self.sizes, T_solid_world, self.solid_links, strict=True):
-            if self.links[link] not in without:
-                np.minimum(least, _distance(kind, size, transform_points(T, points_world)), out=least)
-        return least
+        counts = np.array([link not in without for link in self.links], bool)[self.solid_links]
+        return solid_distance(points_world, self._solids(T_solid_world)[counts], num_threads)
+
+    def _solids(self, T_solid: NDArray[np.floating]) -> Float64:
+        """Rows (P, 16) of `SurfaceScene` for the frame from which T_solid (P, 4, 4) leads to each solid's own."""
+        return np.column_stack([self.kinds, T_solid[:, :3, :3].reshape(-1, 9), T_solid[:, :3, 3], self.sizes])
 
 
 def _half_extents(kinds: Float64, sizes: Float64, R: Float64) -> Float64:
@@ -223,21 +226,6 @@ def _areas(kinds: Float64, sizes: Float64) -> Float64:
     of_box, round_part, ends = 8 * (a * b + b * c + c * a), 4 * np.pi * a * b, np.pi * a * a
     choices = [of_box, round_part + 2 * ends, 4 * ends, round_part + 4 * ends]
     return np.select([kinds == kind for kind in (BOX, CYLINDER, BALL, CAPSULE)], choices)
-
-
-def _distance(kind: float, size: Float64, points: Float64) -> Float64:
-    """Signed distance (Q,) of points (Q, 3) in the solid's own frame."""
-    if kind == BALL:
-        return np.asarray(np.linalg.norm(points, axis=1) - size[0])
-    if kind == BOX:
-        beyond = np.abs(points) - size
-    else:
-        across = np.hypot(points[:, 0], points[:, 1])
-        along = np.abs(points[:, 2]) - size[1]
-        if kind == CAPSULE:
-            return np.asarray(np.hypot(across, np.maximum(along, 0.0)) - size[0])
-        beyond = np.stack([across - size[0], along], axis=1)
-    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
 
 
 def _triangles(urdf: UrdfFile, mesh: MeshShape, folders: Sequence[Path]) -> Float64:

@@ -25,13 +25,13 @@ from splatctrl_cli.scene.contact import contact_seeds, hidden_objects, is_in_con
 from splatctrl_cli.scene.depth_holes import unanswered_points
 from splatctrl_cli.scene.descent import Descent
 from splatctrl_cli.scene.eviction import room_for
-from splatctrl_cli.scene.keyframes import View, Window, all_halved, make_view
+from splatctrl_cli.scene.keyframes import View, Window, all_halved, make_view, seen_through
 from splatctrl_cli.scene.labels import Seen, relabel
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
 from splatctrl_cli.scene.occupancy import OccupancyMap, PeopleMemory
 from splatctrl_cli.scene.posture import RobotPosture, carried
 from splatctrl_cli.scene.relocation import clone, detail_seeds
-from splatctrl_cli.scene.removal import REASONS, removals, seen_through
+from splatctrl_cli.scene.removal import REASONS, removals
 from splatctrl_cli.scene.render import BLACK, Color, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import (
     Candidates,
@@ -83,6 +83,7 @@ class SceneFitter:
         self.workspace = workspace
         self.seed = seed
         self.num_threads = num_threads(threads)
+        self._pool = ThreadPoolExecutor(self.num_threads)
         self.buffer = SplatBuffer(config.max_splats)
         self.descent = Descent(config, self.buffer, seed, self.num_threads, device)
         self.occupancy = OccupancyMap(workspace, occupancy, self.num_threads)
@@ -99,12 +100,12 @@ class SceneFitter:
     def step(self, frames: Sequence[RgbdFrame], robot: RobotPosture | None = None) -> AuditRow:
         """Take in the frames of one time step: integrate, remove, add or relocate, optimise, label."""
         rng = np.random.default_rng([self.seed, self.num_steps])
+        robot = robot and replace(robot, num_threads=self.num_threads)
         self._find_mounted(frames)
-        with ThreadPoolExecutor(self.num_threads) as pool:
-            config = self.occupancy.config
-            masks = list(pool.map(lambda f: object_mask(f) if robot is None else self_mask(f, robot, config), frames))
-            frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
-            views = list(pool.map(self.view, frames))
+        config, each = self.occupancy.config, self._pool.map
+        masks = list(each(lambda f: object_mask(f) if robot is None else self_mask(f, robot, config), frames))
+        frames = [without_mixed(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
+        views = list(each(self.view, frames))
         seen = list(zip(frames, masks, strict=True))
         if self.descent.background is None:
             self.descent.background = self._behind(views)
@@ -277,7 +278,9 @@ class SceneFitter:
         for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
             others = [views[(index + k) % len(views)] for k in spread(range(len(views)), SEED_ASKED_VIEWS)]
             for label, sources in found.items():
-                source = candidates(view.frame, thinned(added[index] & of_label(mask, label), every))
+                source = candidates(
+                    view.frame, thinned(added[index] & of_label(mask, label), every), self.num_threads
+                )
                 sources.append(source.select(self._is_grounded(source.points, others)))
         everything = [source for sources in found.values() for source in sources]
         num_candidates = sum(len(source) for source in everything)
@@ -285,13 +288,14 @@ class SceneFitter:
             return Filled()
         if self.density is None or num_candidates > SEED_MUCH_MORE * self.density.num_candidates:
             count = max(int(self.config.fill * self.config.max_splats), 1)
-            self.density = density_for(everything, count, self.config)
+            self.density = density_for(everything, count, self.config, self.num_threads)
         reserve = int(self.config.gap_reserve * self.config.max_splats)
         filled = Filled()
         for label, sources in found.items():
             if not any(len(source) for source in sources):
                 continue
-            seeds = seeds_at(sources, self.buffer.centers[self._standing_for(label)], self.density, self.config)
+            live = self.buffer.centers[self._standing_for(label)]
+            seeds = seeds_at(sources, live, self.density, self.config, self.num_threads)
             if len(views) > SEED_ASKED_VIEWS:
                 seeds = seeds.select(self._is_grounded(seeds.centers, views))
             filled += self.buffer.fill(seeds, self.config.initial_opacity, keep_free=reserve, label=label)
@@ -308,10 +312,12 @@ class SceneFitter:
         filled = Filled()
         for label in (Label.OBJECT, Label.ROBOT):
             splats = self.splats().select(self._standing_for(label)[self.buffer.is_alive])
-            bare = bare_voxels(self.occupancy, splats, self.workspace, self.config, half)
+            bare = np.zeros((0, 3), np.float32)
+            if label == Label.OBJECT:
+                bare = bare_voxels(self.occupancy, splats, self.workspace, self.config, half)
             seeds = gap_seeds(
                 [(v.frame, v.mappable & of_label(m, label)) for v, m in zip(views, masks, strict=True)],
-                bare if label == Label.OBJECT else bare[:0],
+                bare,
                 self.occupancy.config.voxel,
                 splats,
                 self.config,
@@ -365,10 +371,7 @@ class SceneFitter:
 
     def _is_grounded(self, points: Float32, views: Sequence[View]) -> Bool:
         """Points (K,) that no view sees through: what one sensor measured and another looks past was noise."""
-        is_grounded = np.ones(len(points), bool)
-        for view in views:
-            is_grounded &= ~seen_through(points, view.frame, self.occupancy.config.see_through, view.nearest)
-        return is_grounded
+        return ~seen_through(points, views, self.occupancy.config.see_through, self.num_threads)
 
     def _audit(
         self, views: Sequence[View], filled: Filled, removed: dict[str, int], known: dict[int, LossTerms]

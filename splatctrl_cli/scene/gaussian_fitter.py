@@ -17,9 +17,8 @@ from splatctrl_cli.records import Box, Float32, GaussianSet, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.densify import Densified, densify, fresh, reset_opacity
 from splatctrl_cli.scene.gaussians import gaussians_of, seeded
-from splatctrl_cli.scene.keyframes import View, make_view
+from splatctrl_cli.scene.keyframes import View, make_view, seen_through
 from splatctrl_cli.scene.mounted import background_color, mounted_pixels, spread_views
-from splatctrl_cli.scene.removal import seen_through
 from splatctrl_cli.scene.render import loss_weights, mean_loss, psnr_of
 from splatctrl_cli.scene.seeding import candidates, density_for, inside_workspace, seeds_at, world_points
 
@@ -183,10 +182,7 @@ def first_seeds(views: Sequence[View], config: Config) -> Seeds:
     sources = []
     for view in views:
         found = candidates(view.frame, view.mappable)
-        keep = np.ones(len(found), bool)
-        for other in views:
-            keep &= ~seen_through(found.points, other.frame, config.occupancy.see_through, other.nearest)
-        sources.append(found.select(keep))
+        sources.append(found.select(~seen_through(found.points, views, config.occupancy.see_through)))
     no_splats: Float32 = np.zeros((0, 3), np.float32)
     if not any(len(source) for source in sources):
         return Seeds(centers=no_splats, radii=np.zeros(0, np.float32), colors=no_splats)

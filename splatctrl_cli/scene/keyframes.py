@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import NEAREST_REACH
 from splatctrl_cli.geometry import invert_transform
+from splatctrl_cli.kernels import points
 from splatctrl_cli.kernels.raster import TargetView
 from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.removal import nearest_depth
@@ -54,6 +55,17 @@ def make_view(frame: RgbdFrame, mappable: Bool, mounted: Bool | None = None, *, 
     )
     camera = camera_array(frame.intrinsics, frame.T_world_camera)
     return View(frame=frame, camera=camera, target=target, reach=reach)
+
+
+def seen_through(centers: Float32, views: Sequence[View], tolerance: float, num_threads: int = 1) -> Bool:
+    """Splats (N,) that float before what one of the views measured: nearer than every valid depth around their pixel.
+
+    "Around" is what `nearest_depth` says, and "nearer" by more than `tolerance` [m], so that neither a silhouette nor
+    the sensor's noise takes a splat off its surface. Finer than the voxels: a voxel that holds both a surface and the
+    air before it stays occupied.
+    """
+    cameras, nearest = [view.camera for view in views], [view.nearest for view in views]
+    return points.seen_through(centers, cameras, nearest, tolerance, num_threads)
 
 
 def halved(view: View) -> View:

@@ -257,6 +257,8 @@ class PeopleMemory:
         lost = unseen[now_ns - since_ns > self.memory * 1e9]
         entity[lost] &= np.uint8(~Label.HUMAN & 0xFF)
         log_odds[lost], num_updates[lost] = 0.0, 0
+        if not len(self.voxels) and all(frame.human is None for frame in frames):
+            return  # there was nobody, and nobody came
         self.voxels = np.flatnonzero(entity & Label.HUMAN)
         self.stamps_ns = np.full(len(self.voxels), now_ns, np.int64)
         is_still = np.isin(unseen, self.voxels)

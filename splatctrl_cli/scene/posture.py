@@ -16,7 +16,7 @@ class RobotPosture:
     """Where the robot's spheres are: centers (S, 3) [m], world; radii (S,) [m]; T_world_link (S, 4, 4).
 
     surface: the robot's collision geometry, None where its spheres are all that is known; T_world_surface: by frame
-    stamp [ns], the poses (L, 4, 4) of the surface's links.
+    stamp [ns], the poses (L, 4, 4) of the surface's links. num_threads: that distances are computed on.
     """
 
     centers: Float64
@@ -24,6 +24,7 @@ class RobotPosture:
     T_world_link: Float64
     surface: RobotSurface | None = None
     T_world_surface: Mapping[int, Float64] = field(default_factory=dict)
+    num_threads: int = 1
 
     def seen_at(self, stamp_ns: int) -> tuple[RobotSurface, Float64]:
         """The surface and the poses (L, 4, 4) of its links at a frame's stamp; of the spheres where there is none."""
@@ -36,12 +37,12 @@ class RobotPosture:
         its spheres where it has triangles, which have no distance.
         """
         surface, T = self._solids()
-        return surface.distance(T, points_world)
+        return surface.distance(T, points_world, num_threads=self.num_threads)
 
     def distance_to_moving(self, points_world: NDArray[np.floating]) -> Float64:
         """The same to the solids of links that joints move."""
         surface, T = self._solids()
-        return surface.distance(T, points_world, without=surface.fixed)
+        return surface.distance(T, points_world, without=surface.fixed, num_threads=self.num_threads)
 
     def _solids(self) -> tuple[RobotSurface, Float64]:
         surface, T = self.seen_at(max(self.T_world_surface, default=0))

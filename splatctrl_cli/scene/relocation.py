@@ -1,7 +1,7 @@
 """What to do with splats that nothing needs: clones of opaque ones (3DGS-MCMC), or detail where colours are wrong."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import SEED_OVERSAMPLING
-from splatctrl_cli.records import Float32, Float64, RgbdFrame
+from splatctrl_cli.records import Bool, Float32, Float64, RgbdFrame
 from splatctrl_cli.scene.buffer import Filled, Seeds, SplatBuffer
-from splatctrl_cli.scene.seeding import NO_SEEDS, thinned, thinning, world_points
+from splatctrl_cli.scene.seeding import NO_SEEDS, candidates, thinned, thinning
 
 
 def clone_shape(opacity: Float64, radius: Float64, count: NDArray[np.intp]) -> tuple[Float64, Float64]:
@@ -60,27 +60,55 @@ def detail_seeds(misfits: Sequence[Misfit], num_seeds: int, config: SceneConfig,
     The error is a mean over 3 x 3 pixels; a pixel stands for the area of surface that it sees. No two are nearer to
     each other than their diameters, so that several views do not seed the same spot.
     """
-    points, colors, sizes, weights = [], [], [], []
     every = thinning(misfit.error > 0 for misfit in misfits)
-    for misfit in misfits:
-        frame, mask = misfit.frame, thinned(misfit.error > 0, every)
-        focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
-        points.append(world_points(frame)[mask].astype(np.float32))
-        colors.append(frame.color[mask].astype(np.float32) / 255.0)
-        sizes.append((frame.depth[mask] / focal).astype(np.float32))
-        weights.append(np.square(uniform_filter(misfit.error, 3)[mask] * frame.depth[mask], dtype=np.float64))
-    weight = np.concatenate(weights)
+    masks = [thinned(misfit.error > 0, every) for misfit in misfits]
+    weight = np.concatenate(
+        [
+            np.square(uniform_filter(misfit.error, 3)[mask] * misfit.frame.depth[mask], dtype=np.float64)
+            for misfit, mask in zip(misfits, masks, strict=True)
+        ]
+    )
     count = min(SEED_OVERSAMPLING * num_seeds, int(np.count_nonzero(weight)))
     if count == 0:
         return NO_SEEDS
-    drawn = rng.choice(len(weight), size=count, replace=False, p=weight / weight.sum())
-    all_points, size = np.concatenate(points)[drawn], np.concatenate(sizes)[drawn]
-    kept = _apart(all_points, 2.0 * size)[:num_seeds]
-    return Seeds(
-        centers=all_points[kept],
-        radii=np.clip(size[kept], config.min_radius, config.max_radius),
-        colors=np.concatenate(colors)[drawn][kept],
+    found = _pixels([misfit.frame for misfit in misfits], masks, drawn(weight, count, rng))
+    kept = _apart(found.centers, 2.0 * found.radii)[:num_seeds]
+    return replace(found.select(kept), radii=np.clip(found.radii[kept], config.min_radius, config.max_radius))
+
+
+def drawn(weight: Float64, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """`count` different indices, drawn in proportion to weight (K,), of which as many are above 0: what
+    ``rng.choice(K, count, replace=False, p=weight / weight.sum())`` draws, without its checks of millions.
+    """
+    left = weight / weight.sum()
+    found = np.zeros(0, np.intp)
+    while len(found) < count:
+        left[found] = 0.0
+        reached = np.cumsum(left)
+        reached /= reached[-1]
+        more = reached.searchsorted(rng.random(count - len(found)), side="right")
+        _, first = np.unique(more, return_index=True)
+        found = np.concatenate([found, more[np.sort(first)]])
+    return found
+
+
+def _pixels(frames: Sequence[RgbdFrame], masks: Sequence[Bool], chosen: NDArray[np.intp]) -> Seeds:
+    """The chosen (K,) of the pixels of masks (H, W), counted frame after frame, as seeds of their own size."""
+    order = np.argsort(chosen, kind="stable")
+    parts, first = [], 0
+    for frame, mask in zip(frames, masks, strict=True):
+        pixels = np.flatnonzero(mask)
+        begin, end = np.searchsorted(chosen[order], [first, first + len(pixels)])
+        only = np.zeros(mask.shape, bool)
+        only.reshape(-1)[pixels[chosen[order[begin:end]] - first]] = True
+        parts.append(candidates(frame, only))
+        first += len(pixels)
+    found = Seeds(
+        centers=np.concatenate([part.points for part in parts]),
+        radii=np.concatenate([part.pixels for part in parts]),
+        colors=np.concatenate([part.colors for part in parts]),
     )
+    return found.select(np.argsort(order))
 
 
 def _apart(points: Float32, distances: Float32) -> NDArray[np.intp]:

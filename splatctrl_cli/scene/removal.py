@@ -5,7 +5,6 @@ import numpy as np
 
 from splatctrl_cli.config import OccupancyConfig
 from splatctrl_cli.config.fixed import NEAREST_REACH
-from splatctrl_cli.geometry import invert_transform, project, transform_points
 from splatctrl_cli.records import Bool, Box, Float32, RgbdFrame
 from splatctrl_cli.scene.buffer import SplatBuffer
 from splatctrl_cli.scene.occupancy import OccupancyMap
@@ -23,23 +22,6 @@ def nearest_depth(frame: RgbdFrame, reach: float = NEAREST_REACH) -> Float32:
     half = max(1, round(reach * frame.intrinsics.fx / float(np.median(valid))))
     depth = np.where(frame.depth > 0, frame.depth, np.float32(np.inf))
     return np.asarray(cv2.erode(depth, np.ones((2 * half + 1, 2 * half + 1), np.uint8)), np.float32)
-
-
-def seen_through(centers: Float32, frame: RgbdFrame, tolerance: float, nearest: Float32 | None = None) -> Bool:
-    """Splats (N,) that float before what a frame measured: nearer than every valid depth around their pixel.
-
-    "Around" is what `nearest_depth` says, given where it is known, and "nearer" by more than `tolerance` [m], so that
-    neither a silhouette nor the sensor's noise takes a splat off its surface. Finer than the voxels: a voxel that
-    holds both a surface and the air before it stays occupied.
-    """
-    k = frame.intrinsics
-    points = transform_points(invert_transform(frame.T_world_camera), centers)
-    is_ahead = points[:, 2] > 0
-    pixels = np.floor(project(k, np.where(is_ahead[:, None], points, 1.0)) + 0.5)
-    is_inside = is_ahead & np.all((pixels >= 0) & (pixels < [k.width, k.height]), axis=1)
-    u, v = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
-    measured = (nearest_depth(frame) if nearest is None else nearest)[v, u]
-    return np.asarray(is_inside & np.isfinite(measured) & (points[:, 2] < measured - tolerance))
 
 
 def removals(

@@ -5,16 +5,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.config.fixed import SEED_CROWDED, SEED_LEVELS, SEED_MOST_PIXELS
-from splatctrl_cli.geometry import back_project, back_project_pixels, transform_points
+from splatctrl_cli.kernels.points import Cubes, SplatTree, back_projected
+from splatctrl_cli.kernels.raster import pack_camera
 from splatctrl_cli.records import Bool, Box, Columns, Float32, Float64, RgbdFrame, SplatSet
 from splatctrl_cli.scene.buffer import Seeds
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, num_cubes, tolerance_for
+from splatctrl_cli.scene.seed_octree import CubeLevel, cube_levels, leaves, tolerance_for
 
 NO_SEEDS = Seeds(
     centers=np.zeros((0, 3), np.float32), radii=np.zeros(0, np.float32), colors=np.zeros((0, 3), np.float32)
@@ -23,14 +23,17 @@ NO_SEEDS = Seeds(
 
 def world_points(frame: RgbdFrame) -> Float64:
     """Back-projected points (H, W, 3) [m], world; meaningless where the depth is 0."""
-    return transform_points(frame.T_world_camera, back_project(frame.intrinsics, frame.depth))
+    return back_projected(_placed(frame), frame.depth).reshape(*frame.depth.shape, 3)
 
 
-def world_points_at(frame: RgbdFrame, mask: Bool) -> Float64:
+def world_points_at(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Float64:
     """Back-projected points (K, 3) [m], world, of the pixels of a mask (H, W): the same as all, then those."""
-    v, u = np.nonzero(mask)
-    points = back_project_pixels(frame.intrinsics, u, v, frame.depth[mask])
-    return transform_points(frame.T_world_camera, points)
+    return back_projected(_placed(frame), frame.depth, mask, num_threads)
+
+
+def _placed(frame: RgbdFrame) -> Float64:
+    k = frame.intrinsics
+    return pack_camera(k.fx, k.fy, k.cx, k.cy, k.width, k.height, frame.T_world_camera)
 
 
 def inside_workspace(frame: RgbdFrame, points_world: Float64, workspace: Box, min_range: float = 0.0) -> Bool:
@@ -77,12 +80,12 @@ def thinned(mask: Bool, every: int) -> Bool:
     return kept.reshape(mask.shape)
 
 
-def candidates(frame: RgbdFrame, mask: Bool) -> Candidates:
+def candidates(frame: RgbdFrame, mask: Bool, num_threads: int = 1) -> Candidates:
     """What the pixels of a mask (H, W) offer."""
     focal = 0.5 * (frame.intrinsics.fx + frame.intrinsics.fy)
     colors = frame.color[mask].astype(np.float32) / 255.0
     return Candidates(
-        points=world_points_at(frame, mask).astype(np.float32),
+        points=world_points_at(frame, mask, num_threads).astype(np.float32),
         colors=colors,
         pixels=(frame.depth[mask] / focal).astype(np.float32),
     )
@@ -99,7 +102,7 @@ class SeedDensity:
     num_candidates: int = 0
 
 
-def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig) -> SeedDensity:
+def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig, num_threads: int = 1) -> SeedDensity:
     """The density that spends at most `count` seeds on the candidates.
 
     Cubes start at the edge at which splats of the largest radius still cover a surface; where that is too many
@@ -108,14 +111,18 @@ def density_for(sources: Sequence[Candidates], count: int, config: SceneConfig) 
     points, colors, _ = _joined(sources)
     extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
     edge = config.max_radius / config.radius_per_edge
-    while edge < extent and num_cubes(points, edge) > count:
+    while edge < extent and len(Cubes(points, edge, num_threads)) > count:
         edge *= 1.05
-    tolerance = tolerance_for(cube_levels(points, colors, edge, SEED_LEVELS), count)
+    tolerance = tolerance_for(cube_levels(points, colors, edge, SEED_LEVELS, num_threads), count)
     return SeedDensity(edge=edge, tolerance=tolerance, num_candidates=len(points))
 
 
 def seeds_at(
-    sources: Sequence[Candidates], live_centers: Float32, density: SeedDensity, config: SceneConfig
+    sources: Sequence[Candidates],
+    live_centers: Float32,
+    density: SeedDensity,
+    config: SceneConfig,
+    num_threads: int = 1,
 ) -> Seeds:
     """One seed per standing cube over the candidates of several views, finest cubes first.
 
@@ -126,7 +133,7 @@ def seeds_at(
     cube instead, so r = min(max(radius_per_edge * edge, D/f), r_max).
     """
     points, colors, pixel = _joined(sources)
-    levels = cube_levels(points, colors, density.edge, SEED_LEVELS)
+    levels = cube_levels(points, colors, density.edge, SEED_LEVELS, num_threads)
     chosen = leaves(levels, density.tolerance)
     parts = [_seeds_of(level, mask, pixel, live_centers, config) for level, mask in zip(levels, chosen, strict=True)]
     return parts[-1].joined(*parts[-2::-1])
@@ -151,14 +158,14 @@ def gap_seeds(
     now; a centre may be half a voxel off its surface. With `half` 0 or 1 only every second of the rows: the other
     half waits.
     """
-    sources, spheres = [], SplatTree(splats, num_threads)
+    sources, spheres = [], SplatTree(splats.centers, splats.radii, num_threads)
     for frame, mappable in views:
         mask = mappable.copy()
         step = _gap_stride(frame, config.max_gap) if stride is None else stride
         rows = np.arange(len(mask))
         mask[(rows % step != 0) | ((rows // step) % 2 == (2 if half is None else 1 - half))] = False
         mask[:, np.arange(mask.shape[1]) % step != 0] = False
-        mask[mask] = spheres.are_further(world_points_at(frame, mask), config.max_gap)
+        mask[mask] = spheres.are_further(world_points_at(frame, mask, num_threads), config.max_gap)
         if mask.any():
             sources.append(candidates(frame, mask))
     forgotten = occupied[spheres.are_further(occupied, config.max_gap + 0.5 * voxel)]
@@ -167,7 +174,7 @@ def gap_seeds(
     if not sources:
         return NO_SEEDS
     all_points, colors, pixel = _joined(sources)
-    level = cube_levels(all_points, colors, config.max_radius / config.radius_per_edge, 1)[0]
+    level = cube_levels(all_points, colors, config.max_radius / config.radius_per_edge, 1, num_threads)[0]
     everything, no_splats = np.ones(len(level.points), bool), np.zeros((0, 3), np.float32)
     return _seeds_of(level, everything, pixel, no_splats, config)
 
@@ -177,32 +184,6 @@ def _gap_stride(frame: RgbdFrame, max_gap: float) -> int:
     depth = frame.depth[::8, ::8]
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     return max(3, round(0.5 * max_gap * frame.intrinsics.fx / typical))
-
-
-class SplatTree:
-    """Splats to look for from many points."""
-
-    def __init__(self, splats: SplatSet, num_threads: int) -> None:
-        self._num, self._num_threads = len(splats), num_threads
-        self._radii = np.append(splats.radii, np.float32(0.0))  # the last of what is not found, infinitely far
-        self._tree = cKDTree(splats.centers)
-
-    def are_further(self, points: NDArray[np.floating], gap: float) -> Bool:
-        """Points (K, 3) further than `gap` [m] from the spheres of the eight splats with the nearest centres.
-
-        The nearest settles most of them, at a third of the cost of eight.
-        """
-        if not self._num or not len(points):
-            return np.ones(len(points), bool)
-        most = float(gap + self._radii.max()) * 1.001
-        distance, nearest = self._tree.query(points, distance_upper_bound=most, workers=self._num_threads)
-        is_further: Bool = distance - self._radii[nearest] > gap
-        order = np.arange(1, min(8, self._num) + 1)
-        distance, nearest = self._tree.query(
-            points[is_further], k=order, distance_upper_bound=most, workers=self._num_threads
-        )
-        is_further[is_further] = (distance - self._radii[nearest]).min(axis=1) > gap
-        return is_further
 
 
 def _of_voxels(centers: Float32, splats: SplatSet) -> Candidates:

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
 from splatctrl_cli.config.fixed import OCCUPIED_WITH_SPLATS, SPLATS_ON_SURFACE
+from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Label, SplatSet
-from splatctrl_cli.scene.seeding import SplatTree
 from splatctrl_cli.scene.unrepresented import representing_reach
 from splatctrl_cli.voxels import SWEPT, KnownVoxels, VoxelState
 
@@ -51,7 +51,9 @@ def agreement_with_grid(
     )
     cells = np.argwhere((grid.log_odds > least) & (grid.entity & SWEPT == 0))
     centers = (grid.origin + grid.voxel * cells).astype(np.float32)
-    is_missing = SplatTree(splats, 1).are_further(centers, representing_reach(scene, grid.voxel))
+    is_missing = SplatTree(splats.centers, splats.radii, 1).are_further(
+        centers, representing_reach(scene, grid.voxel)
+    )
     if len(known.unrepresented) and is_missing.any():
         distance, _ = cKDTree(known.unrepresented.centers).query(centers[is_missing])
         is_missing[is_missing] = distance > 0.5 * grid.voxel

@@ -6,9 +6,9 @@ import math
 import numpy as np
 
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, Float32, Label, SplatSet
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.seeding import SplatTree
 from splatctrl_cli.voxels import Balls
 
 
@@ -24,7 +24,7 @@ def unrepresented_voxels(occupancy: OccupancyMap, splats: SplatSet, config: Scen
     voxels = occupancy.occupied_voxels()
     voxels = voxels[~_surely_near(occupancy, others, reach).reshape(-1)[voxels]]
     centers = occupancy.centers_of(voxels)
-    is_missing = SplatTree(others, occupancy.num_threads).are_further(centers, reach)
+    is_missing = SplatTree(others.centers, others.radii, occupancy.num_threads).are_further(centers, reach)
     is_human = occupancy.entity.reshape(-1)[voxels[is_missing]] & Label.HUMAN > 0
     labels = np.where(is_human, np.uint8(Label.HUMAN), np.uint8(Label.OBJECT))
     return Balls.of_voxels(centers[is_missing], occupancy.config.voxel, labels)

@@ -63,6 +63,7 @@ def test_frames_without_masks_that_look_through_a_person_take_the_label() -> Non
     people.take_in(voxels, [at(HERE, 0.0)])
     people.take_in(voxels, [at(frame(), 0.1)])
     assert humans(voxels) == 0
+    assert len(people.voxels) == 0
 
 
 @pytest.mark.parametrize(("memory", "stays"), [(0.5, False), (5.0, True)])

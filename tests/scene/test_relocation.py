@@ -6,7 +6,7 @@ import pytest
 from splatctrl_cli.config import SceneConfig
 from splatctrl_cli.records import Float64, Label
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
-from splatctrl_cli.scene.relocation import Misfit, clone_shape, clone_sources, detail_seeds
+from splatctrl_cli.scene.relocation import Misfit, clone_shape, clone_sources, detail_seeds, drawn
 from tests.scene.wall import HEIGHT, INTRINSICS, frame
 
 CONFIG = SceneConfig()
@@ -91,3 +91,12 @@ def test_no_detail_is_seeded_where_every_colour_is_right() -> None:
     seen = frame()
     misfits = [Misfit(frame=seen, error=np.zeros(seen.depth.shape, np.float32))]
     assert len(detail_seeds(misfits, 30, CONFIG, np.random.default_rng(0))) == 0
+
+
+def test_pixels_are_drawn_as_numpy_draws_them() -> None:
+    """Heavy ones are drawn again and again, which takes several rounds."""
+    weight = np.random.default_rng(1).random(500) ** 8
+    weight[::7] = 0.0
+    for count in (1, 30, int(np.count_nonzero(weight))):
+        wanted = np.random.default_rng(2).choice(500, count, replace=False, p=weight / weight.sum())
+        np.testing.assert_array_equal(drawn(weight, count, np.random.default_rng(2)), wanted)

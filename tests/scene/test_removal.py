@@ -4,13 +4,18 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig
-from splatctrl_cli.records import Bool
+from splatctrl_cli.records import Bool, RgbdFrame
 from splatctrl_cli.scene.buffer import Seeds, SplatBuffer
+from splatctrl_cli.scene.keyframes import View, make_view, seen_through
 from splatctrl_cli.scene.occupancy import OccupancyMap
-from splatctrl_cli.scene.removal import removals, seen_through
+from splatctrl_cli.scene.removal import removals
 from tests.scene.wall import WORKSPACE, frame
 
 FLOOR, AIR, OUTSIDE, BELOW = [0.2, 0.2, 0.0], [0.2, 0.2, 0.3], [3.0, 0.0, 0.0], [0.0, 0.0, 0.1]
+
+
+def view(seen: RgbdFrame) -> View:
+    return make_view(seen, seen.depth > 0)
 
 
 def buffer() -> SplatBuffer:
@@ -74,20 +79,21 @@ def test_uncertainty_is_tolerated_for_a_while() -> None:
 
 @pytest.mark.parametrize(("height", "floats"), [(0.0, False), (0.01, False), (0.03, True), (-0.1, False)])
 def test_a_splat_that_a_camera_sees_through_floats(height: float, floats: bool) -> None:
-    assert seen_through(np.float32([[0.1, 0.1, height]]), frame(), 0.015).tolist() == [floats]
+    assert seen_through(np.float32([[0.1, 0.1, height]]), [view(frame())], 0.015).tolist() == [floats]
 
 
 def test_a_silhouette_does_not_make_its_own_splats_float() -> None:
     rim = np.float32([[0.099, 0.0, 0.2], [0.105, 0.0, 0.2], [0.16, 0.0, 0.2]])
-    assert seen_through(rim, frame(block=0.2), 0.015).tolist() == [False, False, True]
+    assert seen_through(rim, [view(frame(block=0.2))], 0.015).tolist() == [False, False, True]
 
 
 def test_what_no_camera_looks_at_does_not_float() -> None:
     blind = frame()
     blind.depth[:] = 0.0
     points = np.float32([[0.1, 0.1, 0.3], [9.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
-    assert not seen_through(points, blind, 0.015).any()
-    assert not seen_through(points[1:], frame(), 0.015).any()
+    assert not seen_through(points, [view(blind)], 0.015).any()
+    assert not seen_through(points[1:], [view(frame())], 0.015).any()
+    assert not seen_through(points, [], 0.015).any()
 
 
 def test_a_trail_goes_from_the_surface_it_lies_on() -> None:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import SceneConfig
+from splatctrl_cli.kernels.points import Cubes
 from splatctrl_cli.records import Float32, SplatSet
 from splatctrl_cli.scene.render import Rendering
-from splatctrl_cli.scene.seed_octree import cube_levels, leaves, num_cubes, tolerance_for
+from splatctrl_cli.scene.seed_octree import cube_levels, leaves, tolerance_for
 from splatctrl_cli.scene.seeding import (
     SeedDensity,
     add_mask,
@@ -212,5 +213,5 @@ def test_more_pixels_than_are_looked_at_together_are_thinned_in_each_view(monkey
 def test_cubes_are_counted_as_they_are_made() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (5000, 3)).astype(np.float32)
     for edge in (0.05, 0.31, 3.0):
-        assert num_cubes(points, edge) == len(cube_levels(points, points, edge, 1)[0].points)
-    assert num_cubes(points[:0], 0.1) == 0
+        assert len(Cubes(points, edge, 2)) == len(cube_levels(points, points, edge, 1)[0].points)
+    assert len(Cubes(points[:0], 0.1, 2)) == 0
