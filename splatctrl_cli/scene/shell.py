@@ -15,8 +15,7 @@ from splatctrl_cli.config.fixed import SCALE_DEPTH, SHELL_ITERATIONS, SHELL_UNME
 from splatctrl_cli.records import Bool, Box, SplatSet
 from splatctrl_cli.scene.buffer import COLOR, SplatBuffer
 from splatctrl_cli.scene.descent import Descent
-from splatctrl_cli.scene.keyframes import View, Window
-from splatctrl_cli.scene.removal import seen_through
+from splatctrl_cli.scene.keyframes import View, Window, seen_through
 from splatctrl_cli.scene.render import Color
 from splatctrl_cli.scene.scale import scaled
 from splatctrl_cli.scene.seeding import (
@@ -111,7 +110,7 @@ class Shell:
         self.buffer.kill(stands)
         depth = float(np.median(np.concatenate([view.target.depth[mask] for view, mask in shown])))
         sources, config = [*_sources(shown), held], scaled(self.config, depth / SCALE_DEPTH)
-        density = density_for(sources, max(int(config.fill * config.max_splats), 1), config)
+        density = density_for(sources, max(int(config.fill * config.max_splats), 1), config, self._num_threads)
         self._begin(depth, density, self._descent.num_iterations)
         self._fill(sources, density)
 
@@ -119,14 +118,13 @@ class Shell:
         """Put splats on the sources, and say how many found no slot."""
         if not any(len(source) for source in sources):
             return 0
-        seeds = seeds_at(sources, self.buffer.centers[self.buffer.is_alive], density, self._scaled)
+        seeds = seeds_at(sources, self.buffer.centers[self.buffer.is_alive], density, self._scaled, self._num_threads)
         return self.buffer.fill(seeds, self.config.initial_opacity).unmet
 
     def _remove(self, views: Sequence[View]) -> None:
         """Those that moved into the workspace, became faint, or that some view sees through."""
         gone = self.workspace.contains(self.buffer.centers) | (self.buffer.opacities < self.config.min_opacity)
-        for view in views:
-            gone |= seen_through(self.buffer.centers, view.frame, self._see_through, view.nearest)
+        gone |= seen_through(self.buffer.centers, views, self._see_through, self._num_threads)
         self.buffer.kill(self.buffer.is_alive & gone)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.config import OccupancyConfig, SceneConfig
+from splatctrl_cli.kernels.points import SplatTree
 from splatctrl_cli.records import Bool, Box, RgbdFrame
 from splatctrl_cli.scene.checkpoint import fitter_state, restore_fitter
 from splatctrl_cli.scene.fitter import SceneFitter
 from splatctrl_cli.scene.posture import RobotPosture
 from splatctrl_cli.scene.render import BLACK, render
-from splatctrl_cli.scene.seeding import SplatTree, world_points
+from splatctrl_cli.scene.seeding import world_points
 from splatctrl_cli.scene.shell import beyond
 from splatctrl_cli.splat_files.splats import check_splats
 from tests.scene.wall import INTRINSICS, WORKSPACE, frame, looking_down
@@ -72,8 +73,9 @@ def test_a_block_across_the_border_is_whole_in_the_map_within_and_in_the_shell_b
     top = points[..., 2] > 0.15
     within, past = top & REACH.contains(points), top & (points[..., 0] > ACROSS + 0.03)
     assert within.sum() > 100 and past.sum() > 50
-    assert not SplatTree(target.splats(), 1).are_further(points[within], CONFIG.max_gap + 0.002).any()
-    assert SplatTree(target.splats(), 1).are_further(points[past], 0.005).all()
+    mapped = SplatTree(target.splats().centers, target.splats().radii, 1)
+    assert not mapped.are_further(points[within], CONFIG.max_gap + 0.002).any()
+    assert mapped.are_further(points[past], 0.005).all()
     assert not REACH.contains(shell.centers).any() and REACH.contains(target.splats().centers).all()
     assert int(((shell.centers[:, 2] > 0.15) & (shell.opacities > 0.3)).sum()) > 3
 
