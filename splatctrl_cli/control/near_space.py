@@ -35,7 +35,8 @@ class NearFigures:
     blind, the share of the moving spheres about which nearly all (`NEAR_BLIND`) of that space was never seen; age [s]
     within which `NEAR_FRESH_SHARE` of the seen points were last seen; ahead [s] by which the last of them was seen
     after the state. NaN where there are too few points. unanswered [m]: the distance of the nearest voxel that
-    cameras looked at without an answer, and its place (3,) [m]; infinite and NaN where there is none.
+    cameras looked at without an answer, and its place (3,) [m]; hidden [m]: how near a point of that new space that
+    was never seen is to the map's surfaces, and its place (3,) [m]; infinite and NaN where there is none.
     """
 
     unseen: float
@@ -44,6 +45,8 @@ class NearFigures:
     ahead: float
     unanswered: float
     place: Float64
+    hidden: float
+    hidden_place: Float64
 
 
 class NearSpace:
@@ -67,8 +70,10 @@ class NearSpace:
                 self._next_ns = stamp_ns + fixed.NEAR_EVERY_NS
         return chosen
 
-    def look(self, stamp_ns: int, q: Float64, known: Seen) -> NearFigures:
-        """What was known about the posture q (J,) at a stamp."""
+    def look(
+        self, stamp_ns: int, q: Float64, known: Seen, distance: Callable[[Float64], Float64] | None = None
+    ) -> NearFigures:
+        """What was known about the posture q (J,) at a stamp; distance: of points (Q, 3) from the map's surfaces."""
         centers = self._model.sphere_centers(q)
         if self._first is None:
             self._first = centers
@@ -89,9 +94,19 @@ class NearSpace:
         if (~is_never).sum() >= fewest:
             ages = (stamp_ns - seen[~is_never]) * 1e-9
             age, ahead = float(np.quantile(ages, fixed.NEAR_FRESH_SHARE)), max(-float(ages.min()), 0.0)
-        distance, place = self._nearest(known.unanswered, centers)
-        distance = max(distance - known.voxel / 2, 0.0)  # from its nearest face
-        return NearFigures(unseen=unseen, blind=blind, age=age, ahead=ahead, unanswered=distance, place=place)
+        unanswered, place = self._nearest(known.unanswered, centers)
+        unanswered = max(unanswered - known.voxel / 2, 0.0)  # from its nearest face
+        hidden, hidden_place = _nearest_of(points[is_new & is_never], distance)
+        return NearFigures(
+            unseen=unseen,
+            blind=blind,
+            age=age,
+            ahead=ahead,
+            unanswered=unanswered,
+            place=place,
+            hidden=hidden,
+            hidden_place=hidden_place,
+        )
 
     def _nearest(self, points: Float64, centers: Float64) -> tuple[float, Float64]:
         """The least distance [m] of points (K, 3) near the arm to its moving spheres, and that point (3,)."""
@@ -103,6 +118,15 @@ class NearSpace:
         away, nearest = (np.asarray(found) for found in cKDTree(points).query(moving))
         sphere = int(np.argmin(away - radii))
         return float(away[sphere] - radii[sphere]), points[nearest[sphere]]
+
+
+def _nearest_of(points: Float64, distance: Callable[[Float64], Float64] | None) -> tuple[float, Float64]:
+    """The least distance [m] of points (Q, 3) to surfaces, and that point (3,)."""
+    away = distance(points) if distance is not None and len(points) else np.full(len(points), np.nan)
+    if np.isnan(away).all():
+        return np.inf, np.full(3, np.nan)
+    least = int(np.nanargmin(away))
+    return float(away[least]), points[least]
 
 
 def _is_outside(points: Float64, centers: Float64, radii: Float64, owners: NDArray[np.integer] | None = None) -> Bool:

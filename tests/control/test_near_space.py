@@ -8,7 +8,7 @@ from splatctrl_cli.config.fixed import NEAR_EVERY_NS
 from splatctrl_cli.control.near_space import NearSpace, Seen
 from splatctrl_cli.records import Float64
 from tests.control.fakes import PlanarArm
-from tests.reference.intervals import blind_share, near_figures
+from tests.reference.intervals import blind_share, hidden, near_figures
 
 SECOND = 1_000_000_000
 FIRST, LATER = np.array([0.0, 0.0]), np.array([1.2, 0.6])
@@ -108,3 +108,30 @@ def test_the_share_of_blind_spheres_is_that_of_the_reference() -> None:
         found = space.look(SECOND, LATER, Seen(last_ns=seen_above)).blind
         assert found == pytest.approx(blind_share(arm, LATER, FIRST, 0.03, seen_above))
     assert found == 1.0
+
+
+@pytest.mark.parametrize("height", [-0.3, 0.0, 0.05, 0.4])
+def test_unseen_space_at_the_margin_is_as_near_to_a_surface_as_by_the_reference(height: float) -> None:
+    """A sheet seen from above alone: what is under it was never seen."""
+    arm, space = PlanarArm(), NearSpace(PlanarArm(), 0.03)
+
+    def seen(points: Float64) -> NDArray[np.int64]:
+        return np.where(points[:, 2] > height, 0, -1)
+
+    def to_sheet(points: Float64) -> Float64:
+        return np.asarray(np.abs(points[:, 2] - height))
+
+    at_first = space.look(0, FIRST, Seen(last_ns=seen), to_sheet)
+    assert at_first.hidden == np.inf and np.isnan(at_first.hidden_place).all()  # the arm was there from the start
+    found = space.look(SECOND, LATER, Seen(last_ns=seen), to_sheet)
+    assert found.hidden == pytest.approx(hidden(arm, LATER, FIRST, 0.03, seen, to_sheet))
+    if np.isfinite(found.hidden):
+        assert found.hidden == pytest.approx(height - found.hidden_place[2])
+    assert np.isfinite(found.hidden) == (height > -0.3)
+
+
+def test_a_map_that_answers_nowhere_hides_nothing() -> None:
+    space = NearSpace(PlanarArm(), 0.03)
+    space.look(0, FIRST, Seen(last_ns=half_seen))
+    found = space.look(SECOND, LATER, Seen(last_ns=half_seen), lambda points: np.full(len(points), np.nan))
+    assert found.hidden == np.inf

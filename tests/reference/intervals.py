@@ -72,6 +72,22 @@ def blind_share(
     return sum(len(found) >= 5 and np.mean(found) >= 0.9 for found in never.values()) / len(moving)
 
 
+def hidden(
+    arm: ArmModel,
+    q: Float64,
+    q_first: Float64,
+    margin: float,
+    last_seen: Callable[[Float64], NDArray[np.int64]],
+    distance: Callable[[Float64], Float64],
+) -> float:
+    """The least distance [m] to surfaces of the points on the shells in new space that were never seen."""
+    found = [np.inf]
+    for _, point in _shells(arm, q, margin):
+        if min(_gaps(arm, q_first, point)) > 0.05 and int(last_seen(point[None])[0]) < 0:
+            found.append(float(distance(point[None])[0]))
+    return min(found)
+
+
 def _shells(arm: ArmModel, q: Float64, margin: float) -> Iterator[tuple[int, Float64]]:
     """Points of the moving spheres' shells outside of all other spheres, and whose they are."""
     steps = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]

@@ -380,6 +380,8 @@ FOUND = {  # runs that were once called safe, by what was wrong with that
     "a-thing-in-space-that-a-lone-camera-never-saw": (0, 2157),
     "a-hidden-side-of-a-thing-that-a-lone-camera-saw": (31, 202),
     "a-thing-that-came-while-no-camera-gave-depth": (47, 280),
+    "the-far-side-of-a-ball-that-a-lone-camera-saw": (73, 470),
+    "edges-behind-which-the-arm-passes": (0, 936),
     "a-dark-ball-of-which-patches-alone-return-depth": (89, 36),
     "a-voxel-without-an-answer-whose-face-is-nearer-than-its-centre": (47, 6),
 }

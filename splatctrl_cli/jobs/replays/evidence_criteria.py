@@ -8,6 +8,7 @@ from splatctrl_cli.config.fixed import (
     BLIND,
     CLOCKS_APART,
     COARSE_VOXEL,
+    HIDDEN,
     MISPLACED,
     SAME_MOMENT_NS,
     SOME_UNSEEN,
@@ -33,8 +34,8 @@ from splatctrl_cli.jobs.replays.metrics import is_blank
 def known_space(judged: Judged) -> Iterator[Reason]:
     """Cameras saw at least 53 % of the space around the moving arm; where they saw less than two thirds, at most 9 %
     of the moving spheres come to space of which less than a tenth was seen; at most `--max-unknown` of the sphere
-    centres are in space never seen; within the margin there is no place where cameras looked and got no depth. A
-    baked field needs its channel `observed`.
+    centres are in space never seen; the margin about the arm reaches no unseen space within 30 mm of a surface, nor a
+    place where cameras looked and got no depth. A baked field needs its channel `observed`.
     """
     for column, allowed, least, words in (
         ("unseen", UNSEEN, 0.0, "of the space about the arm that the motion comes to was never seen by a camera"),
@@ -57,6 +58,7 @@ def known_space(judged: Judged) -> Iterator[Reason]:
             )
         elif near is not None:
             yield held(f"{100 * near[0]:.0f} % {words}", near[0], allowed, "", near[2])
+    yield from _hidden(judged)
     yield from _unanswered(judged)
     yield from _unknown_share(judged)
 
@@ -79,6 +81,28 @@ def _unknown_share(judged: Judged) -> Iterator[Reason]:
         time_s=seconds_at(judged, first),
         remedy="add a camera, or give a larger --max-unknown",
         count=judged.num_states,
+    )
+
+
+def _hidden(judged: Judged) -> Iterator[Reason]:
+    """Space that no camera saw, a margin away from the arm and close to a surface of the map: one side of a thing
+    says little of where the other ends.
+    """
+    distance, margin = judged.replay.near["hidden"], judged.replay.margin
+    if not np.any(distance < HIDDEN):
+        return
+    worst = int(np.nanargmin(distance))
+    yield lacking(
+        sentence=f"space that no camera saw is {mm(margin)} from the arm, the margin, and "
+        f"{mm(max(distance[worst], 0.0))} from a surface of the map: it may go on there, allowed {mm(HIDDEN)}",
+        value=float(distance[worst]),
+        threshold=HIDDEN,
+        unit="m",
+        time_s=seconds_at(judged, worst),
+        place=tuple(judged.replay.near["hidden_place"][worst].tolist()),
+        cause="at ({:.2f}, {:.2f}, {:.2f}) m".format(*judged.replay.near["hidden_place"][worst]),
+        remedy="add a camera that sees that side",
+        count=int((distance < HIDDEN).sum()),
     )
 
 

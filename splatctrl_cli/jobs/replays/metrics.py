@@ -178,6 +178,7 @@ OF_STATES: Declared = (
     folded("max_unseen_share", LARGEST, _of("near", "unseen"), scale=BAD_SHARE),
     folded("max_blind_share", LARGEST, _of("near", "blind"), scale=BAD_SHARE),
     folded("min_unanswered", LEAST, _of("near", "unanswered"), num_states, scale=GAP),
+    folded("min_hidden", LEAST, _of("near", "hidden"), num_states, scale=GAP),
     folded("max_evidence_age_s", LARGEST, _of("near", "age"), scale=AGE),
     _single("unjudged_s", lambda r: float(r.between["unbounded"].sum()) + r.lead_in_s, _intervals, AGE),
     folded(

@@ -217,21 +217,32 @@ class ReplayRecord:
     def _look_around(self, part: AuditTrace) -> None:
         """What was known of the space about the arm, at some of the states."""
         num = len(part.stamp_ns)
-        unseen, blind, age, ahead, unanswered = np.full((5, num), np.nan)
-        place = np.full((num, 3), np.nan)
+        unseen, blind, age, ahead, unanswered, hidden = np.full((6, num), np.nan)
+        place, hidden_place = np.full((2, num, 3), np.nan)
         if self._scene.has_seen_times:
             self.hindsight.add(part.stamp_ns, part.position)
         for at in self._near.due(part.stamp_ns):
             stamp = int(part.stamp_ns[at])
             known = self._scene.seen_at(stamp)
             if known is not None:
-                figures = self._near.look(stamp, part.position[at], known)
+                exact = self._scene.at(stamp).distances["exact"]
+                figures = self._near.look(stamp, part.position[at], known, exact)
                 unseen[at], blind[at] = figures.unseen, figures.blind
                 unanswered[at], place[at] = figures.unanswered, figures.place
+                hidden[at], hidden_place[at] = figures.hidden, figures.hidden_place
                 if self._scene.has_seen_times:
                     age[at], ahead[at] = figures.age, figures.ahead
                     self.hindsight.looked(stamp, figures.age)
-        self.near.append(unseen=unseen, blind=blind, age=age, ahead=ahead, unanswered=unanswered, place=place)
+        self.near.append(
+            unseen=unseen,
+            blind=blind,
+            age=age,
+            ahead=ahead,
+            unanswered=unanswered,
+            place=place,
+            hidden=hidden,
+            hidden_place=hidden_place,
+        )
 
     def _tell_represented(self, part: AuditTrace) -> None:
         """The clearance (T,) [m] without the balls of voxels that have no splat, where these make a difference."""
