@@ -10,7 +10,7 @@ from splatctrl_cli.records import Float64, LossReport
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.voxels import UNANSWERED
 from tests.cli.replay_desk import SECOND, START
-from tests.jobs.stage import FAR, QUARTER, Stage, ball_beside, passing, resting, states_on, voxels
+from tests.jobs.stage import FAR, QUARTER, Stage, ball_beside, passing, resting, states_on, unseen_about, voxels
 
 
 def self_collision(arm: RobotModel) -> Float64:
@@ -110,6 +110,13 @@ def never_seen_where_it_goes(stage: Stage) -> None:
     stage.last_seen = voxels(is_seen=False)
 
 
+def beside_an_unseen_side(stage: Stage) -> None:
+    """The arm ends 25 mm from a ball whose surroundings no camera saw."""
+    stage.states = passing(np.array([1.8, 0, 0, 0, 0, 0, 0]), num=11)
+    ball = stage.ball_at_the_end(0.025)
+    stage.balls, stage.last_seen = [FAR, ball], unseen_about(ball[0], ball[1] + 0.1)
+
+
 def no_answer_beside_it(stage: Stage) -> None:
     """Nobody got depth from the voxel that the arm ends beside."""
     stage.last_seen = voxels()
@@ -201,6 +208,7 @@ ALONE: dict[str, Broken] = {
         "not evaluable",
         "100 % of the space about the arm",
     ),
+    "unseen side": (beside_an_unseen_side, (), "known space", "not evaluable", "mm from a surface of the map"),
     "no answer": (no_answer_beside_it, (), "known space", "not evaluable", "a place 10.0 mm from the arm"),
     "evidence age": (
         frames_that_renew_nothing,

@@ -183,6 +183,13 @@ def voxels(seen_ns: int = 0, *, is_seen: ArrayLike = True, is_known: ArrayLike =
     )
 
 
+def unseen_about(place: ArrayLike, reach: float) -> KnownVoxels:
+    """Voxels that were all seen but those within `reach` [m] of a place (3,)."""
+    grid = grid_seen()
+    index = np.stack(np.indices(grid.num_updates.shape), axis=-1)
+    return voxels(is_seen=np.linalg.norm(grid.origin + grid.voxel * index - np.asarray(place), axis=-1) > reach)
+
+
 def decisive(verdict: dict[str, Any]) -> dict[str, str]:
     """Outcome by criterion of what did not pass."""
     return {r["criterion"]: r["outcome"] for r in verdict["reasons"] if r["outcome"] != "passed"}

@@ -25,7 +25,19 @@ from tests.jobs.broken import (
     near_margin,
     no_new_map,
 )
-from tests.jobs.stage import FAR, MOVE, QUARTER, Stage, ball_beside, decisive, passing, resting, states_on, voxels
+from tests.jobs.stage import (
+    FAR,
+    MOVE,
+    QUARTER,
+    Stage,
+    ball_beside,
+    decisive,
+    passing,
+    resting,
+    states_on,
+    unseen_about,
+    voxels,
+)
 
 pytestmark = pytest.mark.usefixtures("without_plots")
 
@@ -128,6 +140,14 @@ def test_at_a_mount_only_what_comes_much_nearer_counts(stage: Stage, gap: float,
     stage.later = [beside_the_mount(stage.arm, gap)]
     found, verdict = stage.judged()
     assert (found, decisive(verdict)) == (code, {"static clearance": "failed"} if code else {})
+
+
+def test_what_is_seen_at_a_mount_for_the_first_time_did_not_come(stage: Stage) -> None:
+    """A camera on the hand sees the table about its base when it turns there."""
+    stage.later = [beside_the_mount(stage.arm)]
+    stage.last_seen = unseen_about(stage.later[0][0], 0.1)
+    code, verdict = stage.judged()
+    assert (code, decisive(verdict)) == (0, {})
 
 
 def test_acceleration_limits_count_where_they_are_set(stage: Stage) -> None:

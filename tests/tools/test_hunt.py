@@ -1,4 +1,4 @@
-"""The hunt's generator, its truth and its rules; and the runs nearest to the border, once each."""
+"""The hunt's generator, its truth and its rules."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatctrl_cli.config import Config
 from splatctrl_cli.records import JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.simulate.arm import Capsule
@@ -17,11 +18,20 @@ from tools.hunt.families import CAMERAS, FAMILIES, Draft
 from tools.hunt.faults import Fault
 from tools.hunt.observability import observable
 from tools.hunt.recording import Recorder, Shown
-from tools.hunt.table import Row, border_of, merge_rows, read_rows, report, upper_limit
-from tools.hunt.trial import Trial, draw, record, run, true_robot
-from tools.hunt.world import DURATION_S, World, at_s, draw_cameras, during, moving, positions_of, table
+from tools.hunt.trial import Trial, config_of, draw, family_of, record, true_robot
+from tools.hunt.world import (
+    DURATION_S,
+    NUM_FRAMES,
+    World,
+    at_s,
+    draw_cameras,
+    during,
+    moving,
+    positions_of,
+    table,
+    wrist_camera,
+)
 
-BORDER = Path(__file__).with_name("border.txt")
 START = np.array([-0.1, 0.1, 0.0, -1.9, 0.0, 2.1, 0.4])
 GREY = Texture(pattern="checks", feature=0.05, dark=(0.1, 0.1, 0.1), bright=(0.9, 0.9, 0.9))
 
@@ -202,7 +212,40 @@ def test_each_family_spoils_or_places_something(family: str) -> None:
     for seed in range(20):
         draft = FAMILIES[family](np.random.default_rng(seed))
         is_clean = draft.fault == Fault() and draft.tool is None and draft.cameras == CAMERAS
+        is_clean &= draft.distance == 1 and not draft.settings
         assert is_clean == (family in ("benign", "thin", "touch", "visit", "people"))
+
+
+def test_seeds_below_a_hundred_keep_their_families() -> None:
+    """Rows of campaigns are drawn again by seed and index."""
+    assert [family_of(99, index) for index in (13, 14, 15)] == ["people", "benign", "benign"]
+    assert [family_of(100, index) for index in (13, 14, 18, 19)] == ["people", "behind", "benign", "benign"]
+
+
+def test_settings_that_a_run_draws_are_those_of_its_configuration(model: RobotModel) -> None:
+    index = next(i for i in range(40) if family_of(100, i) == "settings")
+    trial = draw(100, index, model)
+    config = config_of(trial)
+    assert trial.draft.settings
+    for key, value in trial.draft.settings:
+        section, _, name = key.partition(".")
+        assert getattr(getattr(config, section), name) == pytest.approx(value, abs=0.5)
+        assert getattr(getattr(config, section), name) != getattr(getattr(Config(), section), name)
+
+
+def test_a_camera_on_the_hand_rides_with_it_and_sees_nothing_nearer_than_it_can(
+    model: RobotModel, tmp_path: Path
+) -> None:
+    index = next(i for i in range(60) if family_of(100, i) == "wrist")
+    trial = draw(100, index, model)
+    record(trial, model, tmp_path)
+    records = open_source(tmp_path / "log.mcap").records()
+    frames = [r for r in records if isinstance(r, RgbdFrame) and r.camera == "wrist"]
+    assert len(frames) == NUM_FRAMES
+    for frame in frames:
+        hand = model.frame_pose(trial.world.positions(np.array([frame.stamp_ns]))[0], "hand")
+        assert np.allclose(frame.T_world_camera, hand @ wrist_camera().T_world_camera, atol=1e-6)
+        assert frame.depth[frame.depth > 0].min() >= 0.2
 
 
 # --- the same seed, the same run ---
@@ -313,92 +356,3 @@ def test_what_is_narrower_than_half_a_pixel_is_disclaimed(model: RobotModel, tmp
         shown = shown_of(world, Fault(), model, tmp_path)
         seen = replace(shown, target=np.full_like(shown.target, 10))
         assert judged(draft_of(Fault()), world, seen, model)[0] is expected
-
-
-# --- the table ---
-
-
-def row(**changes: object) -> Row:
-    values = {
-        "seed": 0, "index": 1, "family": "benign", "kind": "none", "strength": 0.5, "mode": "audit",
-        "outcome": "safe", "clearance": 0.1, "observable": True, "rule": "seen before", "reason": "",
-    }  # fmt: skip
-    return Row(**(values | changes))  # type: ignore[arg-type]
-
-
-def test_a_false_green_is_safe_in_contact_or_five_millimetres_under_the_margin() -> None:
-    assert row(clearance=-0.001).is_false_green
-    assert row(clearance=0.014).is_false_green
-    assert not row(clearance=0.016).is_false_green
-    assert not row(clearance=-0.001, outcome="contact").is_false_green
-    assert not row(clearance=-0.001, outcome="not evaluable").is_false_green
-
-
-def test_rows_come_back_from_the_table_as_they_were(tmp_path: Path) -> None:
-    rows = [row(), row(index=2, outcome="contact", reason="a, b", clearance=-0.0125, observable=False)]
-    merge_rows(tmp_path / "t.csv", rows[:1])
-    merge_rows(tmp_path / "t.csv", rows[1:])
-    merge_rows(tmp_path / "t.csv", rows)
-    assert read_rows(tmp_path / "t.csv") == rows
-
-
-def test_the_upper_limit_of_no_failure_in_two_thousand_is_fifteen_in_ten_thousand() -> None:
-    assert abs(upper_limit(0, 2000) - 0.0015) < 1e-5
-    assert upper_limit(5, 5) == 1.0
-
-
-def test_the_report_names_false_greens_and_counts_the_benign() -> None:
-    rows = [row(), row(index=2, clearance=-0.01), row(index=3, outcome="contact", reason="clearance 0.001 m")]
-    text = "\n".join(report(rows))
-    assert "false green, contact, observable: 1 of 3 runs" in text
-    assert "0/2 benign" in text
-    assert "1 of 2 safe (50.0 %)" in text
-
-
-def test_the_border_is_safe_by_least_and_broken_by_least() -> None:
-    safe = [row(index=i, clearance=0.02 + 0.01 * i) for i in range(30)]
-    broken = [row(index=100 + i, outcome="failed", clearance=0.014 - 0.001 * i) for i in range(30)]
-    chosen = border_of([*safe, *broken, row(index=200, clearance=0.0), row(index=201, observable=False)])
-    assert [r.index for r in chosen] == [*range(12), *range(100, 112)]
-
-
-# --- the chain ---
-
-
-def border() -> list[tuple[int, int]]:
-    names = [line.split()[0] for line in BORDER.read_text().splitlines() if line and not line.startswith("#")]
-    return [(int(seed), int(index)) for seed, index in (name.split("/") for name in names)]
-
-
-FOUND = {  # runs that were once called safe, by what was wrong with that
-    "an-object-in-space-that-no-camera-saw": (0, 57),
-    "a-map-of-82-splats": (0, 76),
-    "a-rod-whose-splats-were-labelled-robot": (0, 2),
-    "an-arm-that-comes-to-a-side-that-two-long-lenses-never-saw": (7, 57),
-    "a-thing-that-returns-no-depth": (0, 21),
-    "a-thing-that-came-before-the-last-frame-set": (0, 575),
-    "a-thing-in-space-that-a-lone-camera-never-saw": (0, 2157),
-    "a-hidden-side-of-a-thing-that-a-lone-camera-saw": (31, 202),
-    "a-thing-that-came-while-no-camera-gave-depth": (47, 280),
-    "the-far-side-of-a-ball-that-a-lone-camera-saw": (73, 470),
-    "edges-behind-which-the-arm-passes": (0, 936),
-    "a-dark-ball-of-which-patches-alone-return-depth": (89, 36),
-    "a-voxel-without-an-answer-whose-face-is-nearer-than-its-centre": (47, 6),
-}
-
-
-@pytest.mark.parametrize(("seed", "index"), FOUND.values(), ids=FOUND)
-def test_what_was_once_a_false_green_is_none(seed: int, index: int) -> None:
-    found = run(seed, index)
-    assert not found.is_false_green, found
-
-
-@pytest.mark.parametrize(("seed", "index"), border())
-def test_no_run_near_the_border_is_a_false_green(seed: int, index: int) -> None:
-    found = run(seed, index)
-    assert not (found.is_false_green and found.observable), found
-
-
-def test_a_run_is_the_same_twice() -> None:
-    seed, index = border()[0]
-    assert run(seed, index) == run(seed, index)

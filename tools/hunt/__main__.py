@@ -72,7 +72,7 @@ def _row(out: Path, run: Run) -> Row:
         return Row(**json.loads((out / run.result).read_text(encoding="utf-8"))["row"])
     seed, index = _run_name(run.node)
     return Row(
-        seed=seed, index=index, family=family_of(index), kind="", strength=0.0, mode="", outcome="crash",
+        seed=seed, index=index, family=family_of(seed, index), kind="", strength=0.0, mode="", outcome="crash",
         clearance=0.0, observable=True, rule="", reason=(run.cause or run.sentence)[:90],
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
 """The families of the hunt: what each puts before the arm, and what it spoils."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,7 +20,9 @@ class Draft:
     """One family's draw: the kind of the fault in words, its strength (the unit is the kind's own), the target.
 
     second: when [s] the target is near the arm, None for any time; cameras: that are recorded; touches_first: the
-    target may be at the arm from the first moment on; people: names that masks show; only_audit: nothing to drive.
+    target may be at the arm from the first moment on; people: names that masks show; only_audit: nothing to drive;
+    only_closed: always driven. distance: of the cameras, as a share of the usual; has_wrist: beside them one rides on
+    the hand; settings: of the configuration, by key.
     """
 
     kind: str
@@ -35,6 +37,10 @@ class Draft:
     carried: tuple[float, float] | None = None
     people: frozenset[str] = frozenset()
     only_audit: bool = False
+    only_closed: bool = False
+    distance: float = 1.0
+    has_wrist: bool = False
+    settings: tuple[tuple[str, float], ...] = ()
 
 
 def target(rng: np.random.Generator, size: float = 1.0) -> Make:
@@ -290,6 +296,62 @@ def people(rng: np.random.Generator) -> Draft:
     )  # fmt: skip
 
 
+def behind(rng: np.random.Generator) -> Draft:
+    """Driven past things of which one or two cameras see a side."""
+    draft = occlusion(rng)
+    return replace(draft, only_closed=True)
+
+
+def far(rng: np.random.Generator) -> Draft:
+    """Cameras up to three times as far away, with lenses as long or a little wider: depth errs by up to 14 mm."""
+    distance = float(rng.uniform(1.5, 2.8))
+    fewer = tuple(sorted(rng.choice(CAMERAS, size=int(rng.integers(1, 4)), replace=False).tolist()))
+    zoom = distance * float(rng.uniform(0.6, 1.0))
+    kind = f"{len(fewer)} cameras"
+    return Draft(kind=kind, strength=distance, make=target(rng), cameras=fewer, distance=distance, zoom=zoom)
+
+
+def wrist(rng: np.random.Generator) -> Draft:
+    """A camera on the hand, alone or beside one that stands."""
+    fixed = tuple(rng.choice(CAMERAS, size=int(rng.random() < 0.6), replace=False).tolist())
+    draft = visit(rng) if rng.random() < 0.3 else benign(rng)
+    return replace(draft, kind=f"beside {len(fixed)}, {draft.kind}", cameras=fixed, has_wrist=True)
+
+
+def settings(rng: np.random.Generator) -> Draft:
+    """One or two settings that make the map coarser, slower or blinder, as a user may choose them."""
+    names = rng.choice(list(SETTINGS), size=int(rng.integers(1, 3)), replace=False).tolist()
+    chosen = tuple((name, float(np.exp(rng.uniform(*np.log(SETTINGS[name]))))) for name in names)
+    draft = (benign, visit, thin, touch)[int(rng.integers(4))](rng)
+    return replace(draft, kind=" ".join(names), strength=chosen[0][1], settings=chosen)
+
+
+SETTINGS = {  # integers are rounded
+    "occupancy.self_mask_tolerance": (0.006, 0.06),
+    "occupancy.depth_error": (0.003, 0.03),
+    "occupancy.min_range": (0.3, 1.1),
+    "occupancy.max_range": (0.7, 1.5),
+    "occupancy.see_through": (0.0005, 0.01),
+    "occupancy.voxel": (0.02, 0.05),
+    "occupancy.uncertain_patience": (0.3, 2.0),
+    "scene.min_opacity": (0.15, 0.6),
+    "scene.lambda_reg": (0.02, 2.0),
+    "scene.max_gap": (0.03, 1.0),
+    "scene.max_radius": (0.003, 0.019),
+    "scene.first_iterations": (0.3, 10.0),
+    "scene.lr_center": (0.001, 0.1),
+    "scene.lr_log_radius": (0.05, 1.0),
+    "scene.lr_logit_opacity": (0.2, 5.0),
+    "scene.noise": (5e6, 5e8),
+    "scene.contact_radius": (0.001, 0.005),
+    "scene.snapshot_every": (2.0, 5.0),
+    "scene.hole_opacity": (0.01, 0.2),
+    "scene.radius_per_edge": (0.05, 0.3),
+    "scene.max_depth_error": (0.1, 10.0),
+    "scene.lambda_depth": (0.01, 0.3),
+    "scene.fill": (0.05, 0.5),
+}
+
 FAMILIES: dict[str, Callable[[np.random.Generator], Draft]] = {
     "benign": benign,
     "budget": budget,
@@ -305,8 +367,13 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Draft]] = {
     "robot": robot,
     "unknown": unknown,
     "people": people,
+    "behind": behind,
+    "far": far,
+    "wrist": wrist,
+    "settings": settings,
 }
 ORDER = (*FAMILIES, "benign")  # by turns; benign twice, as its share of green is a gate
+LATER = ("behind", "far", "wrist", "settings")  # not in the campaigns of seeds below 100
 
 
 def _standing(solid: Primitive, kind: str, size: tuple[float, ...], place: Float64) -> Primitive:

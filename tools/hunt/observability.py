@@ -31,6 +31,7 @@ NUM_PIXELS = 8  # of the target in the images of one frame set
 NUM_ARM_PIXELS = 30
 NUM_OVERLAP = 100  # [px]
 WIDE = 0.04  # [m] two voxels
+WRIST_PIXEL = 0.005  # [m] of a lone camera on the hand, at 0.4 m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +116,8 @@ def _pixel(world: World) -> float:
     """How wide [m] a pixel of the nearest camera is at the target."""
     place = world.targets[0].T_world_shape[:3, 3]
     return min(
-        float(np.linalg.norm(camera.T_world_camera[:3, 3] - place)) / camera.intrinsics.fx for camera in world.cameras
+        (float(np.linalg.norm(c.T_world_camera[:3, 3] - place)) / c.intrinsics.fx for c in world.cameras),
+        default=WRIST_PIXEL,
     )
 
 

@@ -21,6 +21,8 @@ from tools.hunt.world import DURATION_S, FPS, HEIGHT, NS, NUM_FRAMES, WIDTH, Wor
 
 PATCH = 3  # [px] over which the noise of depth agrees
 RING = 3  # [px]
+WRIST = "wrist"  # the camera on the hand
+NEAREST = 0.2  # [m] that it measures
 MOST_OF_RING = 0.9  # a few pixels beside edges are lost by any camera
 ARM_TEXTURE = Texture(pattern="checks", feature=0.05, dark=PALETTE["shell"][0], bright=PALETTE["shell"][1], seed=20)
 SAME_SURFACE = 0.02  # [m] two cameras see the same place
@@ -50,11 +52,12 @@ class Recorder:
     def __init__(self, world: World, fault: Fault, model: RobotModel, seed: tuple[int, ...]) -> None:
         self._world, self._fault, self._model, self._seed = world, fault, model, seed
         self._renderers = [Renderer(camera, world.things, color_rays=0) for camera in world.cameras]
-        shape = (len(world.cameras), NUM_FRAMES)
+        self._names = tuple(c.name for c in (*world.cameras, *([world.wrist] if world.wrist else [])))
+        shape = (len(self._names), NUM_FRAMES)
         self._arm, self._target, self._outline, self._hole, self._depth = (
             np.zeros(shape, dtype=np.int64) for _ in range(5)
         )
-        self._first: list[Float32] = [np.zeros((HEIGHT, WIDTH), np.float32)] * len(world.cameras)
+        self._first: list[Float32] = [np.zeros((HEIGHT, WIDTH), np.float32)] * len(self._names)
 
     def write(self, path: Path) -> Shown:
         """Write the log, and say what it shows."""
@@ -64,10 +67,13 @@ class Recorder:
             for record in records:
                 if isinstance(record, JointState):
                     log.add_joint_state(record, self._model.joint_names)
-                else:
-                    log.add_frame(record)
+                    continue
+                if record.camera == WRIST:
+                    pose = record.T_world_camera @ OPTICAL_FROM_LINK.T
+                    log.add_transforms(record.stamp_ns, [("world", f"{WRIST}_link", pose)], is_static=False)
+                log.add_frame(record)
         return Shown(
-            cameras=tuple(camera.name for camera in self._world.cameras),
+            cameras=self._names,
             stamps=np.array([at_s(index / FPS) for index in range(NUM_FRAMES)]),
             arm=self._arm,
             target=self._target,
@@ -83,9 +89,18 @@ class Recorder:
             stamp = at_s(index / FPS)
             arm = self._arm_solids(self._world.positions(np.array([stamp]))[0])
             targets = [p.at(stamp) for p in self._world.targets if p.is_present(stamp)]
-            for number, renderer in enumerate(self._renderers):
+            for number, renderer in enumerate(self._renderers_at(stamp)):
                 if (renderer.camera.name, index) not in self._fault.lost:
                     yield self._frame(number, renderer, index, arm, targets)
+
+    def _renderers_at(self, stamp_ns: int) -> list[Renderer]:
+        """Of the cameras that stand, and of that on the hand where it is at a stamp."""
+        wrist = self._world.wrist
+        if wrist is None:
+            return self._renderers
+        T_world_hand = self._model.frame_pose(self._world.positions(np.array([stamp_ns]))[0], "hand")
+        there = replace(wrist, T_world_camera=T_world_hand @ wrist.T_world_camera)
+        return [*self._renderers, Renderer(there, self._world.things, color_rays=0)]
 
     def _states(self) -> Iterator[JointState]:
         gap = self._fault.lost_states
@@ -116,6 +131,8 @@ class Recorder:
         )
         measured = np.where(rng.random(exact.shape) < fault.edge_share, with_edges, measured)
         measured = np.where(is_target & _lost(fault, exact.shape, rng), 0, measured)
+        if camera.name == WRIST:
+            measured = np.where(measured < NEAREST, 0, measured)
         if (camera.name, index) in fault.blind:
             measured = np.zeros_like(measured)
         wrong = measured * fault.depth_scale.get(camera.name, 1.0) + fault.depth_bias.get(camera.name, 0.0)
@@ -157,11 +174,13 @@ class Recorder:
             T_world_camera = self._fault.recorded_pose(camera.name, camera.T_world_camera)
             transforms.append(("world", f"{camera.name}_link", T_world_camera @ OPTICAL_FROM_LINK.T))
             transforms.append((f"{camera.name}_link", f"{camera.name}_optical_frame", OPTICAL_FROM_LINK))
+        if self._world.wrist is not None:
+            transforms.append((f"{WRIST}_link", f"{WRIST}_optical_frame", OPTICAL_FROM_LINK))
         return transforms
 
     def _overlap(self) -> np.ndarray:
         cameras = self._world.cameras
-        out = np.zeros((len(cameras), len(cameras)), dtype=np.int64)
+        out = np.zeros((len(self._names), len(self._names)), dtype=np.int64)  # of that on the hand none is counted
         for i, camera in enumerate(cameras):
             points = transform_points(camera.T_world_camera, _points(camera, self._first[i]))
             for j, other in enumerate(cameras):

@@ -28,7 +28,7 @@ from splatctrl_cli.simulate.primitives import Primitive, Track
 from splatctrl_cli.simulate.render import Camera
 from splatctrl_cli.sources.source import open_source
 from tools.hunt.clearance import TOLERANCE, Positions, TrueArm, interpolated, least_clearance
-from tools.hunt.families import FAMILIES, ORDER, Draft
+from tools.hunt.families import FAMILIES, LATER, ORDER, Draft
 from tools.hunt.faults import spheres_yaml
 from tools.hunt.observability import MARGIN, TOLERATED, Observable, observable
 from tools.hunt.outcome import Word, refused, word_of
@@ -43,10 +43,12 @@ from tools.hunt.world import (
     draw_motion,
     draw_things,
     placed,
+    wrist_camera,
 )
 
 _COVERAGES: dict[object, CoverageReport] = {}  # of the robot used last
 
+FIRST_OF_ALL = 100  # the first seed whose campaigns have all families
 MODES = ("audit", "closed-loop")
 CLOSED_SHARE = 0.3
 SPLATS = 3000  # hold every surface of these scenes
@@ -93,14 +95,15 @@ class Row:
         return self.outcome == "safe" and self.clearance < MARGIN - TOLERATED - TOLERANCE
 
 
-def family_of(index: int) -> str:
+def family_of(seed: int, index: int) -> str:
     """Families by turns."""
-    return ORDER[index % len(ORDER)]
+    order = ORDER if seed >= FIRST_OF_ALL else [name for name in ORDER if name not in LATER]
+    return order[index % len(order)]
 
 
 def draw(seed: int, index: int, model: RobotModel) -> Trial:
     """The run of a seed and an index; the same for the same two."""
-    rng, family = np.random.default_rng([seed, index]), family_of(index)
+    rng, family = np.random.default_rng([seed, index]), family_of(seed, index)
     contact, margin = SHARES.get(family, OTHER_SHARES)
     wish = rng.random()
     for _ in range(60):
@@ -108,7 +111,7 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
         arm = TrueArm(model, draft.tool)
         everywhere = draw_cameras(rng)
         motion = draw_motion(rng, model, arm, everywhere)
-        cameras = tuple(camera for camera in everywhere if camera.name in draft.cameras)
+        cameras = tuple(_seen_from(camera, draft) for camera in everywhere if camera.name in draft.cameras)
         if wish < contact:
             clearance = -float(rng.uniform(0.001, 0.025))
         else:
@@ -128,11 +131,13 @@ def draw(seed: int, index: int, model: RobotModel) -> Trial:
             motion=motion,
             things=draw_things(rng, motion, arm),
             targets=targets,
-            cameras=tuple(_zoomed(camera, draft.zoom) for camera in cameras),
+            cameras=cameras,
+            wrist=wrist_camera() if draft.has_wrist else None,
             tool=draft.tool,
             people=draft.people,
         )
-        mode = MODES[int(rng.random() < CLOSED_SHARE and not draft.only_audit)]
+        is_driven = (rng.random() < CLOSED_SHARE or draft.only_closed) and not draft.only_audit
+        mode = MODES[int(is_driven)]
         return Trial(seed=seed, index=index, family=family, draft=draft, world=world, mode=mode)
     raise RuntimeError(f"{seed}/{index}: no scene found")
 
@@ -193,7 +198,13 @@ def config_of(trial: Trial) -> Config:
         checkpoint_period=86400.0,
     )
     control = replace(config.control, solver="daqp", pose_gain=4.0, max_time=DURATION_S)
-    return replace(config, scene=scene, control=control)
+    config = replace(config, scene=scene, control=control)
+    for key, value in trial.draft.settings:
+        section, _, name = key.partition(".")
+        old = getattr(config, section)
+        kind = type(getattr(old, name))
+        config = replace(config, **{section: replace(old, **{name: kind(round(value) if kind is int else value)})})
+    return config
 
 
 def _judged(trial: Trial, folder: Path) -> tuple[Word, ReplayResult | None]:
@@ -273,12 +284,13 @@ def _carried(draft: Draft, motion: Motion, model: RobotModel) -> Primitive:
     return replace(solid, T_world_shape=poses[0], track=track)
 
 
-def _zoomed(camera: Camera, zoom: float) -> Camera:
-    k = camera.intrinsics
-    return replace(
-        camera,
-        intrinsics=Intrinsics(fx=zoom * k.fx, fy=zoom * k.fy, cx=k.cx, cy=k.cy, width=k.width, height=k.height),
-    )
+def _seen_from(camera: Camera, draft: Draft) -> Camera:
+    """The camera with the draft's lens, as far back along its axis as it says; it looks at a place a metre away."""
+    k, T = camera.intrinsics, camera.T_world_camera.copy()
+    T[:3, 3] -= (draft.distance - 1.0) * T[:3, 2]
+    zoom = draft.zoom
+    lens = Intrinsics(fx=zoom * k.fx, fy=zoom * k.fy, cx=k.cx, cy=k.cy, width=k.width, height=k.height)
+    return replace(camera, intrinsics=lens, T_world_camera=T)
 
 
 @contextmanager

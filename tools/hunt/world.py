@@ -35,13 +35,15 @@ Make = Callable[[Float64], Made]  # the target's solids with its middle at (3,) 
 class World:
     """The truth of one run: `things` stand from beginning to end, `targets` are what the family is about.
 
-    tool: a capsule on the true arm's hand that no model has. people: names of the targets that masks show.
+    wrist: a camera on the hand, its pose that in the hand's frame. tool: a capsule on the true arm's hand that no
+    model has. people: names of the targets that masks show.
     """
 
     motion: Motion
     things: Made
     targets: Made
     cameras: tuple[Camera, ...]
+    wrist: Camera | None = None
     tool: Capsule | None = None
     people: frozenset[str] = frozenset()
 
@@ -119,6 +121,15 @@ def draw_cameras(rng: np.random.Generator) -> tuple[Camera, ...]:
         )
         for index, (eye, spread) in enumerate(places)
     )
+
+
+def wrist_camera() -> Camera:
+    """Beside the hand, looking past the fingers; T_world_camera is T_hand_camera."""
+    k = Intrinsics(
+        fx=0.8 * WIDTH, fy=0.8 * WIDTH, cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2, width=WIDTH, height=HEIGHT
+    )
+    T_hand_camera = look_at(np.array([0.09, 0.0, -0.02]), np.array([0.02, 0.0, 0.35]))
+    return Camera(name="wrist", intrinsics=k, T_world_camera=T_hand_camera, is_training=True)
 
 
 def draw_things(rng: np.random.Generator, motion: Motion, arm: TrueArm) -> Made:

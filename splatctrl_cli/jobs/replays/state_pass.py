@@ -12,7 +12,7 @@ from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_c
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
 from splatctrl_cli.control.motion_limits import MotionLimits
-from splatctrl_cli.control.near_space import NearSpace
+from splatctrl_cli.control.near_space import NearSpace, Seen
 from splatctrl_cli.control.preconditions import static_clearance
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals
 from splatctrl_cli.control.step import ControlStep
@@ -34,10 +34,10 @@ class ReplayRecord:
     the clearance of a posture on the way instead (`met`), the time [s] that nobody can bound (`unbounded`), the
     clearance [m] of the body at the state (`surface`), and that of the spheres to the splats alone (`represented`).
     near: what was known about the arm (the columns of `NearFigures`), NaN at states that were not looked at.
-    hindsight: what later depth says of times without any. strain:
-    velocity and acceleration as shares of their limits. statics: by sphere that no joint moves, its clearance [m] in
-    the first scene and the least in any. closest: of pairs of links that keep less than the margin asked for, how
-    near they came [m] and the stamp; nothing of those that stayed apart.
+    hindsight: what later depth says of times without any. strain: velocity and acceleration as shares of their
+    limits. statics: by sphere that no joint moves, its clearance [m] when its surroundings were first seen and the
+    least in any. closest: of pairs of links that keep less than the margin asked for, how near they came [m] and the
+    stamp; nothing of those that stayed apart.
     """
 
     def __init__(
@@ -81,6 +81,7 @@ class ReplayRecord:
         self.hindsight = Hindsight(model, scene, self._near, config.control.margin)
         self._before: tuple[int, Float64, Float64] | None = None  # the last state: stamp, position, velocity
         self._last_scene: KnownFields | None = None
+        self._seen_before: Seen | None = None  # when the fixed spheres were last looked at
 
     def blocks(self, stamps: Stamps) -> Iterator[tuple[int, int]]:
         """Ranges of at most BLOCK consecutive states of stamps (T,) that see the same scene."""
@@ -205,13 +206,20 @@ class ReplayRecord:
         self.between.append(lower=lower, unbounded=unbounded, met=met, surface=surface)
 
     def _look_at_statics(self, part: AuditTrace) -> None:
-        """The clearance of spheres that no joint moves, once a scene."""
-        known = self._scene.at(int(part.stamp_ns[0]))
+        """The clearance of spheres that no joint moves, once a scene. What is nearer now, where no camera had looked
+        before, was seen for the first time: it did not come.
+        """
+        stamp = int(part.stamp_ns[0])
+        known = self._scene.at(stamp)
         if known is self._last_scene:
             return
-        self._last_scene = known
+        self._last_scene, before, self._seen_before = known, self._seen_before, self._scene.seen_at(stamp)
+        centers = self._model.sphere_centers(part.position[0])
         for name, value in static_clearance(self._model, known.distances["exact"], part.position[0]).items():
             first, least = self.statics.get(name, (value, value))
+            if value < first and before is not None:
+                (nearest,) = known.obstacles(centers[self._number[name]][None])
+                first = value if before.last_ns(np.array([nearest.position]))[0] < 0 else first
             self.statics[name] = (first, min(least, value))
 
     def _look_around(self, part: AuditTrace) -> None:
