@@ -97,11 +97,9 @@ class CaptureSource:
         return replace(loss, damaged=loss.damaged + len(damaged), notes=[*loss.notes, *damaged])
 
     def records(self) -> Iterator[Record]:
-        """Joint states and frames by stamp."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Joint states and stored frames by stamp."""
         self._damaged, self._damaged_before = [], max(self._damaged, self._damaged_before, key=len)
         return by_stamp(self.states, self._stored_frames())
 

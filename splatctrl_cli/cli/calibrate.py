@@ -12,7 +12,6 @@ from splatctrl_cli.jobs.calibrate import CalibrateRequest, CalibrateResult, Came
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args)
     request = request_of(
         CalibrateRequest,

@@ -16,7 +16,6 @@ WIDTH = 118  # columns of text
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     request = request_of(
         CheckRequest,
         args,
@@ -80,7 +79,6 @@ def _shown(value: float | None, digits: int) -> str:
 
 
 def run_info(args: argparse.Namespace) -> int:
-    """Describe what the path leads to, and return the exit code."""
     return show_described(Console(args), describe(args.path, source_options(args)))
 
 

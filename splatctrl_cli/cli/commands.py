@@ -99,7 +99,6 @@ def judges(words: Sequence[str]) -> bool:
 
 
 def function_of(run: str) -> Callable[..., int]:
-    """What runs a command."""
     module, _, name = run.partition(":")
     function: Callable[..., int] = getattr(importlib.import_module(f"splatctrl_cli.cli.{module}"), name)
     return function

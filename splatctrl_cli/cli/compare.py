@@ -11,7 +11,6 @@ MOST_ROWS = 20  # of changes that are no regression; --json has all
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args)
     result = compare(request_of(CompareRequest, args, runs=tuple(args.output)), console)
     return console.concluded(result.verdict, result.as_dict(), _lines(result, is_long=args.verbose > 0))

@@ -11,7 +11,6 @@ from splatctrl_cli.cli.parser import Parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     parser = build_parser()
     _complete_files(parser)
     script = shtab.complete(parser, shell=args.shell).rstrip("\n")

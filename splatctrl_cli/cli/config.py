@@ -9,7 +9,6 @@ from splatctrl_cli.jobs.settings import resolved_settings, template_of, toml_of
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args)
     if args.schema:
         text = SCHEMA_FILE.read_text(encoding="utf-8")

@@ -28,7 +28,6 @@ from splatctrl_cli.simulate.shared_workspace import DURATION_S
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console, request = Console(args), request_of(DemoRequest, args)
     step_console = Console(args, is_step=True)
 
@@ -70,7 +69,6 @@ def _show(console: Console, result: StepResult) -> int:
 
 
 def run_simulate(args: argparse.Namespace) -> int:
-    """Record a log, and return the exit code."""
     console = Console(args)
     given = {"duration_s": args.duration, "with_person": args.person, "is_free": args.free}
     if args.duration is None and (args.human_arm is not None or args.environment is not None):
@@ -82,7 +80,6 @@ def run_simulate(args: argparse.Namespace) -> int:
 
 
 def show_simulated(console: Console, result: SimulateResult) -> int:
-    """Print what a simulation wrote."""
     console.result({"out": str(result.out), "bytes": result.sizes, **result.metrics}, _simulated(result))
     return 0
 

@@ -21,7 +21,6 @@ SHOWN = {  # of Differences: what the table calls it, and the unit it is shown i
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args)
     if args.mcap:
         return _run_mcap(console, args)

@@ -70,24 +70,20 @@ def _preset(text: str) -> str:
 
 
 def add_seed(add: Options, what: str) -> None:
-    """``--seed``."""
     add("--seed SEED", f"seed of {what}", whole(0, MAX_SEED), 0)
 
 
 def add_threads(parser: Parser) -> None:
-    """``--threads``."""
     threads = "threads, at most 16 or one per core (default: one per core)"
     Options(parser.run_group)("--threads THREADS", threads, whole(0, 1024))
 
 
 def add_device(parser: Parser) -> None:
-    """``--device``."""
     where = "auto, cpu, cuda or cuda:N; auto takes a card that is worth its start (docs/gpu.md)"
     Options(parser.run_group)("--device NAME", f"where to compute: {where}", _device, "auto")
 
 
 def add_gates(add: Options) -> None:
-    """``--require 'metric>=value'``."""
     add("--require METRIC>=VALUE ...", "fail (exit 1) unless it holds", gate)
 
 
@@ -139,18 +135,15 @@ def add_disagreement(add: Options) -> None:
 
 
 def add_declare(add: Options) -> None:
-    """``--declare``."""
     add("--declare FILE.toml", "what the robot carries, and contact that is meant (docs/declare.md)", Path)
 
 
 def add_packages(add: Options) -> None:
-    """``--packages``."""
     packages = "where package:// paths of the URDF are found (default: the folders above it)"
     add("--packages DIR ...", packages, Path)
 
 
 def add_lock(add: Options) -> None:
-    """``--lock``."""
     held = "hold a joint, and what mimics it, at a value [rad or m]"
     add("--lock JOINT=VALUE ...", held)
 

@@ -22,7 +22,6 @@ from splatctrl_cli.records import Box
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     native.keep_freed_memory()
     config = load_config(args.config, args.set)  # refused before the source is opened
     if args.max_splats is not None:

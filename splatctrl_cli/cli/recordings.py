@@ -9,7 +9,6 @@ from splatctrl_cli.jobs.ingest import IngestRequest, IngestResult, PackRequest, 
 
 
 def run_ingest(args: argparse.Namespace) -> int:
-    """Write a capture, and return the exit code."""
     console = Console(args)
     request = request_of(IngestRequest, args, paths=tuple(args.source), options=source_options(args))
     return show_ingested(console, ingest(request, console))
@@ -27,7 +26,6 @@ def show_ingested(console: Console, result: IngestResult) -> int:
 
 
 def run_pack(args: argparse.Namespace) -> int:
-    """Write a capture as one MCAP, and return the exit code."""
     console = Console(args)
     result = pack(request_of(PackRequest, args, source=args.capture), console)
     found = {"mcap": str(result.out), "frames": result.num_frames, "bytes": result.bytes}

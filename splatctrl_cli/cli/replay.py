@@ -22,7 +22,6 @@ HEADLINE = (
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args)
     request = request_of(
         ReplayRequest,

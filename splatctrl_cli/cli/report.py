@@ -16,7 +16,6 @@ MOST_NOTES = 5
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write a report, and return the exit code."""
     console = Console(args)
     result = write_report(request_of(WriteReportRequest, args, roots=tuple(args.root)), console)
     lines = [f"{result.file}: {result.num_runs} runs, {result.num_scenes} in 3-D, {result.bytes} bytes"]

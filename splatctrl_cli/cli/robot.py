@@ -36,7 +36,6 @@ def run_spheres(args: argparse.Namespace) -> int:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Measure a set of spheres and return the exit code."""
     result = check_robot(request_of(RobotRequest, args))
     file, left_out = result.file, list(result.links_left_out)
     assert file is not None
@@ -53,7 +52,6 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_pairs(args: argparse.Namespace) -> int:
-    """List the pairs of links and return the exit code."""
     result = robot_pairs(request_of(RobotRequest, args, locked=locked_joints(args)))
     lines = _pairs_lines(result)
     if result.num_foreign:
@@ -64,7 +62,6 @@ def run_pairs(args: argparse.Namespace) -> int:
 
 
 def run_info(args: argparse.Namespace) -> int:
-    """Show the robot and return the exit code."""
     result = describe_robot(request_of(RobotRequest, args, locked=locked_joints(args)))
     Console(args).result(result.as_dict(), _robot_lines(result))
     return 0

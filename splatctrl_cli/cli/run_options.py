@@ -10,7 +10,6 @@ ROOT = "folder in which the scene and robot of a replay's command line are looke
 
 
 def report_options(add: Options, parser: Parser) -> None:
-    """Of ``report``."""
     add("PATH", "the folder of a run, or of a batch", Path)
     add_output(add, "HTML file to write", default="PATH.html, beside PATH")
     add(
@@ -23,7 +22,6 @@ def report_options(add: Options, parser: Parser) -> None:
 
 
 def view_options(add: Options, parser: Parser) -> None:
-    """Of ``view``."""
     add("PATH", "a run, scene or field folder, a field.npz, or a splat file", Path)
     add_output(add, "HTML file to write", default="PATH.html, beside PATH")
     add("--no-open", "do not open it in a browser")
@@ -31,7 +29,6 @@ def view_options(add: Options, parser: Parser) -> None:
 
 
 def batch_options(add: Options, parser: Parser) -> None:
-    """Of ``splatctrl batch``."""
     add("SUITE", "TOML file of recordings and jobs (docs/batch.md); with --list also a batch's folder", Path)
     add("-o/--out DIR", "folder of the batch, where it goes on (default: what the suite says, or SUITE.out)", Path)
     add("--workers N", "nodes that run at once (default: one per core)", whole(1, 256))
@@ -54,7 +51,6 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def sweep_options(add: Options, parser: Parser) -> None:
-    """Of ``splatctrl sweep``."""
     add("REPLAY", "the folder that replay wrote", Path)
     keys = (
         "splats, cameras-out, depth-noise, pose-error, pose-turn, latency, margin, ... (docs/sweep.md), or a setting"
@@ -68,7 +64,6 @@ def sweep_options(add: Options, parser: Parser) -> None:
 
 
 def compare_options(add: Options, parser: Parser) -> None:
-    """Of ``splatctrl compare``."""
     add("OUTPUT", "folder that a command or a batch wrote; of two the earlier first", Path, nargs="+")
     add("--against FILE", "compare the only OUTPUT with this stored baseline", Path)
     add("--update-baseline FILE", "write the last OUTPUT as a baseline, alone or after the comparison", Path)

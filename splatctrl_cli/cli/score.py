@@ -46,7 +46,6 @@ SHARES = ("seen_share", "in_front_seen", "mask_share", "valid_share")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args)
     return show_scored(console, score_fits(_fit(args), console) if args.fit else score(_request(args), console))
 

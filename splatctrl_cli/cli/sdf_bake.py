@@ -24,7 +24,6 @@ COLUMNS = ("count", "mean mm", "rmse mm", "95 % mm", "max mm")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the subcommand and return its exit code."""
     console = Console(args)
     return show_baked(console, bake(_request(args), console))
 

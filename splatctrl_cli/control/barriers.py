@@ -33,7 +33,6 @@ class SceneRows(BarrierTerm):
 
     @property
     def margin(self) -> Float64:
-        """See `BarrierTerm`."""
         return self._margin
 
     def in_field(self, field: DistanceField) -> "SceneRows":
@@ -67,7 +66,6 @@ class SceneRows(BarrierTerm):
         return self._barrier(chosen, G, h, now)
 
     def room(self, state: State, velocity: Float64) -> Float64:
-        """See `BarrierTerm`."""
         centers, jacobians = state.spheres
         distance, gradient = self._queried(centers)
         h = distance_bound(self._config, None, distance, self._margin, None, state.distance_rate)
@@ -112,7 +110,6 @@ class SelfRows(BarrierTerm):
 
     @property
     def margin(self) -> Float64:
-        """See `BarrierTerm`."""
         return self._margin
 
     def rows(self, state: State) -> Barrier:
@@ -140,7 +137,6 @@ class SelfRows(BarrierTerm):
         )
 
     def room(self, state: State, velocity: Float64) -> Float64:
-        """See `BarrierTerm`."""
         centers, jacobians = state.spheres
         distance, direction = pair_gaps(centers, self._radii, self._pairs)
         motion = jacobians @ velocity
@@ -149,7 +145,6 @@ class SelfRows(BarrierTerm):
         return np.asarray(h + np.sum(direction * apart, axis=1))
 
     def distances(self, centers: Float64) -> Float64:
-        """See `BarrierTerm`."""
         return pair_gaps(centers, self._radii, self._pairs)[0]
 
 

@@ -91,7 +91,6 @@ class Program:
             line, has_rows = _line({"rows": rows()}), True
 
     def close(self) -> None:
-        """End it."""
         self._process.close()
 
     def _asked(self, line: bytes) -> Document:
@@ -149,17 +148,14 @@ class OutsideController:
         self.close()
 
     def close(self) -> None:
-        """End its processes."""
         while self._programs:
             self._programs.pop().close()
 
     @property
     def is_over(self) -> bool:
-        """See `Commander`."""
         return self.failure is not None
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
-        """See `Commander`."""
         view = controller.view(moment)
         question = _question(self._model, self._frame, moment, view)
         try:
@@ -191,7 +187,6 @@ class OutsideController:
 
 
 def class_command(target: str) -> tuple[str, ...]:
-    """The command of a Python class ``module:Class``."""
     return sys.executable, "-P", "-c", SERVE, target
 
 

@@ -146,12 +146,10 @@ SOLVERS: Mapping[str, Callable[[], QpSolver]] = {"clarabel": ClarabelSolver, "da
 
 
 def solver_named(name: str) -> QpSolver:
-    """The solver that the configuration names."""
     return SOLVERS[name]()
 
 
 def is_finite(program: QuadraticProgram) -> bool:
-    """True where every number of the program is."""
     return all(bool(np.isfinite(a).all()) for a in (program.H, program.c, program.G, program.h))
 
 

@@ -149,7 +149,6 @@ class InMemory:
         return np.array(self._positions)
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
-        """The next step."""
         self._stamps.append(stamp_ns)
         self._positions.append(q)
         self.steps.append(step)

@@ -57,7 +57,6 @@ class PeopleGrown:
         self._scene, self._people, self._extra = scene, people, extra
 
     def query(self, points: Float64) -> tuple[Float64, Float64]:
-        """See `DistanceField`."""
         distance, gradient = self._scene.query(points)
         to_people, from_people = self._people.query(points)
         is_nearer = to_people - self._extra < distance

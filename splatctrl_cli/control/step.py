@@ -367,7 +367,6 @@ class Ours:
     is_over = False
 
     def step(self, controller: QpIkController, moment: Moment) -> ControlStep:
-        """See `Commander`."""
         return controller.step(
             moment.q,
             moment.T_world_goal,

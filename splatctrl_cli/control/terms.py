@@ -72,7 +72,6 @@ class ReachGoal:
         return cls(weight=eliminated_weight(Q, R))
 
     def rows(self, state: State) -> Cost:
-        """See `CostTerm`."""
         return reach_cost(state.jacobian, state.reference, self.weight)
 
 
@@ -87,7 +86,6 @@ class LeanHome:
     weight: float
 
     def rows(self, state: State) -> Cost:
-        """See `CostTerm`."""
         if state.guide is None:
             return stray_cost(self.gain * (self.home - state.q), self.weight)
         return stray_cost(self.gain * (state.guide.posture - state.q) + state.guide.velocity, self.weight)
@@ -100,7 +98,6 @@ class ChangeLittle:
     weight: float
 
     def rows(self, state: State) -> Cost:
-        """See `CostTerm`."""
         if state.last_velocity is None:
             return stray_cost(np.zeros(len(state.q)), 0.0)
         return stray_cost(state.last_velocity, self.weight)

@@ -130,11 +130,9 @@ class ImageFolderSource:
         return ""
 
     def records(self) -> Iterator[Record]:
-        """Frames by stamp."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Stored frames by stamp."""
         self._damaged, self._num_invalid = [], 0
         checked: set[str] = set()
         for view in self._views:
@@ -372,11 +370,9 @@ class RigFolderSource:
         return total
 
     def records(self) -> Iterator[Record]:
-        """Frames by stamp."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Stored frames by stamp, of the same stamp by camera."""
         return by_stamp(*(part.stored() for part in self._parts))
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:

@@ -55,7 +55,6 @@ class HeldOutComparison:
     num_unknown: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
         counts = {name: value for name, value in vars(self).items() if name not in {"on_surface", "before"}}
         on_surface = {name: asdict(band) for name, band in self.on_surface.items()}
         return {**counts, "on_surface": on_surface, "before": self.before.as_dict()}

@@ -31,12 +31,10 @@ class FirstFrame:
     tiles: list[float]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
         return asdict(self)
 
 
 def first_frame(frame: RgbdFrame) -> FirstFrame:
-    """What to keep of `frame`."""
     k = frame.intrinsics
     return FirstFrame(
         camera=frame.camera,

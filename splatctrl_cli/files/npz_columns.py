@@ -19,8 +19,6 @@ _DAMAGE = (OSError, *DAMAGE)
 
 
 class NpzFile(ArrayFile):
-    """An NPZ file."""
-
     def __init__(self, path: Path) -> None:
         """Raises InputError for a file of another kind."""
         super().__init__(path)

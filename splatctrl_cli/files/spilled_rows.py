@@ -84,7 +84,6 @@ class Rows:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """As of an array."""
         row = self._file.row_shape if self._columns is None else (len(self._columns),)
         return (len(self), *row)
 

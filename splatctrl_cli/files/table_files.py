@@ -22,8 +22,6 @@ _EXTRA = "tables"
 
 
 class Hdf5File(ArrayFile):
-    """An HDF5 file."""
-
     def __init__(self, path: Path) -> None:
         """Raises InputError for a file of another kind."""
         super().__init__(path)

@@ -73,7 +73,6 @@ def file_header(grid: DistanceGrid) -> dict[str, object]:
 
 
 def header_text(grid: DistanceGrid) -> str:
-    """The header as JSON."""
     return json.dumps(file_header(grid), indent=1, allow_nan=False)
 
 

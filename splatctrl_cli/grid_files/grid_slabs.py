@@ -33,7 +33,6 @@ class SlabPlan:
     settings: Mapping[str, object] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values, as they read back from JSON."""
         plain: dict[str, object] = json.loads(json.dumps(asdict(self)))
         return plain
 

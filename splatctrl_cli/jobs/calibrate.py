@@ -90,7 +90,6 @@ class CalibrateResult:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """Plain values."""
         clock = self.calibration.clock
         return {
             "frames": self.num_frames,

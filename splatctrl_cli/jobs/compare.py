@@ -112,7 +112,6 @@ class CompareResult:
     baseline: Path | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
         return {
             "metrics": dict(self.metrics),
             "verdicts": [asdict(one) for one in self.verdicts],
@@ -228,7 +227,6 @@ def _overall(metrics: Mapping[str, int]) -> Reason:
 
 
 def _verdict_change(old: JudgedRun, new: JudgedRun) -> VerdictChange | None:
-    """None where the verdict is the same, by its label."""
     if old.is_green == new.is_green and (old.outcome, old.label) == (new.outcome, new.label):
         return None
     change = Change.OTHER

@@ -79,7 +79,6 @@ class ExportResult:
     was_rounded: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as --json has them."""
         return {name: value for name, value in asdict(self).items() if name != "was_rounded"}
 
 

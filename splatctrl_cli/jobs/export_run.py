@@ -45,7 +45,6 @@ class ExportRunResult:
     messages: dict[str, int]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as --json has them."""
         return asdict(self)
 
 

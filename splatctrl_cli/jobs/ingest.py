@@ -45,7 +45,6 @@ class IngestResult:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """Plain values, as in run.json."""
         written = self.summary
         return {
             "frames": written.num_frames,

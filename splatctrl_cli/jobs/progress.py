@@ -32,7 +32,6 @@ class Lines:
     is_quiet = False
 
     def log(self, line: str) -> None:
-        """One line."""
         sys.stderr.write(line + "\n")
         sys.stderr.flush()
 
@@ -58,7 +57,6 @@ class Wait:
         return self
 
     def step(self) -> None:
-        """One more step is done."""
         self.at(self._done + 1)
 
     def at(self, done: int, more: str = "", *, is_told: bool = False) -> None:

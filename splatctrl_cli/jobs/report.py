@@ -60,7 +60,6 @@ class WriteReportResult:
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as --json has them."""
         return asdict(self)
 
 

@@ -83,7 +83,6 @@ class CoverageResult:
     links_left_out: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Metrics and a row per link, as plain values."""
         links = [_plain_link(link) for link in self.report.links]
         return {"metrics": {name: of(self.report) for name, of in METRICS.items()}, "links": links}
 
@@ -97,7 +96,6 @@ class PairsResult:
     doubts: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Counts and a row per pair of links, as plain values."""
         rows = [
             {
                 "links": list(pair.links),
@@ -133,7 +131,6 @@ class RobotResult:
         return list(self.model.doubts) if len(self.model.sphere_set.radii) else []
 
     def as_dict(self) -> dict[str, Any]:
-        """Joints, links and spheres as plain values."""
         urdf = self.model.urdf
         joints = [
             {"name": name, "lower": _finite(lower), "upper": _finite(upper), "velocity": _finite(velocity)}

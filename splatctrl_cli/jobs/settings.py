@@ -30,7 +30,6 @@ class Setting:
         return f"{self.section}.{self.key}"
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON."""
         return {
             "value": self.value,
             "default": self.default,

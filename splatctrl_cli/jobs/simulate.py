@@ -48,7 +48,6 @@ class SimulateResult:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """Plain values, as in run.json."""
         return _metrics(self.truth, self.num_frames)
 
 

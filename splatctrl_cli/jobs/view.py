@@ -35,7 +35,6 @@ class ViewResult:
     num_unknown: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as --json has them."""
         return asdict(self)
 
 

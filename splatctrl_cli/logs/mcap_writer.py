@@ -96,7 +96,6 @@ class McapLog:
     def add_image(
         self, topic: str, stamp_ns: int, frame_id: str, encoding: str, pixels: NDArray[np.unsignedinteger] | Float32
     ) -> None:
-        """One Image."""
         self._add(topic, self._image(self._header(stamp_ns, frame_id), encoding, pixels), stamp_ns)
 
     def add_camera_info(self, topic: str, stamp_ns: int, frame_id: str, intrinsics: Intrinsics) -> None:
@@ -104,7 +103,6 @@ class McapLog:
         self._add(topic, self._camera_info(self._header(stamp_ns, frame_id), intrinsics), stamp_ns)
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """One attachment."""
         self._writer.add_attachment(0, 0, name, media_type, data)
 
     def describe(self, name: str, values: Mapping[str, str]) -> None:

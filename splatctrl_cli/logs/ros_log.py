@@ -79,7 +79,6 @@ class RosLogSource:
         )
 
     def records(self) -> Iterator[Record]:
-        """Joint states and frames by stamp."""
         return decoded(by_stamp(self.states, self._stored_frames(lazily=False)))
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
@@ -96,7 +95,6 @@ class RosLogSource:
         return next(c for c in self._rig if c.name == camera).pose_at(self._tf, stamp_ns, tolerance_ns)
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the log's files."""
         return dict(self._digests)
 
     @cached_property

@@ -303,7 +303,6 @@ class RobotModel:
         pinocchio.computeJointJacobians(self._model, self._data, self._configuration(q))
 
     def _as_chain(self) -> Chain:
-        """The bodies and spheres as the kernels walk them."""
         placement = np.array([self.T_world_base, *(p.homogeneous for p in list(self._model.jointPlacements)[1:])])
         self._jacobians(self.middle)
         kind, axis = [REVOLUTE], [np.array([0.0, 0.0, 1.0])]

@@ -67,7 +67,6 @@ class Snapshot:
         return read_unrepresented(self._checked(self.occupancy_path)) if self._has_voxels else None
 
     def splats(self) -> SplatSet:
-        """The splats of that moment."""
         return read_world_splats(self._checked(self.path))
 
     @property
@@ -249,7 +248,6 @@ class SceneFolder:
         return gaussians
 
     def splats(self) -> SplatSet:
-        """The final splats."""
         self._expect_isotropic()
         return read_world_splats(self.parts.checked(self.path / "splats.ply"))
 

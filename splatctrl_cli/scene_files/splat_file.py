@@ -59,11 +59,9 @@ class SplatFile(SceneFolder):
 
     @cached_property
     def snapshots(self) -> tuple[Snapshot, ...]:
-        """None."""
         return ()
 
     def unrepresented_at(self, stamp_ns: int | None) -> Balls | None:
-        """Not known."""
         return None
 
 

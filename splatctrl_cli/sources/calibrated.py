@@ -162,11 +162,9 @@ class CalibratedSource:
         return replace(loss, without_pose=loss.without_pose + self._num_without_pose, notes=[*loss.notes, *notes])
 
     def records(self) -> Iterator[Record]:
-        """Joint states and frames by stamp."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Joint states and stored frames by stamp."""
         return by_stamp(self.states, self._frames())
 
     def poses(self) -> Iterator[tuple[int, str, Float64]]:

@@ -90,11 +90,9 @@ class PerturbedSource:
         return replace(loss, notes=[*loss.notes, f"perturbed: {self._perturbation.words()}"])
 
     def records(self) -> Iterator[Record]:
-        """Joint states and frames by stamp."""
         return decoded(self.stored())
 
     def stored(self) -> Iterator[StoredFrame | JointState]:
-        """Joint states and stored frames by stamp."""
         for item in self.inner.stored():
             yield self._perturbed(item) if isinstance(item, StoredFrame) else item
 

@@ -150,5 +150,4 @@ class SplatFormat:
 
 
 def without_labels(gaussians: GaussianSet) -> GaussianSet:
-    """`gaussians`, all of them objects."""
     return replace(gaussians, labels=np.zeros_like(gaussians.labels))

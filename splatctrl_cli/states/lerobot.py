@@ -18,7 +18,6 @@ INFO, POSITION, EPISODE = Path("meta/info.json"), "observation.state", "episode_
 
 
 def is_lerobot(path: Path) -> bool:
-    """Whether a folder is such a dataset."""
     return (path / INFO).is_file() and (path / "data").is_dir()
 
 

@@ -50,15 +50,12 @@ class StateSource:
 
     @property
     def loss(self) -> LossReport:
-        """What did not become states."""
         return replace(self._loss, notes=list(self._loss.notes))
 
     def records(self) -> Iterator[Record]:
-        """Joint states by stamp."""
         yield from self.states
 
     def digests(self) -> dict[str, str]:
-        """sha256 of the files."""
         return {file.name: sha256(file) for file in self._files}
 
 

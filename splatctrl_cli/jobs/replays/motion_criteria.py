@@ -70,7 +70,6 @@ def true_clearance(judged: Judged) -> Iterator[Reason]:
 
 
 def _by_source(judged: Judged, source: str) -> Iterator[Reason]:
-    """Contact, margin broken or kept, by one of the distances."""
     replay = judged.replay
     values = replay.true_clearance if source == "true" else replay.audit.clearance[source].distance
     least = least_of(np.asarray(values))

@@ -57,7 +57,6 @@ class StoredObjects(Sequence[T], Generic[T]):
         self._read: tuple[int, list[T]] = (-1, [])
 
     def extend(self, objects: Sequence[T]) -> None:
-        """Add a block."""
         if not objects:
             return
         self._starts.append(self._num)
@@ -146,7 +145,6 @@ class StoredAudit:
         self._names: tuple[str, ...] = ()
 
     def add(self, part: AuditTrace) -> None:
-        """The next states."""
         self._names = tuple(part.clearance)
         self._stamps.append(part.stamp_ns)
         for name, clearance in part.clearance.items():
@@ -192,8 +190,6 @@ class StoredAudit:
         return self._figures["unknown_share"]
 
     def block(self, first: int, last: int) -> AuditTrace:
-        """Some of the states."""
-
         def part(name: str) -> Float64:
             return self._figures.block(name, first, last)
 
@@ -227,7 +223,6 @@ class StoredSteps:
         return self.figures.rows("velocity")
 
     def extend(self, steps: Sequence[ControlStep | None], num_joints: int) -> None:
-        """The next steps."""
         blank = np.full(num_joints, np.nan)
         self.stored.extend(steps)
         rows = np.array([STEP_BLANK if step is None else _figures_of(step) for step in steps])
@@ -272,7 +267,6 @@ class StoredLoop:
         return self.kept.stored  # type: ignore[return-value]
 
     def add(self, stamp_ns: int, q: Float64, step: ControlStep) -> None:
-        """The next step."""
         self._waiting.append((stamp_ns, q, step))
         if len(self._waiting) == BLOCK:
             self._flush()
@@ -312,7 +306,6 @@ class StoredOpenLoop:
         return self.figures.rows("difference")
 
     def add(self, part: OpenLoopTrace) -> None:
-        """The next states."""
         self.kept.extend(part.steps, part.logged.shape[1])
         self.margins.extend(part.margins)
         nothing = (np.nan, np.nan)
@@ -327,7 +320,6 @@ class StoredOpenLoop:
         )
 
     def block(self, first: int, last: int) -> OpenLoopTrace:
-        """Some of the states."""
         return OpenLoopTrace(
             logged=self.logged[first:last],
             commanded=self.kept.velocity[first:last],

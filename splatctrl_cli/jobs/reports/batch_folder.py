@@ -63,7 +63,6 @@ class BatchFolder:
 
 
 def is_batch(path: Path) -> bool:
-    """Whether a folder is one of a batch."""
     return (path / FILE).is_file()
 
 

@@ -57,7 +57,6 @@ class RunFolder:
 
     @property
     def command(self) -> str:
-        """The subcommand."""
         return str(self.run.get("command", ""))
 
     @property
@@ -67,7 +66,6 @@ class RunFolder:
 
     @property
     def metrics(self) -> Mapping[str, Any]:
-        """By name."""
         return self._object("metrics")
 
     def _object(self, name: str) -> Mapping[str, Any]:
@@ -78,7 +76,6 @@ class RunFolder:
 
     @property
     def arguments(self) -> list[str]:
-        """As typed."""
         given = list(self.words) or self.run.get("arguments", [])
         return [str(word) for word in given] if isinstance(given, list) else []
 
