@@ -14,7 +14,7 @@ from splatctrl_cli.records import Intrinsics, SplatSet
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.voxels import OccupancyGrid
 from tests.datasets.make_layout import make_bop, make_frames, make_nerfstudio, make_redwood, make_scannet, make_tum
-from tests.known_voxels import known
+from tests.plain import known
 
 Commands = tuple[tuple[str, ...], ...]
 

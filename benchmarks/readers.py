@@ -17,15 +17,14 @@ from benchmarks.fuzz_samples import ROBOT, capture_of, plain_log
 from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.containers.bag1_log import Bag1Log
 from splatctrl_cli.containers.db3_log import Db3Log
+from splatctrl_cli.containers.foxglove import MessageTypes
 from splatctrl_cli.containers.mcap_log import McapLog
-from splatctrl_cli.containers.protobuf import MessageTypes
 from splatctrl_cli.containers.raw_log import Damage
 from splatctrl_cli.datasets.folder_description import read_description
 from splatctrl_cli.datasets.poses import read_nerfstudio, read_trajectory_log, read_tum
 from splatctrl_cli.errors import SplatCtrlError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of, read_arrays, savez
-from splatctrl_cli.files.image_file import image_head
-from splatctrl_cli.files.pfm import read_pfm, write_pfm
+from splatctrl_cli.files.image_file import image_head, read_pfm, write_pfm
 from splatctrl_cli.grid_files.grid_formats import write_grid
 from splatctrl_cli.grid_files.npz_grid import read_npz
 from splatctrl_cli.grid_files.nrrd import read_nrrd_head
@@ -41,7 +40,7 @@ from tests.containers.test_log_formats import as_ros1_bag, as_ros2_folder
 from tests.datasets.make_layout import make_nerfstudio, make_redwood, make_tum
 from tests.grid_files.make_grid import random_grid
 from tests.logs.make_log import LogRecipe, make_log
-from tests.logs.test_rvl import encoded_rvl
+from tests.logs.test_decoder import encoded_rvl
 from tests.splat_files.test_gaussian_ply import gaussian_set
 
 Read = Callable[[bytes], object]

@@ -24,7 +24,7 @@ from splatctrl_cli.datasets.layouts import LAYOUTS
 from splatctrl_cli.evaluate.verdict import Criterion
 from splatctrl_cli.grid_files.grid_format import GridFormat
 from splatctrl_cli.grid_files.grid_formats import FORMATS as GRID_FORMATS
-from splatctrl_cli.jobs.declared_metrics import Compared, documented
+from splatctrl_cli.jobs.judged_runs import Compared, documented
 from splatctrl_cli.jobs.replays.criteria_input import Judged
 from splatctrl_cli.jobs.replays.verdict import CRITERIA
 from splatctrl_cli.splat_files.splat_format import SplatFormat

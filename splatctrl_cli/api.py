@@ -19,9 +19,15 @@ from splatctrl_cli.jobs.reconstruct import ReconstructResult, reconstruct
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.replay import ReplayResult, replay
 from splatctrl_cli.jobs.replays.request import ReplayRequest
-from splatctrl_cli.jobs.report import WriteReportRequest, WriteReportResult, write_report
+from splatctrl_cli.jobs.report import (
+    ViewRequest,
+    ViewResult,
+    WriteReportRequest,
+    WriteReportResult,
+    view,
+    write_report,
+)
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, score
-from splatctrl_cli.jobs.view import ViewRequest, ViewResult, view
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Box, Label
 

@@ -1,9 +1,12 @@
-"""Libraries that take most of a second to load, each loaded when a name of it is first used, and those of extras."""
+"""Modules that are found by name: libraries that take most of a second to load, each loaded when a name of it is
+first used, those of extras, and a room's own modules, which declare what they add to its registry.
+"""
 
 from importlib import import_module
 from importlib.util import find_spec
+from pkgutil import iter_modules
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from splatctrl_cli.errors import UsageError
 
@@ -47,3 +50,20 @@ def of_extra(module: str, extra: str, what: str) -> Any:
 
 
 __all__ = ["distributed", "is_installed", "mpl", "of_extra", "scipy_io", "trimesh"]
+
+
+class Ordered(Protocol):
+    """An entry of a registry; lists show the lowest `order` first, and things are tried in it."""
+
+    @property
+    def order(self) -> int: ...
+
+
+Entry = TypeVar("Entry", bound=Ordered)
+
+
+def entries_of(room: str, kind: type[Entry]) -> tuple[Entry, ...]:
+    """The `kind` that the modules of the package `room` hold in their ``ENTRIES``, by order, then by module."""
+    modules = [import_module(f"{room}.{found.name}") for found in iter_modules(import_module(room).__path__)]
+    found = [entry for module in modules for entry in getattr(module, "ENTRIES", ()) if isinstance(entry, kind)]
+    return tuple(sorted(found, key=lambda entry: entry.order))

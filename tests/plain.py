@@ -1,10 +1,10 @@
-"""Records of which a test says what matters; the rest is plain."""
+"""Records and voxels of which a test says what matters; the rest is plain."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from splatctrl_cli.records import Float64, Intrinsics, RgbdFrame, SplatSet
-from splatctrl_cli.voxels import OccupancyGrid
+from splatctrl_cli.voxels import Balls, KnownVoxels, OccupancyGrid
 
 
 def plain_frame(
@@ -65,4 +65,15 @@ def plain_grid(
         log_odds=np.broadcast_to(np.asarray(log_odds, np.float32), shape).copy(),
         num_updates=np.broadcast_to(np.asarray(num_updates, np.uint16), shape).copy(),
         entity=np.broadcast_to(np.asarray(entity, np.uint8), shape).copy(),
+    )
+
+
+def known(grid: OccupancyGrid, stamp_ns: int = 0, unrepresented: ArrayLike = (), label: int = 0) -> KnownVoxels:
+    """`grid`, what of it was seen at `stamp_ns`, with balls of one label around voxel centres (K, 3) [m]."""
+    centers = np.asarray(unrepresented, np.float32).reshape(-1, 3)
+    return KnownVoxels(
+        grid=grid,
+        last_seen=(grid.num_updates > 0).astype(np.uint16),
+        step_stamps_ns=np.array([stamp_ns], np.int64),
+        unrepresented=Balls.of_voxels(centers, grid.voxel, np.full(len(centers), label, np.uint8)),
     )

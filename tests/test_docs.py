@@ -302,3 +302,17 @@ def test_the_first_page_shows_what_info_prints(
     printed = capsys.readouterr().out.splitlines()
     assert len(lines) == 5
     assert [line for line in lines if line not in printed] == []
+
+
+FORMATS = ROOT / "docs" / "formats.md"
+
+
+def test_every_proof_of_the_page_is_a_test() -> None:
+    proofs = re.findall(r"`(\S+\.py): (\w+)`", FORMATS.read_text(encoding="utf-8"))
+    assert len(proofs) > 40
+    missing = [
+        f"{file}: {name}"
+        for file, name in proofs
+        if f"def {name}(" not in (ROOT / "tests" / file).read_text(encoding="utf-8")
+    ]
+    assert not missing

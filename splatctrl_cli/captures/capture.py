@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.captures.capture_header import read_capture_header
-from splatctrl_cli.captures.capture_index import COLUMNS, ROBOT, FileSums, FrameRows
+from splatctrl_cli.captures.capture_header import COLUMNS, ROBOT, FileSums, FrameRows, read_capture_header
 from splatctrl_cli.errors import InputError
+from splatctrl_cli.files.array_columns import NpzFile
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
 from splatctrl_cli.files.image_file import decode_file
-from splatctrl_cli.files.npz_columns import NpzFile
 from splatctrl_cli.files.output import sha256
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.logs.joint_topics import (
@@ -25,10 +24,10 @@ from splatctrl_cli.logs.joint_topics import (
     without_joints,
 )
 from splatctrl_cli.logs.messages import metres
-from splatctrl_cli.logs.robot_description import RobotDescription
 from splatctrl_cli.logs.source_options import CALIBRATION, PERTURB, SourceOptions
 from splatctrl_cli.logs.state_columns import NO_STATES, StateColumns
 from splatctrl_cli.logs.stored_frame import StoredFrame, decoded, human_mask
+from splatctrl_cli.logs.survey import RobotDescription
 from splatctrl_cli.records import (
     Bool,
     Float32,

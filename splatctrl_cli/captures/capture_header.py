@@ -1,19 +1,28 @@
-"""capture.json: whether a folder is a capture, and what it has to say for the rest to be read by it."""
+"""What a capture says of itself: capture.json, by which the rest is read, frames.csv and SHA256SUMS, a row at a time:
+some fifty bytes of memory a file.
+"""
 
+import csv
+import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+import tempfile
+import weakref
+from array import array
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import fields
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import IO, Any, BinaryIO
 
-from splatctrl_cli.captures.capture_index import FileSums
-from splatctrl_cli.captures.capture_writer import FORMAT, VERSION
+import numpy as np
+
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.output import sha256
+from splatctrl_cli.files.spilled_rows import scratch_folder
 from splatctrl_cli.logs.joint_topics import AGAIN
 from splatctrl_cli.records import LossReport
 
+FORMAT, VERSION = "splatctrl-capture", 1
 INDEX_FILES = ("capture.json", "frames.csv", "joints.npz")
 
 
@@ -105,3 +114,153 @@ def _check_index(path: Path) -> None:
             raise InputError(f"{path / name}: missing", remedy=AGAIN)
         if sums.get(name) != sha256(path / name):
             raise InputError(f"{path / name}: its checksum differs from SHA256SUMS", remedy=AGAIN)
+
+
+SUMS = "SHA256SUMS"
+COLUMNS = ("camera", "stamp_ns", "color", "depth", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "source")
+MASKS = ("human", "valid")  # further columns, where the recording has such masks
+ROBOT = "robot_description.urdf"  # the URDF that the log itself brings, where it does
+_FURTHER = ((), *((mask,) for mask in MASKS), MASKS)  # columns of frames.csv after COLUMNS
+_MOST_ROW = 1 << 16  # bytes of a row
+IN_MEMORY = 1 << 16  # [bytes] of the lines of one folder
+
+
+class FrameRows(Sequence[Mapping[str, str]]):
+    """Rows of frames.csv of some cameras, in its order; each is read when it is asked for."""
+
+    def __init__(self, file: Path, cameras: Collection[str]) -> None:
+        """Raises InputError for a row that cannot be read, or that names a file outside the capture."""
+        self._file = file
+        self._offsets = array("q")
+        try:
+            with file.open("rb") as stream:
+                rows = _rows(stream, 0)
+                _, names = next(rows, (0, []))
+                self._names = tuple(names)
+                if self._names[: len(COLUMNS)] != COLUMNS or self._names[len(COLUMNS) :] not in _FURTHER:
+                    raise InputError(f"{file}: expected columns {', '.join(COLUMNS)}", remedy=AGAIN)
+                for offset, values in rows:
+                    row = self._row(values)
+                    _check(row)
+                    if row["camera"] in cameras:
+                        self._offsets.append(offset)
+        except (OSError, UnicodeDecodeError, csv.Error, ValueError, TypeError) as error:
+            raise InputError(f"{file}: cannot be read: {error}", remedy=AGAIN) from None
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def __getitem__(self, number: int) -> Mapping[str, str]:  # type: ignore[override]
+        """A row by its number. Raises InputError where the file is no longer what it was."""
+        try:
+            with self._file.open("rb") as stream:
+                _, values = next(_rows(stream, self._offsets[number]), (0, []))
+            row = self._row(values)
+            _check(row)
+        except (UnicodeDecodeError, csv.Error, ValueError, TypeError):
+            raise InputError(f"{self._file}: changed while it was read", remedy="try again") from None
+        return row
+
+    def _row(self, values: Sequence[str]) -> Mapping[str, str]:
+        return dict(zip(self._names, values, strict=True))
+
+
+def _check(row: Mapping[str, str]) -> None:
+    """Raise ValueError for what is no frame."""
+    int(row["stamp_ns"])
+    for key in COLUMNS[4:11]:
+        float(row[key])
+    for name in (row["color"], row["depth"], *(row.get(mask) or "" for mask in MASKS)):
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts:
+            raise ValueError(f"{name} lies outside the capture")
+
+
+def _rows(stream: BinaryIO, offset: int) -> Iterator[tuple[int, list[str]]]:
+    """Each row from the byte `offset` on, with the byte at which it begins."""
+    end = offset
+    stream.seek(offset)
+
+    def lines() -> Iterator[str]:
+        nonlocal end
+        while line := stream.readline(_MOST_ROW):
+            end += len(line)
+            yield line.decode("utf-8")
+
+    reader, start = csv.reader(lines(), strict=True), offset
+    for row in reader:
+        if row:
+            yield start, row
+        start = end
+
+
+class FileSums:
+    """SHA256SUMS: the checksum that it says of a file, by name."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError where there is none."""
+        file = folder / SUMS
+        if not file.is_file():
+            raise InputError(f"{file}: missing", remedy=f"the capture was not finished; {AGAIN}")
+        keys, sums = array("Q"), bytearray()
+        with file.open("rb") as stream:
+            while line := stream.readline(_MOST_ROW):
+                try:
+                    digest = bytes.fromhex(line[:64].decode("ascii"))
+                except ValueError:  # UnicodeDecodeError among them
+                    continue
+                if len(digest) == 32:
+                    keys.append(_key(line[66:].rstrip(b"\r\n")))
+                    sums += digest
+        order = np.argsort(np.frombuffer(keys, dtype=np.uint64), kind="stable")
+        self._keys = np.frombuffer(keys, dtype=np.uint64)[order]
+        self._sums = np.frombuffer(sums, dtype=np.uint8).reshape(-1, 32)[order]
+
+    def get(self, name: str) -> str | None:
+        """The sha256, hexadecimal, that the last line of a name says; None where there is none."""
+        at = int(np.searchsorted(self._keys, np.uint64(_key(name.encode())), side="right")) - 1
+        if at < 0 or int(self._keys[at]) != _key(name.encode()):
+            return None
+        return bytes(self._sums[at]).hex()
+
+
+def _key(name: bytes) -> int:
+    """64 bits of a name; two that share them would make a good file look damaged."""
+    return int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little")
+
+
+class Checksums:
+    """SHA256SUMS to be written, by name. Lines of a folder wait in a file without a name, as they come in order."""
+
+    def __init__(self) -> None:
+        self._folders: dict[str, IO[bytes]] = {}
+        self._others: dict[str, str] = {}
+
+    def add(self, digest: str, name: str) -> None:
+        """Of a file in a folder, after those before it there."""
+        folder = name.rpartition("/")[0]
+        if folder not in self._folders:
+            self._folders[folder] = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY, dir=str(scratch_folder()))  # noqa: SIM115
+            weakref.finalize(self, self._folders[folder].close)
+        self._folders[folder].write(_line(digest, name))
+
+    def add_other(self, digest: str, name: str) -> None:
+        """Of one of few files, in any order, any number of times; not in a folder of `add`."""
+        self._others[name] = digest
+
+    def write(self, path: Path) -> None:
+        """All lines, by name."""
+        blocks = sorted([*(f"{folder}/" for folder in self._folders), *self._others])
+        with path.open("wb") as stream:
+            for block in blocks:
+                if block in self._others:
+                    stream.write(_line(self._others[block], block))
+                    continue
+                lines = self._folders[block[:-1]]
+                lines.seek(0)
+                while piece := lines.read(1 << 20):
+                    stream.write(piece)
+
+
+def _line(digest: str, name: str) -> bytes:
+    return f"{digest}  {name}\n".encode()

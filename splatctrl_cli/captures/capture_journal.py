@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from splatctrl_cli.captures.capture_index import MASKS
+from splatctrl_cli.captures.capture_header import MASKS
 from splatctrl_cli.errors import InputError, UsageError
 
 JOURNAL = "ingest.jsonl"  # in the folder while it is partial

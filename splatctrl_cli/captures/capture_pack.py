@@ -17,8 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from splatctrl_cli.captures.capture import CaptureSource
-from splatctrl_cli.captures.capture_index import SUMS
-from splatctrl_cli.captures.capture_writer import VERSION
+from splatctrl_cli.captures.capture_header import SUMS, VERSION
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_records import ATTACHMENT, BadRecordError, Metadata, parse_record

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.lib import format as npy
 
-from splatctrl_cli.captures.capture_index import COLUMNS, MASKS, ROBOT, Checksums
+from splatctrl_cli.captures.capture_header import COLUMNS, FORMAT, MASKS, ROBOT, VERSION, Checksums
 from splatctrl_cli.captures.capture_journal import Entry, Journal, check_same_frame
 from splatctrl_cli.config.fixed import FLOAT_DEPTH_ERROR, FLOAT_DEPTH_UNIT
 from splatctrl_cli.errors import InputError, WriteError
@@ -27,7 +27,6 @@ from splatctrl_cli.logs.state_columns import StateCollector, StateColumns
 from splatctrl_cli.logs.stored_frame import FrameSource, StoredFrame, is_png
 from splatctrl_cli.records import Float32, JointState, LossReport
 
-FORMAT, VERSION = "splatctrl-capture", 1
 PROVENANCE = "provenance.csv"
 PLACE = ("file", "offset", "log_time_ns")
 PROVENANCE_COLUMNS = ("color", "depth", *(f"{kind}_{name}" for kind in ("color", "depth") for name in PLACE))

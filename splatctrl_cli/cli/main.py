@@ -19,7 +19,7 @@ from splatctrl_cli.cli.envelope import enveloped
 from splatctrl_cli.cli.reports import tell_of_failure
 from splatctrl_cli.errors import SplatCtrlError, UsageError
 from splatctrl_cli.files.output import PARTIAL, check_can_be_written, is_write_failure
-from splatctrl_cli.report.junit import check_replaceable
+from splatctrl_cli.report.suites import check_replaceable
 
 MAX_PIXELS = 1 << 27  # of an image file: twice the largest cameras; a small file can announce a thousand million
 

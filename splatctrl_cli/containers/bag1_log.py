@@ -1,27 +1,177 @@
-"""The messages of a ROS 1 bag, with or without its index; what is damaged is left out and counted."""
+"""The messages of a ROS 1 bag, with or without its index; what is damaged is left out and counted.
 
+A bag (format 2.0, wiki.ros.org/Bags/Format/2.0) is a sequence of records, each a header of named fields and a body,
+read from front to back in bounded memory. Its index stands at the end and is written last, so a bag that was cut, or
+is still being written, has none: nothing here needs it.
+"""
+
+import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import BinaryIO, NamedTuple
 
-from splatctrl_cli.containers.bag_file import (
-    BAG_HEADER,
-    CHUNK,
-    CHUNK_INFO,
-    CONNECTION,
-    MESSAGE,
-    BagFile,
-    BagRecord,
-    Fields,
-    fields_of,
-    number,
-    records_in,
-)
 from splatctrl_cli.containers.foxglove import standing_in
 from splatctrl_cli.containers.mcap_log import ros_type_name
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.unpacking import BadBlockError, Budget, unpacked_start
+from splatctrl_cli.files.unpacking import MAX_BLOCK, PIECE, BadBlockError, Budget, unpacked_start
 from splatctrl_cli.records import SECOND_NS
+
+MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+_KINDS = frozenset({MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION})
+_U32 = struct.Struct("<I")
+_MARK = b"compression="  # of a chunk's header, behind its length and perhaps the fields `op` and `size`
+_MARK_OFFSETS = (8, 16, 21, 29)
+
+Fields = dict[str, bytes]
+
+
+class BagRecord(NamedTuple):
+    """One record: its fields and body; the body is what the file still holds of it where it is cut."""
+
+    offset: int
+    kind: int
+    fields: Fields
+    body: bytes
+    is_cut: bool = False
+
+
+class BagFile:
+    """Walks over the records of one file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = path.stat().st_size
+
+    def records(self, damage: Damage) -> Iterator[BagRecord]:
+        """Yield chunks, connections, messages and the bag's header in order; what is lost goes to `damage`."""
+        with self.path.open("rb") as stream:
+            if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
+                damage.add(f"{self.path.name}: is not a bag of format 2.0")
+                return
+            while stream.tell() < self.size:
+                offset = stream.tell()
+                record = self._record(stream, offset)
+                if record is not None and not record.is_cut:
+                    yield record
+                    continue
+                place = self._next_chunk(stream, offset)
+                if place is None:
+                    damage.add(f"{self.path.name}: cut or damaged after byte {offset}")
+                    if record is not None:
+                        yield record
+                    return
+                damage.add(f"{self.path.name}: bytes {offset} to {place} are damaged and were left out")
+                stream.seek(place)
+
+    def connections(self) -> list[BagRecord]:
+        """The connections that the index at the end names; none where there is no index."""
+        with self.path.open("rb") as stream:
+            stream.readline(64)
+            first = self._record(stream, stream.tell())
+            place = number(first.fields, "index_pos") if first is not None and first.kind == BAG_HEADER else 0
+            if not 0 < place < self.size:
+                return []
+            stream.seek(place)
+            found = []
+            while (record := self._record(stream, stream.tell())) is not None and record.kind == CONNECTION:
+                found.append(record)
+            return found
+
+    def _record(self, stream: BinaryIO, offset: int) -> BagRecord | None:
+        """The record at `offset`, None where there is none; the stream is left behind it."""
+        head = self._head(stream)
+        if head is None:
+            return None
+        kind, fields, length = head
+        end = stream.tell() + length
+        is_cut = end > self.size
+        is_read = kind in {MESSAGE, CHUNK, CONNECTION} or is_cut
+        body = stream.read(min(length, MAX_BLOCK)) if is_read else b""
+        stream.seek(min(end, self.size))
+        return BagRecord(offset, kind, fields, body, is_cut)
+
+    def _head(self, stream: BinaryIO) -> tuple[int, Fields, int] | None:
+        """Kind, fields and length of the body of the record that begins here; the stream is left at the body."""
+        length = self._length(stream)
+        if length is None or length > min(1 << 20, self.size - stream.tell()):  # those of connections hold a name
+            return None
+        fields = fields_of(stream.read(length))
+        kind = fields["op"][0] if fields is not None and len(fields.get("op", b"")) == 1 else 0
+        length = self._length(stream)
+        return None if fields is None or kind not in _KINDS or length is None else (kind, fields, length)
+
+    def _next_chunk(self, stream: BinaryIO, offset: int) -> int | None:
+        """Where behind `offset` a whole chunk begins, by the fields of its header."""
+        stream.seek(offset + 1)
+        kept = b""
+        while block := stream.read(PIECE):
+            here = stream.tell()
+            base, block = here - len(block) - len(kept), kept + block
+            at = block.find(_MARK)
+            while at >= 0:
+                for back in _MARK_OFFSETS:
+                    place = base + at - back
+                    if place > offset and self._is_chunk(stream, place):
+                        return place
+                at = block.find(_MARK, at + 1)
+            stream.seek(here)
+            kept = block[-(len(_MARK) - 1) :]
+        return None
+
+    def _is_chunk(self, stream: BinaryIO, place: int) -> bool:
+        stream.seek(place)
+        head = self._head(stream)
+        return head is not None and head[0] == CHUNK and stream.tell() + head[2] <= self.size
+
+    @staticmethod
+    def _length(stream: BinaryIO) -> int | None:
+        content = stream.read(4)
+        return int(_U32.unpack(content)[0]) if len(content) == 4 else None
+
+
+def fields_of(header: bytes) -> Fields | None:
+    """The named fields of a record's header; None where its lengths do not fit."""
+    found: Fields = {}
+    at = 0
+    while at < len(header):
+        if at + 4 > len(header):
+            return None
+        length = _U32.unpack_from(header, at)[0]
+        at += 4 + length
+        name, equals, value = header[at - length : at].partition(b"=")
+        if at > len(header) or not equals:
+            return None
+        found[name.decode("latin-1")] = value
+    return found
+
+
+def number(fields: Fields, name: str) -> int:
+    """A field of four or eight bytes as a number; -1 where it is missing."""
+    value = fields.get(name, b"")
+    return int.from_bytes(value, "little") if len(value) in {4, 8} else -1
+
+
+def records_in(content: bytes) -> Iterator[tuple[int, Fields, bytes]]:
+    """Yield kind, fields and body of the records of an unpacked chunk, up to the first that does not fit.
+
+    Raises ValueError where bytes are left that are not a record.
+    """
+    at = 0
+    while at < len(content):
+        if at + 4 > len(content):
+            raise ValueError(f"{len(content) - at} bytes are not a record")
+        start = at + 4
+        end = start + _U32.unpack_from(content, at)[0]
+        fields = fields_of(content[start:end]) if end + 4 <= len(content) else None
+        if fields is None:
+            raise ValueError(f"{len(content) - at} bytes are not a record")
+        body = end + 4
+        at = body + _U32.unpack_from(content, end)[0]
+        kind = fields.get("op", b"")
+        if at > len(content) or len(kind) != 1:
+            raise ValueError(f"{len(content) - body} bytes are not a record")
+        yield kind[0], fields, content[body:at]
 
 
 class Bag1Log:

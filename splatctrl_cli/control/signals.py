@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splatctrl_cli.control.audit import AuditTrace
 from splatctrl_cli.control.events import EventKind, OneEach, Signal
 from splatctrl_cli.control.fallbacks import Rung
-from splatctrl_cli.control.motion_limits import Strain
+from splatctrl_cli.control.limits import Strain
 from splatctrl_cli.control.step import ControlStep
 from splatctrl_cli.control.terms import RowKind
 from splatctrl_cli.records import Bool, Float64

@@ -18,7 +18,7 @@ import numpy as np
 from splatctrl_cli.datasets.dtu import DtuScan, DtuView, Shrink, check_lengths, chosen_scan, read_views, write_png
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import read_arrays, savez
-from splatctrl_cli.files.pfm import write_pfm
+from splatctrl_cli.files.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform
 from splatctrl_cli.records import MILLIMETRES, Float64, Intrinsics
 

@@ -25,9 +25,8 @@ from splatctrl_cli.datasets.folder_views import (
 from splatctrl_cli.datasets.layout_nerfstudio import with_transforms
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.arrays import DAMAGE, npy_of
-from splatctrl_cli.files.image_file import decode_file
+from splatctrl_cli.files.image_file import decode_file, read_pfm
 from splatctrl_cli.files.output import sha256
-from splatctrl_cli.files.pfm import read_pfm
 from splatctrl_cli.logs.messages import measured, metres, num_invalid
 from splatctrl_cli.logs.registration import DepthToColor, Undistortion
 from splatctrl_cli.logs.source_options import SourceOptions

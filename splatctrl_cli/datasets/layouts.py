@@ -8,8 +8,8 @@ from splatctrl_cli.datasets.idr import idr_scans
 from splatctrl_cli.datasets.image_folder import ImageFolderSource
 from splatctrl_cli.datasets.layout import Layout, images_of
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.listing import names_in
-from splatctrl_cli.files.registry import entries_of
+from splatctrl_cli.files.summary import names_in
+from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.logs.source_options import SourceOptions
 
 _COLORS = ("images", "image", "rgb", "color")  # where folders of colour alone keep it

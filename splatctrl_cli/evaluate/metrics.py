@@ -1,8 +1,8 @@
 """Metrics as they are declared: the value, what it rests on, of a figure of states how it folds over them, and how
-two runs are compared by it.
+two runs are compared by it, or two of each of many recordings, by a confidence interval of the mean change.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Generic, TypeVar
@@ -185,3 +185,31 @@ def counted(
         scale=scale,
         shown=shown,
     )
+
+
+FEWEST = 8  # recordings; of fewer there are too few different resamples for their percentiles to mean anything
+RESAMPLES = 10_000
+CONFIDENCE = 0.95
+SEED = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanChange:
+    """The mean of num_pairs differences, and an interval that has it with CONFIDENCE."""
+
+    mean: float
+    low: float
+    high: float
+    num_pairs: int
+
+
+def mean_change(differences: Sequence[float]) -> MeanChange | None:
+    """The mean of paired differences with its percentile interval: means of RESAMPLES draws with replacement, by SEED
+    (Efron and Tibshirani 1993, section 13.3). None for fewer than FEWEST pairs.
+    """
+    values, num = np.asarray(differences, dtype=np.float64), len(differences)
+    if num < FEWEST:
+        return None
+    means = values[np.random.default_rng(SEED).integers(num, size=(RESAMPLES, num))].mean(axis=1)
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return MeanChange(mean=float(values.mean()), low=float(low), high=float(high), num_pairs=num)

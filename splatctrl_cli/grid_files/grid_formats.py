@@ -4,8 +4,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from splatctrl_cli.errors import UsageError
-from splatctrl_cli.files.registry import entries_of
 from splatctrl_cli.grid_files.grid_format import STEM, GridFormat
+from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.records import DistanceGrid
 
 FORMATS: Mapping[str, GridFormat] = {kind.name: kind for kind in entries_of(__package__, GridFormat)}

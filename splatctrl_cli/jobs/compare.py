@@ -8,13 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.metrics import Better, Scale
-from splatctrl_cli.evaluate.paired_bootstrap import CONFIDENCE, MeanChange, mean_change
+from splatctrl_cli.evaluate.metrics import CONFIDENCE, Better, MeanChange, Scale, mean_change
 from splatctrl_cli.evaluate.verdict import Reason, Verdict, failed, lacking, noted, verdict_of
-from splatctrl_cli.jobs.declared_metrics import scales
-from splatctrl_cli.jobs.judged_runs import Judged, JudgedRun, read_baseline, read_judged, write_baseline
+from splatctrl_cli.jobs.judged_runs import (
+    Judged,
+    JudgedRun,
+    WorstState,
+    read_baseline,
+    read_judged,
+    scales,
+    worst_state,
+    write_baseline,
+)
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.jobs.worst_state import WorstState, worst_state
 
 MOST_NAMES = 5  # in an error
 REGRESSION = "regression"

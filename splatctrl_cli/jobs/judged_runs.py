@@ -1,19 +1,103 @@
-"""Runs that were judged, read back to be compared: a command's folder, a batch, or a stored baseline."""
+"""Runs that were judged, read back to be compared: a command's folder, a batch, or a stored baseline; the figures
+that each command declares, and the state of a replay that is worst by one.
+"""
 
+import csv
 import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from splatctrl_cli import __version__
+from splatctrl_cli.config.fixed import BANDS
 from splatctrl_cli.errors import InputError, UsageError
-from splatctrl_cli.evaluate.metrics import Better
+from splatctrl_cli.evaluate import field_accuracy, score_report
+from splatctrl_cli.evaluate.field_truth import FIELDS
+from splatctrl_cli.evaluate.metrics import Better, Scale, Shown
 from splatctrl_cli.files.output import PARTIAL, output_path
-from splatctrl_cli.jobs.declared_metrics import scales
+from splatctrl_cli.jobs import bake, reconstruct_gaussians, reconstruct_verdict, robot, score_fit
+from splatctrl_cli.jobs.replays.metrics import metric_scales, shown_metrics
+from splatctrl_cli.jobs.replays.request import MODES
+from splatctrl_cli.jobs.replays.standstill_baseline import BASELINES
+
+REPLAY_FIELDS = ("exact", "barrier", "certified")
+WORDS = {  # of a name in the documentation, for those that it stands for
+    "METHOD": ("closed_loop", "log", "birrt_ik", "birrt", "standstill"),
+    "FIELD": ("exact", "barrier", "certified"),
+    "REGION": ("seen", "all", "masked"),
+    "FIT": ("3dgs", "ours"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """Figures of a command that are compared alike, as the documentation's table has them."""
+
+    command: str
+    names: tuple[str, ...]
+    scale: Scale
+
+    @property
+    def docs(self) -> str:
+        """The row of the table, its cells separated by |."""
+        scale, shown = self.scale, ", ".join(f"`{name}`" for name in self.names)
+        parts = [f"{scale.absolute:g} {scale.unit}".rstrip()] if scale.absolute else []
+        parts += [f"{100 * scale.relative:g} %"] if scale.relative else []
+        return f"{self.command} | {shown} | {scale.unit or '-'} | {scale.better} | {' + '.join(parts) or '0'}"
+
+
+@cache
+def scales() -> Mapping[str, Mapping[str, Scale]]:
+    """How two runs are compared by each figure, by command and name."""
+    replay: dict[str, Scale] = {}
+    for mode in MODES:
+        replay |= metric_scales(mode, REPLAY_FIELDS, has_truth=True, baselines=BASELINES, has_twists=True)
+    bands = [field_accuracy.band_name(lower, upper) for lower, upper in BANDS]
+    return {
+        "reconstruct": reconstruct_gaussians.GATED | reconstruct_verdict.GATED,
+        "sdf-bake": bake.SUMMARY_METRICS | field_accuracy.metric_scales(FIELDS, bands),
+        "score": score_report.SCALES | score_fit.GATED,
+        "replay": replay,
+        "robot": robot.SCALES,
+    }
+
+
+@cache
+def shown() -> Mapping[str, Shown]:
+    """Where the ``steps.csv`` of a replay shows its figures, by name."""
+    return {name: where for mode in MODES for name, where in shown_metrics(mode, REPLAY_FIELDS).items()}
+
+
+def documented() -> Iterator[Compared]:
+    """The rows of the documentation's table: figures that have a direction, alike ones together."""
+    for command, of_name in scales().items():
+        alike: dict[Scale, list[str]] = {}
+        for name, scale in of_name.items():
+            if scale.better is not Better.NEITHER:
+                alike.setdefault(scale, []).append(_general(name, of_name))
+        for scale, names in alike.items():
+            yield Compared(command=command, names=tuple(dict.fromkeys(names)), scale=scale)
+
+
+def _general(name: str, names: Container[str]) -> str:
+    """A name with a word for what is one of several among `names`: ``seen.FIELD.BAND.rmse``, ``METHOD_success``."""
+    if name.startswith(("everywhere.", "seen.")):
+        where, *_, figure = name.split(".")
+        return f"{where}.FIELD.BAND.{figure}"
+    for word, choices in WORDS.items():
+        for choice in choices:
+            head, tail = name.removeprefix(f"{choice}_"), name.removesuffix(f"_{choice}")
+            if head != name and sum(f"{other}_{head}" in names for other in choices) > 1:
+                return f"{word}_{head}"
+            if tail != name and sum(f"{tail}_{other}" in names for other in choices) > 1:
+                return f"{tail}_{word}"
+    return name
+
 
 BATCH, BASELINE, VERSION = "splatctrl-batch", "splatctrl-baseline", 1
 HEAD = "# Made by splatctrl compare --update-baseline: review what changed, then commit it.\n"
@@ -252,3 +336,50 @@ def _toml(value: object) -> str:
     if isinstance(value, int | float):
         return f"{value:.9g}"
     return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorstState:
+    """A state by its row, from 0, and its time [s] as in ``steps.csv``; the nearest sphere, and what it is near."""
+
+    state: int
+    time_s: float
+    sphere: str = ""
+    obstacle: str = ""
+
+    def __str__(self) -> str:
+        """As words of a report."""
+        near = f", {self.sphere}" if self.sphere else ""
+        return f"state {self.state}{near}" + (f" near {self.obstacle}" if self.obstacle else "")
+
+
+def worst_state(folder: Path | None, metric: str) -> WorstState | None:
+    """Where the replay in `folder` shows a metric; None where its states do not, or are not there."""
+    where = shown().get(metric)
+    if where is None or folder is None or not (folder / "steps.csv").is_file():
+        return None
+    with (folder / "steps.csv").open(encoding="utf-8", newline="") as stream:
+        rows = csv.DictReader(stream)
+        if where.column not in (rows.fieldnames or ()):
+            return None
+        found, least = None, math.inf
+        for index, row in enumerate(rows):
+            badness = _badness(where, row[where.column])
+            if badness < least:
+                found, least = (index, row), badness
+    if found is None:
+        return None
+    index, row = found
+    sphere = row.get(f"nearest_{where.column.removeprefix('clearance_')}") or ""
+    is_exact = where.column == "clearance_exact"
+    obstacle = (row.get("obstacle") or "") if is_exact else ""
+    return WorstState(state=index, time_s=float(row["time_s"]), sphere=sphere, obstacle=obstacle)
+
+
+def _badness(where: Shown, text: str) -> float:
+    """Smaller is worse; infinite where the cell does not count."""
+    if where.pick not in ("least", "largest"):
+        return 0.0 if text == where.pick else math.inf
+    if not text:
+        return math.inf
+    return float(text) if where.pick == "least" else -float(text)

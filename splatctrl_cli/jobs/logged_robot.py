@@ -5,7 +5,7 @@ from pathlib import Path
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.jobs.progress import SILENT, Progress
-from splatctrl_cli.logs.robot_description import NAME, RobotDescription
+from splatctrl_cli.logs.survey import NAME, RobotDescription
 from splatctrl_cli.records import RecordSource
 from splatctrl_cli.robot.model_difference import model_difference
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf

@@ -12,6 +12,7 @@ from splatctrl_cli.config import Config
 from splatctrl_cli.config.fixed import SAME_MOMENT_NS
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.same_recording import first_frame
+from splatctrl_cli.files.ply import read_points
 from splatctrl_cli.jobs.camera_agreement import CameraAgreement
 from splatctrl_cli.jobs.correct_views import Corrections
 from splatctrl_cli.jobs.device import CPU, Device, FitDevice
@@ -30,7 +31,6 @@ from splatctrl_cli.scene.self_mask import self_mask, self_mask_metrics
 from splatctrl_cli.scene.time_steps import TimeStep, cloud_box, depth_box, time_steps
 from splatctrl_cli.scene_files.scene_folder import FORMAT
 from splatctrl_cli.scene_files.scene_writer import Checkpoint, SceneWriter
-from splatctrl_cli.splat_files.points import read_points
 
 LONGEST_SHARE = 50  # a checkpoint is not written before 50 times as long as the last one took: below 2 % of the run
 

@@ -21,11 +21,10 @@ from splatctrl_cli.report.robot_picture import robot_picture
 from splatctrl_cli.robot.coverage import CoverageReport, LinkCoverage, coverage_of_solids
 from splatctrl_cli.robot.link_meshes import Solid, mesh_path, read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import SelfCollisionPairs, self_collision_pairs
+from splatctrl_cli.robot.self_collision import SelfCollisionPairs, read_srdf, self_collision_pairs
 from splatctrl_cli.robot.sphere_files import SphereFile, read_sphere_file, read_spheres, spheres_yaml
 from splatctrl_cli.robot.sphere_fit import FitOptions, fit_spheres
 from splatctrl_cli.robot.spheres import are_links_renamed, matched_links
-from splatctrl_cli.robot.srdf import read_srdf
 from splatctrl_cli.robot.urdf import UrdfFile, read_urdf
 
 SCALES = {

@@ -37,8 +37,7 @@ from splatctrl_cli.jobs.score_reference import (
 )
 from splatctrl_cli.jobs.score_views import Ranked, Scorer, Scores
 from splatctrl_cli.records import Label
-from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture
-from splatctrl_cli.report.view_picture import view_picture
+from splatctrl_cli.report.pictures import ComparisonRow, comparison_picture, view_picture
 from splatctrl_cli.scene_files.scene_folder import SceneFolder, run_value
 from splatctrl_cli.scene_files.splat_file import open_splats
 

@@ -10,11 +10,11 @@ from splatctrl_cli.config.fixed import CLOUD_DISTANCE, CLOUD_SPACING
 from splatctrl_cli.evaluate.cloud import cloud_score, points_on, spaced, thinned
 from splatctrl_cli.evaluate.protocols import ObservedSpace, cloud_of_scan, read_observed
 from splatctrl_cli.evaluate.views import seen_by, surface_points
+from splatctrl_cli.files.ply import is_mesh, read_positions
 from splatctrl_cli.jobs.score_views import final_splats, rendered
 from splatctrl_cli.mesh_distance import load_mesh
 from splatctrl_cli.records import Float64, Label, RgbdFrame
 from splatctrl_cli.scene_files.scene_folder import SceneFolder
-from splatctrl_cli.splat_files.points import is_mesh, read_positions
 
 
 @dataclass(frozen=True, kw_only=True)

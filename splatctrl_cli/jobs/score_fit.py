@@ -27,7 +27,7 @@ from splatctrl_cli.jobs.reconstruct_gaussians import reconstruct_gaussians
 from splatctrl_cli.jobs.reconstruction import ReconstructRequest
 from splatctrl_cli.jobs.score import ScoreRequest, ScoreResult, Scoring, chosen, folder_of, score_scene, write_result
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.report.view_picture import renders_picture
+from splatctrl_cli.report.pictures import renders_picture
 
 PROTOCOL = "dtu-holdout8"  # the paper names neither scans nor views
 

@@ -1,9 +1,18 @@
-"""What CI systems are told of commands: a suite for each recording, a case for each criterion and gate."""
+"""What CI systems are told of commands: a suite for each recording, a case for each criterion and gate, as JUnit XML,
+which GitLab, Jenkins and others show beside a run, and as annotations and a table on GitHub.
+"""
 
+import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any
+from pathlib import Path
+from typing import Any, TextIO
+from xml.etree import ElementTree
+
+from splatctrl_cli.errors import UsageError
+from splatctrl_cli.files.output import output_path
 
 
 class Kind(StrEnum):
@@ -132,3 +141,179 @@ def _told(reason: Mapping[str, Any]) -> str:
     }
     lines = [f"{name}: {value}" for name, value in facts.items() if value not in (None, "")]
     return "\n".join([f"{reason['outcome']}: {reason['sentence']}", *lines])
+
+
+HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<testsuites name="splatctrl"'
+ELEMENTS = {Kind.FAILED: "failure", Kind.ERROR: "error", Kind.NOT_EVALUABLE: "error", Kind.SKIPPED: "skipped"}
+_NOT_XML = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def write_junit(path: Path, suites: Sequence[Suite]) -> None:
+    """Write the suites into the file `path`, whole or not at all; a report that is there is replaced.
+
+    Raises UsageError where `path` is another kind of file or cannot be written, WriteError where the disk is full.
+    """
+    check_replaceable(path)
+    with output_path(path, force=True, is_folder=False) as partial:
+        partial.write_text(junit_text(suites), encoding="utf-8")
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise UsageError where `path` is a file that is no report of ours, and not empty."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(len(HEAD))
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        return  # `output_path` says what is wrong with the others
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be replaced: {error.strerror}", remedy="give another --junit") from None
+    if start not in (b"", HEAD.encode()):
+        raise UsageError(f"{path}: exists, and is no JUnit report of splatctrl", remedy="give another --junit")
+
+
+def junit_text(suites: Sequence[Suite]) -> str:
+    """The suites as XML 1.0, the same for the same suites; what is no character of XML stands as its escape."""
+    seconds = _seconds(sum(suite.seconds for suite in suites))
+    root = ElementTree.Element("testsuites", {"name": "splatctrl", **_counts(suites), "time": seconds})
+    for suite in suites:
+        _add_suite(root, suite)
+    ElementTree.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_suite(root: ElementTree.Element, suite: Suite) -> None:
+    attributes = {"name": _clean(suite.name), **_counts([suite]), "skipped": str(suite.count(Kind.SKIPPED))}
+    attributes |= {"time": _seconds(suite.seconds)} | ({"timestamp": suite.started} if suite.started else {})
+    element = ElementTree.SubElement(root, "testsuite", attributes)
+    if suite.properties:
+        properties = ElementTree.SubElement(element, "properties")
+        for name, value in suite.properties.items():
+            ElementTree.SubElement(properties, "property", name=_clean(name), value=_clean(value))
+    for case in suite.cases:
+        _add_case(element, case)
+    if suite.notes:
+        ElementTree.SubElement(element, "system-out").text = _clean("\n".join(suite.notes))
+
+
+def _add_case(suite: ElementTree.Element, case: Case) -> None:
+    attributes = {"classname": _clean(case.group), "name": _clean(case.name), "time": _seconds(case.seconds)}
+    element = ElementTree.SubElement(suite, "testcase", attributes)
+    if case.kind is Kind.PASSED:
+        if case.text:
+            ElementTree.SubElement(element, "system-out").text = _clean(case.text)
+        return
+    ended = {"message": _clean(case.sentence), "type": str(case.kind)}
+    ElementTree.SubElement(element, ELEMENTS[case.kind], ended).text = _clean(case.text)
+
+
+def _counts(suites: Sequence[Suite]) -> dict[str, str]:
+    """Errors are also what is not evaluable: nothing was shown to be right."""
+    return {
+        "tests": str(sum(len(suite.cases) for suite in suites)),
+        "failures": str(sum(suite.count(Kind.FAILED) for suite in suites)),
+        "errors": str(sum(suite.count(Kind.ERROR, Kind.NOT_EVALUABLE) for suite in suites)),
+    }
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.3f}"
+
+
+def _clean(text: str) -> str:
+    """The text with escapes for what no XML can hold: control characters, bytes that are not UTF-8."""
+    return _NOT_XML.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+MOST_ANNOTATIONS = 10  # of a level that GitHub shows for a step
+SUMMARY_BYTES = 1 << 20  # of a step, whoever wrote them; GitHub shows none of a larger one
+TABLE_HEAD = ["| recording | criterion | outcome | what was found |", "|---|---|---|---|"]
+MORE = "\n... and {} more that do not fit here\n"
+
+
+def tell_github(suites: Sequence[Suite], stream: TextIO, *, is_fatal: bool) -> None:
+    """Inside a step of GitHub Actions: annotations to `stream`, which has to be the process's stdout or stderr, and
+    the table to the summary of the step. Nothing elsewhere.
+
+    is_fatal: the exit code is not 0; else annotations are warnings. Raises OSError where the summary cannot be
+    written.
+    """
+    if os.environ.get("GITHUB_ACTIONS") != "true":
+        return
+    for line in annotations(suites, is_fatal=is_fatal, environment=os.environ):
+        print(line, file=stream, flush=True)
+    if os.environ.get("GITHUB_STEP_SUMMARY"):
+        _append(Path(os.environ["GITHUB_STEP_SUMMARY"]), suites)
+
+
+def annotations(suites: Sequence[Suite], *, is_fatal: bool, environment: Mapping[str, str]) -> list[str]:
+    """A workflow command for each of the most severe cases; its file is the recording, where that is in the
+    repository.
+    """
+    level = "error" if is_fatal else "warning"
+    lines = []
+    for suite, case in [pair for pair in worst_first(suites) if pair[1].kind is not Kind.SKIPPED][:MOST_ANNOTATIONS]:
+        file = _in_repository(suite.path, environment)
+        properties = {**({"file": file} if file else {}), "title": f"{case.group}: {case.name} ({case.kind})"}
+        given = ",".join(f"{name}={_property(value)}" for name, value in properties.items())
+        lines.append(f"::{level} {given}::{_escaped(case.text)}")
+    return lines
+
+
+def summary(suites: Sequence[Suite], room: int) -> str:
+    """Markdown of at most `room` bytes: how many cases passed, and a row for each that did not, the worst first."""
+    cases = worst_first(suites)
+    total = sum(len(suite.cases) for suite in suites)
+    of = suites[0].name if len(suites) == 1 else f"{len(suites)} recordings"
+    counts = [f"{_cell(of)}: {total - len(cases)} of {total} criteria passed"]
+    counts += [f"{number} {kind}" for kind in Kind if (number := sum(case.kind is kind for _, case in cases))]
+    head = "\n".join([f"### splatctrl: {', '.join(counts)}", "", *(TABLE_HEAD if cases else [])]) + "\n"
+    rows = [_row(suite, case) for suite, case in cases]
+    left = room - len(head.encode()) - 1
+    if sum(len(row.encode()) for row in rows) <= left:
+        return head + "".join(rows) + "\n" if left >= 0 else ""
+    left -= len(MORE.encode()) + len(str(len(rows)))
+    if left < 0:
+        return ""
+    kept: list[str] = []
+    for row in rows:
+        left -= len(row.encode())
+        if left < 0:
+            break
+        kept.append(row)
+    return head + "".join(kept) + MORE.format(len(rows) - len(kept))
+
+
+def _append(path: Path, suites: Sequence[Suite]) -> None:
+    """The summary behind what other commands of the step wrote, as far as there is room."""
+    written = path.stat().st_size if path.exists() else 0
+    text = summary(suites, SUMMARY_BYTES - written)
+    with path.open("a", encoding="utf-8", errors="backslashreplace") as stream:
+        stream.write(text)
+
+
+def _row(suite: Suite, case: Case) -> str:
+    return f"| {' | '.join(map(_cell, (suite.name, case.name, str(case.kind), case.sentence)))} |\n"
+
+
+def _cell(text: str) -> str:
+    """Text that Markdown and HTML leave as it is, in one line."""
+    escaped = "".join(f"&#{ord(mark)};" if mark in "&<>|`*_[]\\#~@" else mark for mark in text)
+    return " ".join(escaped.split()).encode("utf-8", "backslashreplace").decode()
+
+
+def _in_repository(path: str, environment: Mapping[str, str]) -> str:
+    """The file relative to the repository's folder; empty where it is a folder or lies elsewhere."""
+    workspace = environment.get("GITHUB_WORKSPACE", "")
+    if not (path and workspace and Path(path).is_file()):
+        return ""
+    real, root = Path(os.path.realpath(path)), Path(os.path.realpath(workspace))
+    return real.relative_to(root).as_posix() if real.is_relative_to(root) else ""
+
+
+def _escaped(text: str) -> str:
+    """As actions/toolkit writes the message of a workflow command."""
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _escaped(text).replace(":", "%3A").replace(",", "%2C")

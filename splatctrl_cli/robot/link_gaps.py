@@ -15,8 +15,7 @@ from splatctrl_cli.geometry import invert_transform, transform_points
 from splatctrl_cli.records import Float64
 from splatctrl_cli.robot.link_meshes import Solid, SolidDistance
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import joined_links, random_postures
-from splatctrl_cli.robot.srdf import DisabledPair
+from splatctrl_cli.robot.self_collision import DisabledPair, joined_links, random_postures
 
 Int64 = NDArray[np.int64]
 LinkNames = tuple[str, str]

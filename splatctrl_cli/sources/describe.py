@@ -14,16 +14,15 @@ from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import ImageFolderSource, RigFolderSource, open_image_folder
 from splatctrl_cli.datasets.layouts import BARE_REMEDY, bare_images, layout_of, open_layout, readable_in
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.listing import files_below, names_in
-from splatctrl_cli.files.summary import Grid, Summary
+from splatctrl_cli.files.summary import Grid, Summary, files_below, names_in
 from splatctrl_cli.grid_files.grid_format import FORMAT, covers, header_facts
 from splatctrl_cli.logs.rig import camera_topics, missing
-from splatctrl_cli.logs.robot_description import NAME as ROBOT
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.stored_frame import StoredFrame
+from splatctrl_cli.logs.survey import NAME as ROBOT
 from splatctrl_cli.logs.survey import Survey, TopicSurvey, survey_to_describe
-from splatctrl_cli.logs.video_file import SUFFIXES as VIDEOS
-from splatctrl_cli.logs.video_file import open_log
+from splatctrl_cli.logs.video import SUFFIXES as VIDEOS
+from splatctrl_cli.logs.video import open_log
 from splatctrl_cli.scene_files.scene_folder import run_value
 from splatctrl_cli.scene_files.voxel_file import known_space, read_occupancy
 from splatctrl_cli.sources.describe_file import describe_file

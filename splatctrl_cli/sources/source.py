@@ -11,11 +11,11 @@ from splatctrl_cli.containers.raw_log import RawLog
 from splatctrl_cli.datasets.image_folder import ImageFolderSource, open_image_folder
 from splatctrl_cli.datasets.layouts import has_views, open_layout
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.robot_description import RobotDescription, robot_descriptions
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import CameraTopics, SourceOptions
 from splatctrl_cli.logs.stored_frame import FrameSource
-from splatctrl_cli.logs.video_file import open_log
+from splatctrl_cli.logs.survey import RobotDescription, robot_descriptions
+from splatctrl_cli.logs.video import open_log
 from splatctrl_cli.sources.calibrated import calibrated
 
 __all__ = ["CameraTopics", "SourceOptions", "open_logs", "open_session", "open_source"]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.ply import read_table
-from splatctrl_cli.files.registry import entries_of
 from splatctrl_cli.files.summary import Summary
+from splatctrl_cli.libraries import entries_of
 from splatctrl_cli.records import GaussianSet, Label, SplatSet
 from splatctrl_cli.splat_files import splats
 from splatctrl_cli.splat_files.gaussian_ply import REFERENCE_PLY, gaussians_of

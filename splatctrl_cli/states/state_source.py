@@ -18,7 +18,7 @@ from splatctrl_cli.logs.state_topics import joint_records, with_prefix
 from splatctrl_cli.logs.state_track import RawTrack, cleaned
 from splatctrl_cli.logs.stored_frame import FrameSource
 from splatctrl_cli.logs.survey import survey
-from splatctrl_cli.logs.video_file import open_log
+from splatctrl_cli.logs.video import open_log
 from splatctrl_cli.records import LossReport, Record
 from splatctrl_cli.sources.calibrated import calibrated
 from splatctrl_cli.sources.source import open_source

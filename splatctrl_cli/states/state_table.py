@@ -9,8 +9,7 @@ import numpy as np
 
 from splatctrl_cli.datasets.folder_description import read_table
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.files.array_columns import ArrayFile
-from splatctrl_cli.files.npz_columns import NpzFile
+from splatctrl_cli.files.array_columns import ArrayFile, NpzFile
 from splatctrl_cli.files.spilled_rows import Rows, absent, scaled
 from splatctrl_cli.files.table_files import Hdf5File, ParquetFile
 from splatctrl_cli.logs.state_messages import pose_of_columns, pose_of_quat, rigid_or_none

@@ -1,20 +1,30 @@
-"""A capture gives back what was put in, to the bit where it can, and notices damage."""
+"""A capture gives back what was put in, to the bit where it can, and notices damage, files that change meanwhile, and
+names that lead elsewhere.
+"""
 
 import csv
 import hashlib
+import os
+import re
+import subprocess
+import sys
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin
 
+from splatctrl_cli.captures.capture import CaptureSource
 from splatctrl_cli.captures.capture_writer import write_capture
+from splatctrl_cli.cli.main import main
 from splatctrl_cli.containers.mcap_records import CHUNK
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.records import JointState, Record, RgbdFrame
 from splatctrl_cli.sources.source import SourceOptions, open_source
-from tests.containers.test_log_formats import assert_same
+from tests.containers.test_log_formats import as_ros2_folder, assert_same
 from tests.logs.make_log import FRAME_NS, START_NS, LogRecipe, make_log
 
 
@@ -244,3 +254,101 @@ def test_a_capture_without_provenance_is_read_as_before(tmp_path: Path) -> None:
     sums = (folder / "SHA256SUMS").read_text().splitlines(keepends=True)
     (folder / "SHA256SUMS").write_text("".join(line for line in sums if "provenance" not in line))
     assert_same(before, list(open_source(folder).records()))
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "capture.md"
+
+
+def test_the_script_of_the_page_writes_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(script) == 1
+    assert len(script[0].splitlines()) <= 35
+    subprocess.run([sys.executable, "-c", script[0]], cwd=tmp_path, check=True, timeout=60)
+    source = open_source(tmp_path / "mine.capture")
+    records = list(source.records())
+    frames = [record for record in records if isinstance(record, RgbdFrame)]
+    assert [frame.stamp_ns for frame in frames] == [0, 100_000_000]
+    assert np.unique(frames[1].depth).tolist() == [np.float32(1.25)]
+    assert frames[1].T_world_camera[0, 3] == pytest.approx(0.1)
+    assert [record.position.tolist() for record in records if isinstance(record, JointState)] == [[0.0]]
+    assert source.loss.damaged == 0
+    assert main(["check", str(tmp_path / "mine.capture"), "--fail-on", "warning"]) == 0
+    assert main(["info", str(tmp_path / "mine.capture")]) == 0
+    packed, back = tmp_path / "mine.mcap", tmp_path / "back.capture"
+    assert main(["capture", "pack", str(tmp_path / "mine.capture"), "-o", str(packed), "-q"]) == 0
+    assert main(["capture", "unpack", str(packed), "-o", str(back), "-q"]) == 0
+    assert {p.name: p.read_bytes() for p in back.rglob("*.*")} == {
+        p.name: p.read_bytes() for p in (tmp_path / "mine.capture").rglob("*.*")
+    }
+
+
+RECIPE = LogRecipe(num_frames=30, color_format="rgb8", has_joints=False)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_frames_that_are_gone_from_a_log_are_counted(tmp_path: Path, kind: str) -> None:
+    path = file = make_log(tmp_path / "log.mcap", RECIPE)
+    if kind == "db3":
+        path = as_ros2_folder(path, tmp_path / "bag", StoragePlugin.SQLITE3)
+        file = path / "bag.db3"
+    source = open_source(path)
+    whole = sum(1 for _ in source.records())
+    assert source.loss.damaged == 0
+    records = source.records()
+    next(records)
+    os.truncate(file, file.stat().st_size // 3)
+    found = 1 + sum(1 for _ in records)
+    assert found < whole
+    assert source.loss.damaged == 1
+    assert f"{whole - found} frames that were there are gone: it changed while it was read" in source.loss.notes[-1]
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.0])
+def test_a_frames_csv_that_shrinks_is_refused(tmp_path: Path, share: float) -> None:
+    folder = tmp_path / "x.capture"
+    folder.mkdir()
+    write_capture(folder, open_source(make_log(tmp_path / "log.mcap", RECIPE)))
+    records = open_source(folder).records()
+    next(records)
+    file = folder / "frames.csv"
+    os.truncate(file, int(share * file.stat().st_size))
+    with pytest.raises(InputError, match=r"frames.csv: changed while it was read"):
+        list(records)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "folders"),
+    [
+        (("../../evil",), {"evil"}),
+        (("..",), {"camera"}),
+        (("a\0b",), {"a_b"}),
+        (("x" * 300,), {"x" * 80}),
+        (("line\nbreak",), {"line_break"}),
+        (("a b", "a.b"), {"a_b", "a.b"}),
+        (("a b", "a\tb"), {"a_b_0", "a_b_1"}),
+        (("left/cam", "right/cam"), {"left_cam", "right_cam"}),
+    ],
+)
+def test_a_camera_is_written_below_its_capture(tmp_path: Path, cameras: tuple[str, ...], folders: set[str]) -> None:
+    log = make_log(tmp_path / "log.mcap", LogRecipe(cameras=cameras, num_frames=2))
+    capture = tmp_path / "deep" / "x.capture"
+    capture.mkdir(parents=True)
+    write_capture(capture, open_source(log))
+    assert {path.name for path in (capture / "color").iterdir()} == folders
+    assert {path.name for path in tmp_path.iterdir()} == {"log.mcap", "deep"}
+    assert {path.name for path in (tmp_path / "deep").iterdir()} == {"x.capture"}
+
+
+def test_a_capture_whose_images_lie_outside_is_refused(tmp_path: Path) -> None:
+    capture = tmp_path / "x.capture"
+    capture.mkdir()
+    write_capture(capture, open_source(make_log(tmp_path / "log.mcap")))
+    frames = capture / "frames.csv"
+    frames.write_text(frames.read_text().replace("color/cam0/000000.jpg", "../secret.jpg"))
+    with pytest.raises(InputError):
+        CaptureSource(capture, SourceOptions())
+    sums = capture / "SHA256SUMS"
+    lines = [line for line in sums.read_text().splitlines() if not line.endswith("  frames.csv")]
+    sums.write_text("\n".join([*lines, f"{sha256(frames.read_bytes()).hexdigest()}  frames.csv"]) + "\n")
+    with pytest.raises(InputError, match=r"../secret.jpg lies outside the capture"):
+        CaptureSource(capture, SourceOptions())

@@ -1,17 +1,29 @@
-"""Logged states against a robot: degrees, and end-effector poses beside forward kinematics."""
+"""Logged states against a robot: degrees, poses beside forward kinematics, and the offset of two clocks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatctrl_cli.checks.check_states import PoseVerdict, check_angles, pose_agreement, robot_findings
+from splatctrl_cli.checks.clock_offset import (
+    CameraMotion,
+    ClockOffset,
+    ImageMotion,
+    RobotPoints,
+    estimate_clock_offset,
+    silhouettes,
+    states_asked,
+)
 from splatctrl_cli.checks.finding import Severity
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.geometry import transform_from
-from splatctrl_cli.records import Float64, JointState
+from splatctrl_cli.logs.source_options import SourceOptions
+from splatctrl_cli.records import Float64, Intrinsics, JointState, RgbdFrame
 from splatctrl_cli.robot.model import RobotModel
+from splatctrl_cli.states.state_source import open_states
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "tabletop"
 TOOL = transform_from([0.01, -0.02, 0.1], [0.0, 0.0, np.sin(0.4), np.cos(0.4)])
@@ -146,3 +158,145 @@ def test_end_effector_poses_of_another_robot_are_an_error(model: RobotModel) -> 
     assert (other.code, other.severity) == ("end-effector", Severity.ERROR)
     assert other.value is not None and other.value > 100
     assert other.remedy == "give the URDF of this very robot, and its --base"
+
+
+INTERVAL = 0.2  # [s] between the frames of the sample
+
+
+@pytest.fixture(scope="module")
+def sample() -> tuple[list[JointState], ImageMotion, RobotPoints]:
+    model = RobotModel.from_urdf(SAMPLE / "robot.urdf", SAMPLE / "robot_spheres.yaml")
+    options = SourceOptions(cameras=("cam0", "cam1"))
+    source = open_states(SAMPLE / "log.mcap", options, model.joint_names)
+    states, motion, order = [], ImageMotion(), model.joint_order(source.joint_names)
+    for record in source.records():
+        if isinstance(record, RgbdFrame):
+            motion.add(record)
+        else:
+            states.append(record)
+    moving = model.moving_spheres
+    q = np.array([state.position[order] for state in states])
+    points = RobotPoints(centers=model.sphere_centers_batch(q)[:, moving], radii=model.sphere_set.radii[moving])
+    return states, motion, points
+
+
+def shifted(states: Sequence[JointState], seconds: float) -> list[JointState]:
+    """The states of a robot clock that is behind the cameras' by this."""
+    return [replace(state, stamp_ns=state.stamp_ns - round(seconds * 1e9)) for state in states]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.137, -0.5])
+def test_silhouettes_find_the_offset_to_a_fraction_of_the_time_between_frames(
+    sample: tuple[list[JointState], ImageMotion, RobotPoints], seconds: float
+) -> None:
+    states, motion, points = sample
+    found = estimate_clock_offset(shifted(states, seconds), motion, points)
+    assert found.offset_s is not None
+    assert found.uncertainty_s is not None
+    assert abs(found.offset_s - seconds) < 0.15 * INTERVAL
+    assert abs(found.offset_s - seconds) < 2 * found.uncertainty_s
+    assert "frames are stamped" in found.sentence
+
+
+@pytest.mark.parametrize("seconds", [0.0, -0.5, 0.7])
+def test_whole_images_find_it_to_the_time_between_frames(
+    sample: tuple[list[JointState], ImageMotion, RobotPoints], seconds: float
+) -> None:
+    states, motion, _ = sample
+    found = estimate_clock_offset(shifted(states, seconds), motion)
+    assert found.offset_s is not None
+    assert abs(found.offset_s - seconds) < INTERVAL
+
+
+@pytest.mark.parametrize("has_robot", [True, False])
+def test_the_offset_is_found_from_few_states_of_a_dense_log(
+    sample: tuple[list[JointState], ImageMotion, RobotPoints], has_robot: bool
+) -> None:
+    """Of a log at 200 Hz that goes on for minutes after its frames, with a pause between two of them."""
+    states, motion, points = sample
+    pause = 60 * 10**9
+    cameras = {}
+    for name, camera in motion.cameras.items():
+        half = len(camera.stamps_ns) // 2
+        stamps = [stamp + pause * (i >= half) for i, stamp in enumerate(camera.stamps_ns)]
+        cameras[name] = replace(camera, stamps_ns=stamps)
+    long = ImageMotion(cameras=cameras)
+    middle = sorted(motion.cameras["cam0"].stamps_ns)[len(motion.cameras["cam0"].stamps_ns) // 2]
+    known = np.array([s.stamp_ns + pause * (s.stamp_ns >= middle) for s in states])
+    stamps = np.arange(known[0], known[-1] + 120 * 10**9, 5_000_000)
+    q = np.array([state.position for state in states])
+    position = np.column_stack([np.interp(stamps, known, q[:, j]) for j in range(q.shape[1])])
+    centers = np.array(points.centers[np.searchsorted(known, stamps, side="right") - 1][:, :8])
+
+    def found_from(index: np.ndarray) -> ClockOffset:
+        some = [
+            JointState(stamp_ns=int(stamps[i]), position=position[i], velocity=np.zeros(q.shape[1])) for i in index
+        ]
+        robot = RobotPoints(centers=centers[index], radii=points.radii[:8]) if has_robot else None
+        return estimate_clock_offset(some, long, robot)
+
+    asked = states_asked(stamps, long)
+    assert len(asked) < len(stamps) // 2
+    assert found_from(asked) == found_from(np.arange(len(stamps)))
+
+
+def refused(found: ClockOffset) -> str:
+    assert found.offset_s is None
+    assert "cannot tell" in found.sentence
+    return found.reason
+
+
+def test_nothing_is_told_where_no_joint_moves(sample: tuple[list[JointState], ImageMotion, RobotPoints]) -> None:
+    states, motion, _ = sample
+    still = [replace(state, position=states[0].position) for state in states]
+    assert refused(estimate_clock_offset(still, motion)) == "no joint moves"
+
+
+def test_nothing_is_told_where_images_show_something_else(
+    sample: tuple[list[JointState], ImageMotion, RobotPoints],
+) -> None:
+    states, motion, points = sample
+    rng = np.random.default_rng(1)
+    noise = {
+        name: replace(camera, changes=[rng.random(camera.changes[0].shape, dtype=np.float32) for _ in camera.changes])
+        for name, camera in motion.cameras.items()
+    }
+    assert "do not move alike" in refused(estimate_clock_offset(states, ImageMotion(cameras=noise), points))
+    assert "do not move alike" in refused(estimate_clock_offset(states, ImageMotion(cameras=noise)))
+
+
+def test_nothing_is_told_of_a_motion_that_repeats() -> None:
+    stamps = np.arange(0, 20.0, 0.1)
+    camera = CameraMotion(
+        intrinsics=Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1),
+        T_world_camera=np.eye(4),
+        stamps_ns=[round(t * 1e9) for t in stamps],
+        changes=[np.full((1, 1), abs(np.sin(4 * np.pi * (t + 0.05))), np.float32) for t in stamps[:-1]],
+    )
+    seconds = np.arange(0, 20.0, 0.01)
+    states = [
+        JointState(stamp_ns=round(t * 1e9), position=np.array([np.cos(4 * np.pi * t)]), velocity=np.zeros(1))
+        for t in seconds
+    ]
+    assert "the motion repeats" in refused(estimate_clock_offset(states, ImageMotion(cameras={"c": camera})))
+
+
+def test_too_little_to_judge_is_said(sample: tuple[list[JointState], ImageMotion, RobotPoints]) -> None:
+    states, motion, _ = sample
+    assert "expected at least" in refused(estimate_clock_offset(states, ImageMotion()))
+    assert "expected at least" in refused(estimate_clock_offset(states[:2], motion))
+    assert refused(estimate_clock_offset(states[:30], motion)) in {"the log is too short", "no joint moves"}
+    other_clock = shifted(states, 1e6)
+    assert refused(estimate_clock_offset(other_clock, motion)) == "no joint states within 2 s of the frames"
+
+
+def test_a_silhouette_is_the_sphere_that_is_nearest() -> None:
+    camera = CameraMotion(
+        intrinsics=Intrinsics(fx=20, fy=20, cx=10, cy=10, width=21, height=21), T_world_camera=np.eye(4)
+    )
+    centers = np.array([[[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.5, 0.0, 2.0], [0.0, 0.0, -2.0]]])
+    depth = silhouettes(centers, np.array([0.25, 1.0, 0.1, 0.5]), camera)[0]
+    assert depth[10, 10] == pytest.approx(1.75)
+    assert depth[10, 15] == pytest.approx(1.9)
+    assert depth[10, 6] == pytest.approx(3 - np.sqrt(1 - 0.6**2))
+    assert depth[0, 0] == 0

@@ -17,8 +17,7 @@ from splatctrl_cli.records import Float64, JointState, LossReport, Record, Splat
 from splatctrl_cli.robot.model import RobotModel
 from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.voxels import OccupancyGrid
-from tests.known_voxels import known
-from tests.plain import plain_grid, plain_splats
+from tests.plain import known, plain_grid, plain_splats
 
 SECOND = 1_000_000_000
 START = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.0])

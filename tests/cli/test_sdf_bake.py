@@ -26,8 +26,7 @@ from splatctrl_cli.splat_files import splat_formats
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.cli import here
 from tests.field.scenes import cloud, splat_set
-from tests.known_voxels import known
-from tests.plain import plain_grid
+from tests.plain import known, plain_grid
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 COARSE = ("--set", "field.max_loss=1")  # cells that are baked in no time

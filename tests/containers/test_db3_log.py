@@ -157,7 +157,7 @@ def _unpacked(path: Path) -> bytes:
 
 
 def test_a_bomb_stops_on_disk_and_a_nested_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatctrl_cli.containers.compressed_log.FREE_BYTES", 1 << 20)
+    monkeypatch.setattr("splatctrl_cli.containers.log_formats.FREE_BYTES", 1 << 20)
     magic = b"\x89MCAP0\r\n"
     (tmp_path / "bomb.mcap.zstd").write_bytes(zstandard.compress(magic + bytes(1 << 26)))
     damage = Damage()

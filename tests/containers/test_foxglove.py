@@ -19,8 +19,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from splatctrl_cli.containers.foxglove import DEFINITIONS
-from splatctrl_cli.containers.protobuf import MessageTypes
+from splatctrl_cli.containers.foxglove import DEFINITIONS, MessageTypes
 from splatctrl_cli.containers.raw_log import RawMessage, Topic
 from splatctrl_cli.logs.decoder import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, JOINT_STATE, MessageDecoder
 from splatctrl_cli.records import JointState, RgbdFrame

@@ -5,6 +5,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from collections import Counter
 from io import BytesIO
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
+from benchmarks.mcap_recovery import DAMAGES, LOGS, NUM_MESSAGES, counted, damaged, log
 from splatctrl_cli.containers.mcap_file import McapFile
 from splatctrl_cli.containers.mcap_log import McapLog
 from splatctrl_cli.containers.mcap_records import CHUNK, MAGIC
@@ -22,6 +24,7 @@ from splatctrl_cli.containers.raw_log import MAX_NOTES, Damage
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.files.unpacking import MAX_BLOCK
 from splatctrl_cli.sources.source import SourceOptions, open_source
+from tests.containers.mcap_recover import recover
 from tests.logs.make_log import LogRecipe, make_log
 
 GIB = 1 << 30
@@ -259,3 +262,18 @@ def test_a_log_whose_damage_took_what_is_missing_says_so(tmp_path: Path) -> None
     expected = r"no tf .*; but the log is damaged: .*chunk.*; copy the file again; if this is all there is: "
     with pytest.raises(InputError, match=expected):
         open_source(log, SourceOptions(world_frame="world"))
+
+
+STEP = 211
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_no_message_is_lost_that_the_tool_recovers_and_each_loss_is_told(tmp_path: Path, name: str) -> None:
+    data = log(*LOGS[name])
+    truth = Counter(recover(data).kept)
+    assert truth.total() == NUM_MESSAGES == recover(data, always_decode=True).claimed
+    for kind in DAMAGES:
+        for number, file in enumerate(damaged(data, kind, STEP)):
+            found = counted(file, truth, tmp_path / "x.mcap")
+            assert not found.lacking, f"{kind} {number}: {found}"
+            assert found.read == NUM_MESSAGES or found.is_told, f"{kind} {number}: {found}"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.datasets.poses import OPENGL_FROM_OPTICAL
-from splatctrl_cli.files.pfm import write_pfm
+from splatctrl_cli.files.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, quat_from_rotation
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import Float64, RgbdFrame

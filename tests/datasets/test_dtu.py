@@ -14,7 +14,7 @@ from splatctrl_cli.datasets.dtu_source import DtuSource, shrunk, view_numbers
 from splatctrl_cli.datasets.idr import decompose, projection, read_idr, write_idr
 from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.evaluate.protocols import score_protocol
-from splatctrl_cli.files.pfm import write_pfm
+from splatctrl_cli.files.image_file import write_pfm
 from splatctrl_cli.geometry import invert_transform, look_at, project
 from splatctrl_cli.records import Intrinsics, RgbdFrame
 from splatctrl_cli.sources.source import open_source

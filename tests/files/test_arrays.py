@@ -10,8 +10,8 @@ from splatctrl_cli.datasets.idr import read_idr
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.evaluate import perceptual
 from splatctrl_cli.evaluate.perceptual import Lpips
+from splatctrl_cli.files.array_columns import NpzFile
 from splatctrl_cli.files.arrays import DAMAGE, read_arrays, savez
-from splatctrl_cli.files.npz_columns import NpzFile
 from splatctrl_cli.grid_files.npz_grid import MOST_PACKED, read_npz
 from splatctrl_cli.scene_files.scene_writer import CHECKPOINT, read_checkpoint
 from splatctrl_cli.scene_files.voxel_file import read_occupancy, read_states

@@ -5,13 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatctrl_cli.files import npz_columns, spilled_rows
+from splatctrl_cli.files import array_columns, spilled_rows
 from splatctrl_cli.files.spilled_rows import RowFile, Rows, ranges, scratch_folder, selected
 from splatctrl_cli.logs import state_columns
-from splatctrl_cli.logs.state_clock import checked_stamps
 from splatctrl_cli.logs.state_columns import StateCollector
-from splatctrl_cli.logs.state_track import RawTrack, cleaned
-from splatctrl_cli.logs.state_velocity import differentiated, smoothed_seconds
+from splatctrl_cli.logs.state_topics import checked_stamps
+from splatctrl_cli.logs.state_track import RawTrack, cleaned, differentiated, smoothed_seconds
 from splatctrl_cli.records import Float64, JointState, LossReport
 from splatctrl_cli.sources.source import SourceOptions
 from splatctrl_cli.states import state_csv
@@ -24,7 +23,7 @@ JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 @pytest.fixture(params=[1, 7, 10_000])
 def block(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
     """So many states at once, everywhere."""
-    for module in (spilled_rows, npz_columns, state_columns, state_csv):
+    for module in (spilled_rows, array_columns, state_columns, state_csv):
         monkeypatch.setattr(module, "BLOCK", request.param)
     return int(request.param)
 

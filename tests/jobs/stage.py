@@ -19,7 +19,7 @@ from splatctrl_cli.simulate.primitives import Primitive, Texture
 from splatctrl_cli.simulate.truth import Truth, truth_document
 from splatctrl_cli.voxels import Balls, KnownVoxels
 from tests.cli.replay_desk import SECOND, START, Desk, grid_seen, splats_of
-from tests.known_voxels import known
+from tests.plain import known
 
 FAR = ((-1.0, 0.0, 1.3), 0.05)  # a ball behind the arm
 MOVE = np.array([0.5, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -18,8 +18,7 @@ from splatctrl_cli.scene_files.scene_writer import SceneWriter
 from splatctrl_cli.splat_files.splats import write_ply
 from tests.field.scenes import cloud, splat_set
 from tests.jobs.bakes import Said, baked, field_json
-from tests.known_voxels import known
-from tests.plain import plain_grid
+from tests.plain import known, plain_grid
 
 BOX = (-0.6, -0.6, -0.5, 0.6, 0.6, 0.5)
 SECOND = 10**9

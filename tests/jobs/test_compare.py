@@ -15,7 +15,7 @@ from splatctrl_cli.cli.main import main
 from splatctrl_cli.errors import InputError, SplatCtrlError, UsageError
 from splatctrl_cli.evaluate.metrics import Better
 from splatctrl_cli.evaluate.verdict import Outcome
-from splatctrl_cli.jobs import declared_metrics
+from splatctrl_cli.jobs import judged_runs
 from splatctrl_cli.jobs.compare import Change, CompareRequest, CompareResult, compare
 from splatctrl_cli.jobs.replays.metrics import metric_names
 from splatctrl_cli.jobs.replays.standstill_baseline import BASELINES
@@ -329,7 +329,7 @@ def test_another_file_is_never_replaced_by_a_baseline(audit: Path, tmp_path: Pat
 
 
 def test_every_figure_of_a_replay_is_declared_with_a_direction_or_without_one() -> None:
-    declared = declared_metrics.scales()["replay"]
+    declared = judged_runs.scales()["replay"]
     for mode in ("audit", "open-loop", "closed-loop"):
         fields = ("exact", "barrier", "certified")
         names = metric_names(mode, fields, has_truth=True, baselines=BASELINES, has_twists=True)

@@ -18,10 +18,9 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.files.output import part_digests
 from splatctrl_cli.geometry import transform_from
 from splatctrl_cli.jobs.compare import CompareRequest, compare
-from splatctrl_cli.jobs.report import MOST_SCENES, WriteReportRequest, write_report
+from splatctrl_cli.jobs.report import MOST_SCENES, ViewRequest, WriteReportRequest, view, write_report
 from splatctrl_cli.jobs.reports.run_folder import open_run
 from splatctrl_cli.jobs.reports.spaces import space_of
-from splatctrl_cli.jobs.view import ViewRequest, view
 from splatctrl_cli.robot.model import RobotModel
 from tests.jobs.runs import Runs, patch_json
 from tests.jobs.stage import passing

@@ -1,4 +1,6 @@
-"""Images that wait for others: in memory, and beyond a bound in a file; and the plan that says which are needed."""
+"""Images that wait for others: in memory, and beyond a bound in a file; the plan that says which are needed; and
+pairs by stamp.
+"""
 
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import pytest
 from splatctrl_cli.containers.raw_log import Damage, RawMessage, Topic
 from splatctrl_cli.logs import frame_plan
 from splatctrl_cli.logs.frame_plan import HeldMessages, PlannedImages
+from splatctrl_cli.logs.image_stamps import pair_by_stamp
 from splatctrl_cli.logs.ros_log import RosLogSource
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
@@ -79,3 +82,18 @@ def test_images_that_no_frame_needs_any_more_are_let_go(tmp_path: Path) -> None:
     images = PlannedImages(source._log, source._plan)
     most = [len(images._held._messages) for _ in images.of_frames(Damage())]
     assert len(most) == 10 and max(most) <= 4 and most[-1] == 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pairs_are_those_of_every_pair_tried_in_turn(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    color, depth = (random.integers(0, 200, random.integers(0, 40)).tolist() for _ in range(2))
+    tolerance = int(random.integers(0, 30))
+    near = [(abs(a - b), a, b, i, j) for i, a in enumerate(color) for j, b in enumerate(depth)]
+    expected: dict[int, int] = {}
+    for gap, _, _, i, j in sorted(near):
+        if gap <= tolerance and i not in expected and j not in expected.values():
+            expected[i] = j
+    assert pair_by_stamp(color, depth, tolerance) == sorted(
+        expected.items(), key=lambda pair: (color[pair[0]], pair[0])
+    )

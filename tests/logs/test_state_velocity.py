@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.logs.state_clock import checked_stamps
-from splatctrl_cli.logs.state_track import RawTrack, cleaned
-from splatctrl_cli.logs.state_velocity import differentiated, gaps_of, smoothed_seconds
+from splatctrl_cli.logs.state_topics import checked_stamps
+from splatctrl_cli.logs.state_track import RawTrack, cleaned, differentiated, gaps_of, smoothed_seconds
 from splatctrl_cli.records import LossReport
 
 MS = 1_000_000

@@ -23,7 +23,7 @@ from splatctrl_cli.errors import InputError, UsageError
 from splatctrl_cli.logs import cameras
 from splatctrl_cli.logs.decoder import COMPRESSED_IMAGE
 from splatctrl_cli.logs.source_options import SourceOptions
-from splatctrl_cli.logs.video_file import VideoFileLog, open_log
+from splatctrl_cli.logs.video import VideoFileLog, open_log
 from splatctrl_cli.records import RgbdFrame
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import open_logs, open_session, open_source

@@ -14,8 +14,7 @@ from splatctrl_cli.records import Float64, SphereSet
 from splatctrl_cli.robot.link_gaps import LinkSurface, SelfSurfaces, depth_in, surface_gap
 from splatctrl_cli.robot.link_meshes import Solid, read_solids
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import random_postures
-from splatctrl_cli.robot.srdf import DisabledPair
+from splatctrl_cli.robot.self_collision import DisabledPair, random_postures
 from splatctrl_cli.robot.urdf import read_urdf
 from tests.reference.mesh_gap import surface_distance
 from tests.robot.folding_arm import CROSSED, FOLDED, GAP, OPEN, URDF, covering_spheres, folding_arm

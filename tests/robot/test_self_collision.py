@@ -7,8 +7,7 @@ import pytest
 
 from splatctrl_cli.errors import InputError
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.self_collision import self_collision_pairs
-from splatctrl_cli.robot.srdf import read_srdf
+from splatctrl_cli.robot.self_collision import read_srdf, self_collision_pairs
 from tests.robot.shapes import BALL, arm_of, written
 
 

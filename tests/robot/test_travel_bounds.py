@@ -5,7 +5,7 @@ import pytest
 
 from splatctrl_cli.kernels.chain import PRISMATIC, REVOLUTE, Chain
 from splatctrl_cli.robot.model import RobotModel
-from splatctrl_cli.robot.travel_bounds import lever_arms
+from splatctrl_cli.robot.spheres import lever_arms
 
 
 def random_chain(seed: int, num_joints: int = 6) -> tuple[Chain, np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ from splatctrl_cli.scene_files.voxel_file import (
 )
 from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.voxels import SWEPT, UNANSWERED, OccupancyGrid
-from tests.known_voxels import known
+from tests.plain import known
 
 
 @dataclass(frozen=True)

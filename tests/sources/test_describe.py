@@ -15,9 +15,8 @@ from splatctrl_cli.sources.describe import describe
 from splatctrl_cli.sources.source import SourceOptions, open_source
 from splatctrl_cli.splat_files.splats import write_ply
 from splatctrl_cli.voxels import SWEPT
-from tests.known_voxels import known
 from tests.logs.make_log import LogRecipe, make_log
-from tests.plain import plain_grid, plain_splats
+from tests.plain import known, plain_grid, plain_splats
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 

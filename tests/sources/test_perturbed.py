@@ -8,7 +8,7 @@ import pytest
 from splatctrl_cli.errors import UsageError
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.records import RgbdFrame
-from splatctrl_cli.sources.perturbed import Perturbation, PerturbedSource
+from splatctrl_cli.sources.calibrated import Perturbation, PerturbedSource
 from splatctrl_cli.sources.source import open_source
 from tests.logs.make_log import LogRecipe, make_log
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatctrl_cli.errors import InputError
-from splatctrl_cli.splat_files.points import is_mesh, read_points, read_positions
+from splatctrl_cli.files.ply import is_mesh, read_points, read_positions
 from tests.splat_files.test_gaussian_ply import ascii_ply
 
 COLOURED = ["x", "y", "z", "red", "green", "blue"]

@@ -11,7 +11,7 @@ from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.control.audit import AuditTrace, Clearance, audited, moving_clearance
 from splatctrl_cli.control.events import EventFold, EventKind, Obstacle
 from splatctrl_cli.control.intervals import Between, Reach, between_states, clearances
-from splatctrl_cli.control.motion_limits import MotionLimits
+from splatctrl_cli.control.limits import MotionLimits
 from splatctrl_cli.control.near_space import NearSpace, Seen
 from splatctrl_cli.control.preconditions import static_clearance
 from splatctrl_cli.control.signals import audit_signals, interval_signals, limit_signals, stale_signal, step_signals

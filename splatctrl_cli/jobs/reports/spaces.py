@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from splatctrl_cli.captures.capture_index import ROBOT
+from splatctrl_cli.captures.capture_header import ROBOT
 from splatctrl_cli.control.arm import sphere_names
 from splatctrl_cli.errors import InputError, NotEvaluableError
 from splatctrl_cli.files.output import sha256
