@@ -98,6 +98,7 @@ views-pose | warning |  | how far a camera must be moved and turned for its view
 agreement | note, error | later | how far apart views place a surface that both see [mm]; an error beyond 30 mm (3 %
     of depth above 1 m), which `reconstruct` refuses
 exposure | note |  | one surface is over 5 % brighter or more coloured in one image of a camera than in another
+exposure-rows | note |  | rows of one image are over 20 % brighter than others, unlike in the camera's other images
 joints | note, error | replay | which topics and velocities are used; an error where the robot's joints are missing
 joints-nan | warning |  | positions that are not finite
 joints-degrees | error | replay | positions that no joint can reach in radians

@@ -9,13 +9,14 @@ import pytest
 
 from splatctrl_cli.calibration.exposure import exposed
 from splatctrl_cli.checks.check_arm import motion_findings
+from splatctrl_cli.checks.check_exposure import exposure_findings
 from splatctrl_cli.checks.check_images import alignment_findings
 from splatctrl_cli.checks.check_log import check_log
 from splatctrl_cli.checks.check_states import log_states
 from splatctrl_cli.checks.check_views import ViewsCheck, check_views
 from splatctrl_cli.checks.clock_offset import ImageMotion
 from splatctrl_cli.checks.finding import Finding, Severity
-from splatctrl_cli.checks.judge_evidence import exposure_findings, usable_frames
+from splatctrl_cli.checks.judge_evidence import usable_frames
 from splatctrl_cli.containers.log_formats import open_raw_log
 from splatctrl_cli.logs.source_options import SourceOptions
 from splatctrl_cli.logs.state_columns import StateColumns
@@ -108,6 +109,23 @@ def test_a_camera_of_automatic_exposure_is_named_with_its_ratio(table: Table) ->
     (finding,) = exposure_findings(off)
     assert (finding.code, finding.where, finding.severity) == ("exposure", "camera cam1", Severity.NOTE)
     assert finding.value == pytest.approx(25.0, abs=4.0)
+
+
+@pytest.mark.parametrize(("period_moves", "codes"), [(True, ["exposure-rows"]), (False, [])])
+def test_rows_that_a_flickering_light_exposes_differently_are_named(
+    table: Table, period_moves: bool, codes: list[str]
+) -> None:
+    """A rolling shutter under a lamp: bands that move from image to image. Bands that stay are the lens's."""
+    off = []
+    for frame in table.few:
+        phase = 2.4 * (frame.stamp_ns // 100_000_000) * period_moves
+        rows = 1 + 0.2 * np.sin(np.linspace(0, 9, len(frame.color)) + phase)
+        shown = np.clip(frame.color * rows[:, None, None], 0, 255).astype(np.uint8)
+        off.append(replace(frame, color=shown) if frame.camera == "cam1" else frame)
+    found = [finding for finding in exposure_findings(off) if finding.code != "exposure"]
+    assert [finding.code for finding in found] == codes
+    assert all(finding.where == "camera cam1" for finding in found)
+    assert all(finding.value == pytest.approx(45.0, abs=15.0) for finding in found)
 
 
 def test_a_flat_wall_says_nothing_of_its_scale(table: Table) -> None:
