@@ -18,7 +18,7 @@ from splatctrl_cli.field.clustered_splats import Spheres, checked_points, not_fi
 from splatctrl_cli.field.kernel import Matern12, SquaredExponential
 from splatctrl_cli.field.weights import weights_named
 from splatctrl_cli.kernels import field as native
-from splatctrl_cli.kernels.field import GridSpan
+from splatctrl_cli.kernels.field import GridSpan, LogSumExp
 from splatctrl_cli.records import DistanceField, Float32, Float64
 
 
@@ -88,6 +88,10 @@ class LogSumExpField(ABC):
     def _hold(self, spheres: Spheres, config: FieldConfig, threads: int) -> None: ...
 
     @abstractmethod
+    def terms(self) -> LogSumExp:
+        """What it is made of, laid out for the kernels."""
+
+    @abstractmethod
     def query_raw(self, points: Float64) -> tuple[Float64, Float64]:
         """points (Q, 3) [m] -> distance (Q,) [m] and its gradient (Q, 3); NaN where it has no distance."""
 
@@ -136,21 +140,22 @@ class GpdfField(LogSumExpField):
         )
         return score.astype(np.float64) - self._common, gradient.astype(np.float64)
 
+    def terms(self) -> LogSumExp:
+        """See `LogSumExpField`."""
+        points = self.spheres.points
+        return LogSumExp(
+            is_matern=True,
+            offsets=points.offsets(self.offsets),
+            exact=points.laid_out(self.offsets, spare=native.SPARE_OFFSET),
+            radii=points.laid_out(self.spheres.radii, spare=0.0).astype(np.float32),
+            sign=self.sign,
+            length=self.kernel.length,
+            tolerance=self.share,
+        )
+
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
         """`query_raw` at the cells of `span`, into distance (X, Y, Z) and gradient (X, Y, Z, 3)."""
-        points = self.spheres.points
-        native.bake_matern(
-            points.clusters,
-            points.offsets(self.offsets),
-            points.laid_out(self.offsets, spare=native.SPARE_OFFSET),
-            self.sign,
-            self.kernel.length,
-            self.share,
-            span,
-            distance,
-            gradient,
-            threads=threads,
-        )
+        native.bake_matern(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SeField(LogSumExpField):
@@ -210,22 +215,22 @@ class SeField(LogSumExpField):
             raise not_finite(asked)
         return found
 
+    def terms(self) -> LogSumExp:
+        """See `LogSumExpField`."""
+        points, log_size = self.spheres.points, self.weights.log_size
+        return LogSumExp(
+            is_matern=False,
+            offsets=points.offsets(self.unit * log_size),
+            exact=points.laid_out(log_size, spare=native.SPARE_OFFSET),
+            radii=self.radii.values,
+            sign=self.sign,
+            length=self.kernel.length,
+            tolerance=self.tolerance,
+        )
+
     def bake_raw(self, span: GridSpan, distance: Float32, gradient: Float32 | None, *, threads: int) -> None:
         """`query_raw` at the cells of `span`, into distance (X, Y, Z) and gradient (X, Y, Z, 3)."""
-        points, log_size = self.spheres.points, self.weights.log_size
-        native.bake_gaussian(
-            points.clusters,
-            points.offsets(self.unit * log_size),
-            points.laid_out(log_size, spare=native.SPARE_OFFSET),
-            self.radii.values,
-            self.sign,
-            self.kernel.length,
-            self.tolerance,
-            span,
-            distance,
-            gradient,
-            threads=threads,
-        )
+        native.bake_gaussian(self.spheres.points.clusters, self.terms(), span, distance, gradient, threads=threads)
 
 
 class SafeField:

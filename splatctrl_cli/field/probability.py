@@ -1,7 +1,7 @@
 """Probability that a point is in collision: the paper's form, and one calibrated by a measured error (III-D)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -104,18 +104,15 @@ class PaperProbability:
         places = self._gpdf.spheres.points
         gpdf, half = np.zeros_like(sdf), np.zeros_like(sdf)
         self._gpdf.bake_raw(span, gpdf, None, threads=threads)
-        native.bake_matern(
-            places.clusters,
-            places.offsets(self._offsets),
-            places.laid_out(self._offsets, spare=native.SPARE_OFFSET),
-            None,
-            self._half.length,
-            self._share,
-            span,
-            half,
-            None,
-            threads=threads,
+        terms = replace(
+            self._gpdf.terms(),
+            offsets=places.offsets(self._offsets),
+            exact=places.laid_out(self._offsets, spare=native.SPARE_OFFSET),
+            sign=None,
+            length=self._half.length,
+            tolerance=self._share,
         )
+        native.bake_matern(places.clusters, terms, span, half, threads=threads)
         return self._combined(gpdf.astype(np.float64), half.astype(np.float64)).astype(np.float32)
 
     def described(self) -> dict[str, object]:

@@ -70,6 +70,23 @@ class GridSpan:
         return np.array([*self.shape, self.first, self.last], dtype=np.int64)
 
 
+@dataclass(frozen=True, kw_only=True)
+class LogSumExp:
+    """What a kernel field is made of beside its spheres, as `bake_matern` or `bake_gaussian` takes it.
+
+    offsets only cull; exact (16 C,): the offsets [m] of Matern, log weights of the Gaussian; radii (16 C,) [m];
+    tolerance: the share of the terms that may be left out of Matern, what that may raise the Gaussian by [m].
+    """
+
+    is_matern: bool
+    offsets: Offsets
+    exact: Float64
+    radii: Float32
+    sign: Float32 | None
+    length: float
+    tolerance: float
+
+
 def nearest(
     spheres: Clusters, radii: Offsets, points: Float32, *, threads: int = 0
 ) -> tuple[Float32, Float32, Int32]:
@@ -236,29 +253,24 @@ def bake_hard(
 
 def bake_gaussian(
     spheres: Clusters,
-    offsets: Offsets,
-    log_weights: Float64,
-    radii: Float32,
-    sign: Float32 | None,
-    length: float,
-    tolerance: float,
+    terms: LogSumExp,
     span: GridSpan,
     distance: Float32,
     gradient: Float32 | None = None,
     *,
     threads: int = 0,
 ) -> None:
-    """`gaussian` at the cells of `span`; log_weights (16 C,) ``log |w_i|``, offsets ``2 l^2 log |w_i|``."""
+    """`gaussian` at the cells of `span`; the exact terms are ``log |w_i|``, the offsets ``2 l^2 log |w_i|``."""
     native.field_bake_gaussian(
         spheres.centers,
         spheres.boxes,
-        offsets.values,
-        offsets.maxima,
-        log_weights,
-        radii,
-        sign,
-        length,
-        tolerance,
+        terms.offsets.values,
+        terms.offsets.maxima,
+        terms.exact,
+        terms.radii,
+        terms.sign,
+        terms.length,
+        terms.tolerance,
         span.origin,
         span.voxel,
         span.sizes,
@@ -271,27 +283,23 @@ def bake_gaussian(
 
 def bake_matern(
     spheres: Clusters,
-    offsets: Offsets,
-    exact_offsets: Float64,
-    sign: Float32 | None,
-    length: float,
-    truncation: float,
+    terms: LogSumExp,
     span: GridSpan,
     distance: Float32,
     gradient: Float32 | None = None,
     *,
     threads: int = 0,
 ) -> None:
-    """`matern` at the cells of `span`; exact_offsets (16 C,) are the offsets in float64."""
+    """`matern` at the cells of `span`; the exact terms are the offsets in float64."""
     native.field_bake_matern(
         spheres.centers,
         spheres.boxes,
-        offsets.values,
-        offsets.maxima,
-        exact_offsets,
-        sign,
-        length,
-        truncation,
+        terms.offsets.values,
+        terms.offsets.maxima,
+        terms.exact,
+        terms.sign,
+        terms.length,
+        terms.tolerance,
         span.origin,
         span.voxel,
         span.sizes,

@@ -10,7 +10,7 @@ from cuda.core import Device, LaunchConfig, launch
 
 from splatctrl_cli.kernels.cuda.driver import Card, usable_card
 from splatctrl_cli.kernels.cuda.memory import Array, DeviceError, Graph, Launch, OutOfMemory
-from splatctrl_cli.kernels.cuda.program import compiled
+from splatctrl_cli.kernels.cuda.program import FIT, compiled
 
 MANY = 20  # replays in a graph: to launch one costs the host as much as a small map's iteration takes
 
@@ -45,14 +45,15 @@ class CudaDevice:
     Raises DeviceError where it cannot be used.
     """
 
-    def __init__(self, card: Card | None = None) -> None:
+    def __init__(self, card: Card | None = None, *, source: str = FIT) -> None:
+        """source: the kernels that are launched."""
         card = card or usable_card()
         self.name, self.capability = card.name, card.capability
         with _named_faults():
             self._device: Any = Device(card.index)
             self._device.set_current()
             self._stream: Any = self._device.create_stream()
-            self._code: Any = compiled(self.capability)
+            self._code: Any = compiled(self.capability, source=source)
         self._handle = int(self._stream.handle)
 
     def available(self) -> int:

@@ -12,6 +12,8 @@ from cuda.core.utils import FileStreamProgramCache, make_program_cache_key
 HERE = Path(__file__).parent
 FOLDERS = (HERE / "src", HERE / "include", HERE.parent / "src")  # as #include looks through them
 
+FIT, FIELD = "fit.cu", "field.cu"
+
 
 @cache
 def source_digest() -> bytes:
@@ -23,26 +25,26 @@ def source_digest() -> bytes:
     return digest.digest()
 
 
-def compiled(capability: tuple[int, int], cache_folder: Path | None = None) -> Any:
-    """The kernels for a compute capability, as machine code; `cache_folder` is that of cuda-core unless given.
+def compiled(capability: tuple[int, int], cache_folder: Path | None = None, *, source: str = FIT) -> Any:
+    """The kernels of a source for a compute capability, as machine code; `cache_folder` is that of cuda-core unless given.
 
     A cache that cannot be written costs the compilation only.
     """
     options = ProgramOptions(
-        name="fit.cu", arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
+        name=source, arch=f"sm_{capability[0]}{capability[1]}", std="c++17", include_path=[str(f) for f in FOLDERS]
     )
-    source = (HERE / "src" / "fit.cu").read_text()
+    code = (HERE / "src" / source).read_text()
     key = make_program_cache_key(
-        code=source, code_type="c++", options=options, target_type="cubin", extra_digest=source_digest()
+        code=code, code_type="c++", options=options, target_type="cubin", extra_digest=source_digest()
     )
     try:
         store = FileStreamProgramCache(cache_folder)
         known = store.get(key)
     except OSError:
-        return Program(source, "c++", options).compile("cubin")
+        return Program(code, "c++", options).compile("cubin")
     if known is not None:
         return ObjectCode.from_cubin(known)
-    code = Program(source, "c++", options).compile("cubin")
+    made = Program(code, "c++", options).compile("cubin")
     with suppress(OSError):
-        store[key] = code
-    return code
+        store[key] = made
+    return made

@@ -1,56 +1,30 @@
 // Spheres in clusters of 16 neighbours, clusters in groups of 16, a box around each: what every distance here walks.
-//
-// The fields are made of scores s_i(x) = |x - p_i| - o_i (exact distance: o = r; Matern: o = r + l log w) or of
-// squared ones q_i(x) = |x - p_i|^2 - b_i (squared exponential: b = 2 l^2 log w). A score changes by no more than one
-// moves, and inside a box it is at least (distance to the box) - (largest offset): all culls rest on these two facts.
 #pragma once
 
-#include <cmath>
 #include <vector>
 
-#include "simd.h"
+#include "field_geometry.h"
 
 namespace splatctrl {
 
-constexpr int kLanes = 16;  // spheres of a cluster, clusters of a group
-constexpr float kFar = 3e38f;
-
-struct Point {
-  float x, y, z;
+struct Boxes8 {
+  Float8 lower[3], upper[3];
 };
 
-// Views of C clusters (a multiple of 16) and G groups (a multiple of 8). Boxes (6, C + G): lower then upper corner,
-// clusters then groups. Spare entries stand far away with an offset of -1e30.
-struct Clusters {
-  int num_clusters, num_groups;
-  const float *x, *y, *z;  // (16 C)
-  const float* boxes[6];   // (C + G) each
-};
-
-// One offset for each sphere, and the largest of each cluster and group.
-struct Offsets {
-  const float* value;    // (16 C)
-  const float* maximum;  // (C + G)
-};
-
-// Squared distances from q to eight boxes, the first of them at `box`.
-inline Float8 squared_box_distances(const Clusters& s, int box, Point q) {
-  const Float8 zero{};
-  const Float8 dx = max8(load8(s.boxes[0] + box) - q.x, q.x - load8(s.boxes[3] + box));
-  const Float8 dy = max8(load8(s.boxes[1] + box) - q.y, q.y - load8(s.boxes[4] + box));
-  const Float8 dz = max8(load8(s.boxes[2] + box) - q.z, q.z - load8(s.boxes[5] + box));
-  const Float8 x = max8(dx, zero), y = max8(dy, zero), z = max8(dz, zero);
-  return x * x + y * y + z * z;
+// Eight boxes, the first of them at `box`.
+inline Boxes8 boxes_at(const Clusters& s, int box) {
+  return {{load8(s.boxes[0] + box), load8(s.boxes[1] + box), load8(s.boxes[2] + box)},
+          {load8(s.boxes[3] + box), load8(s.boxes[4] + box), load8(s.boxes[5] + box)}};
 }
+
+// Squared distances from q to eight boxes.
+inline Float8 squared_box_distances(const Clusters& s, int box, Point q) { return squared_box_distance(boxes_at(s, box), q); }
 
 inline Float8 box_distances(const Clusters& s, int box, Point q) { return sqrt8(squared_box_distances(s, box, q)); }
 
 // Distances from q to the farthest corners of eight boxes.
 inline Float8 farthest_corners(const Clusters& s, int box, Point q) {
-  const Float8 dx = max8(q.x - load8(s.boxes[0] + box), load8(s.boxes[3] + box) - q.x);
-  const Float8 dy = max8(q.y - load8(s.boxes[1] + box), load8(s.boxes[4] + box) - q.y);
-  const Float8 dz = max8(q.z - load8(s.boxes[2] + box), load8(s.boxes[5] + box) - q.z);
-  return sqrt8(dx * dx + dy * dy + dz * dz);
+  return sqrt8(squared_farthest_corner(boxes_at(s, box), q));
 }
 
 // Squared distances from q to eight spheres' centres, the first of them at `entry`.
@@ -60,25 +34,6 @@ inline Float8 squared_center_distances(const Clusters& s, int entry, Point q) {
 }
 
 inline Float8 center_distances(const Clusters& s, int entry, Point q) { return sqrt8(squared_center_distances(s, entry, q)); }
-
-// The kinds of score, of a squared distance and an offset; a bound of a box is the same of its distance and maximum.
-struct LinearScore {
-  static Float8 of(Float8 squared, Float8 offset) { return sqrt8(squared) - offset; }
-};
-struct SquaredScore {
-  static Float8 of(Float8 squared, Float8 offset) { return squared - offset; }
-};
-
-// What float32 may have lost in any score near `score` at q: added to every threshold, so that culls stay exact.
-inline float rounding_slack(Point q, float score) {
-  return 4e-6f * (std::fabs(q.x) + std::fabs(q.y) + std::fabs(q.z) + std::fabs(score)) + 1e-30f;
-}
-
-// The least score at q and the first entry that has it.
-struct Nearest {
-  float score;
-  int entry;
-};
 
 // Clusters whose bound at a point may count, and work space for finding them.
 struct Candidates {

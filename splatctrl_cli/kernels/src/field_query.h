@@ -38,12 +38,4 @@ inline float largest_of(const float* values, int count) {
   return largest;
 }
 
-// By how much the logarithm of the Gaussian sum may fall short where the distance is `distance`, so that the distance
-// grows by no more than `tolerance`: (d + t)^2 - d^2 = 2 l^2 log_share. At most a thousandth, for the gradient's sake.
-inline float gaussian_log_share(float distance, float tolerance, float length) {
-  const float d = distance > tolerance ? 2.0f * distance - tolerance : tolerance;
-  const float share = 0.5f * (tolerance / length) * (d / length);
-  return share < 1e-3f ? share : 1e-3f;
-}
-
 }  // namespace splatctrl

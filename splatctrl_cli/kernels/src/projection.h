@@ -3,11 +3,7 @@
 
 #include <cmath>
 
-#if defined(__CUDACC__)
-#define SPLATCTRL_HOST_DEVICE __host__ __device__
-#else
-#define SPLATCTRL_HOST_DEVICE
-#endif
+#include "host_device.h"
 
 namespace splatctrl {
 

@@ -178,6 +178,7 @@ inline unsigned __ballot_sync(unsigned, int value) {
       emulated::folded(static_cast<std::uint64_t>(value != 0) << emulated::current % 32, first, first + 32,
                        emulated::Waits::kWarp, [](std::uint64_t a, std::uint64_t b) { return a | b; }));
 }
+inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __ffs(int bits) { return __builtin_ffs(bits); }
 inline int atomicAdd(int* at, int value) { return std::exchange(*at, *at + value); }
 inline int atomicMax(int* at, int value) { return std::exchange(*at, *at > value ? *at : value); }
@@ -187,6 +188,9 @@ inline float __fmul_rn(float a, float b) { return a * b; }
 inline float __fadd_rn(float a, float b) { return a + b; }
 inline float __fdividef(float a, float b) { return a / b; }
 inline float exp2_fast(float x) { return std::exp2(x); }
+inline float sqrt_fast(float x) { return std::sqrt(x); }
+inline float inverse_root_fast(float x) { return 1.0f / std::sqrt(x); }
+inline float not_a_number() { return std::nanf(""); }
 inline unsigned __float_as_uint(float x) {
   unsigned bits;
   std::memcpy(&bits, &x, sizeof bits);

@@ -1,5 +1,6 @@
-// The kernels of the fit as a library of the processor's.
+// The kernels of the fit and of the fields as a library of the processor's.
 #include "device.h"
+#include "field.cu"
 #include "fit.cu"
 
 extern "C" {
@@ -17,6 +18,14 @@ int launch(const char* name, const int* grid, int block, void** arguments) {
   KERNEL(loss_gradient);
   KERNEL(blend_backward);
   KERNEL(step);
+  KERNEL(bake_hard);
+  KERNEL(bake_gaussian);
+  KERNEL(bake_matern);
+  KERNEL(query_hard);
+  KERNEL(query_gaussian);
+  KERNEL(query_matern);
+  KERNEL(choose);
+  KERNEL(settle);
   return 0;
 }
 }

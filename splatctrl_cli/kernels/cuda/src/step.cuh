@@ -6,8 +6,8 @@
 namespace splatctrl {
 
 constexpr int kStepThreads = 128;
-constexpr int kLanes = kNumParameters;  // threads of a splat
-static_assert(kNumSums <= 2 * kLanes, "two sums a thread");
+constexpr int kSplatLanes = kNumParameters;  // threads of a splat
+static_assert(kNumSums <= 2 * kSplatLanes, "two sums a thread");
 
 // The derivatives by a footprint, and its sums over the tiles of its pixels' moments.
 __device__ inline FootprintGradient footprint_gradient(const TileSplat& s, const float (&sums)[kNumSums]) {
@@ -16,7 +16,7 @@ __device__ inline FootprintGradient footprint_gradient(const TileSplat& s, const
           -0.5f * sums[5],           sums[9],                   sums[0] / s.opacity};
 }
 
-// The sums over the parts of a splat, by one group of kLanes threads, for each of them.
+// The sums over the parts of a splat, by one group of kSplatLanes threads, for each of them.
 __device__ inline void gather(const float* parts, int first, int count, int lane, float (&sums)[kNumSums]) {
   float2 sum = make_float2(0.0f, 0.0f);
   if (2 * lane < kNumSums) {
@@ -30,8 +30,8 @@ __device__ inline void gather(const float* parts, int first, int count, int lane
   }
 #pragma unroll
   for (int k = 0; k < kNumSums / 2; ++k) {
-    sums[2 * k] = __shfl_sync(kAllLanes, sum.x, k, kLanes);
-    sums[2 * k + 1] = __shfl_sync(kAllLanes, sum.y, k, kLanes);
+    sums[2 * k] = __shfl_sync(kAllLanes, sum.x, k, kSplatLanes);
+    sums[2 * k + 1] = __shfl_sync(kAllLanes, sum.y, k, kSplatLanes);
   }
 }
 
@@ -81,7 +81,7 @@ extern "C" __global__ void __launch_bounds__(kStepThreads)
     if (threadIdx.x == 0) counters->next = iteration + 1;
     return;
   }
-  const int lane = threadIdx.x % kLanes, i = ((blockIdx.x - 1) * kStepThreads + threadIdx.x) / kLanes;
+  const int lane = threadIdx.x % kSplatLanes, i = ((blockIdx.x - 1) * kStepThreads + threadIdx.x) / kSplatLanes;
   const bool is_splat = i < num_splats;
   const int count = is_splat ? num_parts[i] : 0;
   float sums[kNumSums];
@@ -91,7 +91,7 @@ extern "C" __global__ void __launch_bounds__(kStepThreads)
   float value = parameters[at];
   float p[kNumParameters], g[kNumParameters];
 #pragma unroll
-  for (int k = 0; k < kNumParameters; ++k) p[k] = __shfl_sync(kAllLanes, value, k, kLanes);
+  for (int k = 0; k < kNumParameters; ++k) p[k] = __shfl_sync(kAllLanes, value, k, kSplatLanes);
   OptimiserSettings settings = run->settings;
   settings.seed += static_cast<std::uint64_t>(iteration);
   const Camera& camera = views[which].camera;
@@ -113,7 +113,7 @@ extern "C" __global__ void __launch_bounds__(kStepThreads)
     gradients[at] = 0.0f;
   }
 #pragma unroll
-  for (int k = 0; k < kNumParameters; ++k) p[k] = __shfl_sync(kAllLanes, value, k, kLanes);
+  for (int k = 0; k < kNumParameters; ++k) p[k] = __shfl_sync(kAllLanes, value, k, kSplatLanes);
   if (!is_seen || gradients != nullptr) return;
   limit(camera, settings, p);
   add_noise(settings, i, p);

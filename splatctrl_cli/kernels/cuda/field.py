@@ -1,0 +1,188 @@
+"""Distance fields on a device: the exact one and those of kernels, at the cells of grids and at points.
+
+Shapes: N spheres laid out as C clusters (kernels/field.py), Q points, (X, Y, Z) cells.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatctrl_cli.kernels.cuda.memory import Array, Launch, Memory
+from splatctrl_cli.kernels.field import LANES, Clusters, Float32, GridSpan, Int32, LogSumExp, Offsets
+
+# As field.h and field_query.cuh lay them out.
+CLUSTERS = np.dtype([("counts", "i4", 2), ("centers", "u8", 3), ("boxes", "u8", 6)], align=True)
+GRID = np.dtype(
+    [("place", "f8", 4), ("size", "i4", 3), ("planes", "i4", 2), ("mask", "u8"), ("num_threads", "i4")], align=True
+)
+FIELD = np.dtype(
+    [("spheres", CLUSTERS), ("offsets", "u8", 2), ("exact", "u8"), ("radius", "u8"), ("sign", "u8"),
+     ("numbers", "f4", 4), ("grid", GRID), ("points", "u8"), ("num_points", "i4"), ("out", "u8", 3)],
+    align=True,
+)  # fmt: skip
+CHOICE = np.dtype(
+    [("hard", "u8", 2), ("kernel", "u8", 2), ("out", "u8", 3), ("counts", "u8"), ("num", "i8"), ("margin", "f8"),
+     ("resolution", "f4"), ("takes_least", "i4")],
+    align=True,
+)  # fmt: skip
+WARP, WARPS, CHOOSE = 32, 4, 256  # threads of a warp, warps of a block, threads of a block that chooses
+SUB_BLOCK = 4  # cells along each axis that a warp bakes
+FAR = 3e38
+HARD = "hard"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Which distance is taken: the exact one, or where a kernel is named the smaller of both, or (is_single) the
+    kernel's where it has one. resolution [m]: by more than this a kernel is to exceed the exact distance to be counted.
+    """
+
+    kernel: str | None
+    is_single: bool = False
+    resolution: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answers:
+    """Of (X, Y, Z) cells or (Q,) points: the exact distance, the chosen one and its gradient, bound (the exact one less
+    the margin), the entry of the nearest sphere, by kernel its distance (the exact one where it has none), each [m].
+
+    counts: of a kernel the cells without a distance, and those where it exceeds the exact one.
+    """
+
+    hard: Float32
+    distance: Float32
+    gradient: Float32 | None
+    bound: Float32 | None
+    entry: Int32 | None
+    kernels: Mapping[str, Float32]
+    counts: Mapping[str, tuple[int, int]]
+
+
+class DeviceField:
+    """The fields of N spheres on a device, where what they are made of stays."""
+
+    def __init__(
+        self, device: Memory, spheres: Clusters, radii: Offsets, kernels: Mapping[str, LogSumExp], choice: Choice
+    ) -> None:
+        """kernels: by name, those that are wanted. Raises OutOfMemory."""
+        self.device, self.choice, self._kernels = device, choice, kernels
+        self._rooms: dict[str, tuple[int, int]] = {}  # address and bytes
+        self.launches: list[Launch] = []  # of the last answer
+        base = np.zeros((), FIELD)
+        base["spheres"]["counts"] = (spheres.centers.shape[1] // LANES, 0)
+        base["numbers"] = (0.0, 0.0, FAR, np.log(spheres.centers.shape[1]))
+        for name, values in {"centers": spheres.centers, "boxes": spheres.boxes}.items():
+            rows = 4 * values.shape[1] * np.arange(len(values))
+            base["spheres"][name] = self._put(name, values) + rows.astype(np.uint64)
+        self._tasks = {HARD: self._with_offsets(base, HARD, radii)}
+        for name, kernel in kernels.items():
+            task = self._with_offsets(base, name, kernel.offsets)
+            task["exact"] = self._put(f"{name}.exact", kernel.exact)
+            task["radius"] = self._put(f"{name}.radii", kernel.radii)
+            task["numbers"][:2] = (kernel.length, kernel.tolerance)
+            if kernel.sign is not None:
+                task["sign"] = self._put(f"{name}.sign", kernel.sign)
+                task["numbers"][2] = kernel.radii.max()
+            self._tasks[name] = task
+
+    def close(self) -> None:
+        """Give back the memory."""
+        for address, _ in self._rooms.values():
+            self.device.free(address)
+        self._rooms = {}
+
+    def bake(
+        self, span: GridSpan, *, with_gradient: bool = True, with_entry: bool = False, margin: float | None = None
+    ) -> Answers:
+        """At the cells of a span, whose mask does not count; margin: what `bound` stands below the exact distance."""
+        grid = np.zeros((), GRID)
+        grid["place"], grid["size"], grid["planes"] = (*span.origin, span.voxel), span.shape, (span.first, span.last)
+        shape = span.shape_of_channel
+        num_warps = int(np.prod([-(-n // SUB_BLOCK) for n in shape]))
+        return self._answered("bake", {"grid": grid}, shape, num_warps, with_gradient, with_entry, margin)
+
+    def query(self, points: Float32, *, with_entry: bool = False) -> Answers:
+        """At points (Q, 3) relative to the spheres' anchor, Q > 0."""
+        asked = {"points": self._put("points", points), "num_points": len(points)}
+        return self._answered("query", asked, (len(points),), len(points), True, with_entry, None)
+
+    def _answered(
+        self, what: str, asked: Mapping[str, Array | int], shape: tuple[int, ...], num_warps: int,
+        with_gradient: bool, with_entry: bool, margin: float | None,
+    ) -> Answers:  # fmt: skip
+        num, launches = int(np.prod(shape)), []
+        places = {name: (self._room(f"{name}.distance", 4 * num), 0) for name in self._tasks}
+        if with_gradient:
+            for name in {HARD, self.choice.kernel or HARD}:
+                places[name] = (places[name][0], self._room(f"{name}.gradient", 12 * num))
+        entry = self._room("entry", 4 * num) if with_entry else 0
+        for name, base in self._tasks.items():
+            task = base.copy()
+            for key, value in asked.items():
+                task[key] = value
+            task["out"] = (*places[name], entry if name == HARD else 0)
+            kernel = HARD if name == HARD else "matern" if self._kernels[name].is_matern else "gaussian"
+            launches.append(self._launch(f"{what}_{kernel}", f"{name}.task", task, num_warps, WARPS, WARP * WARPS))
+        launches += self._choices(num, places, margin)
+        self.launches = launches
+        self.device.record(launches).run()
+        gradient = self._read(f"{HARD}.gradient", (*shape, 3), np.float32) if with_gradient else None
+        counts = {name: self._read(f"{name}.counts", (2,), np.int32).tolist() for name in self._kernels}
+        return Answers(
+            hard=self._read(f"{HARD}.distance", shape, np.float32),
+            distance=self._read("distance", shape, np.float32),
+            gradient=gradient,
+            bound=None if margin is None else self._read("bound", shape, np.float32),
+            entry=self._read("entry", shape, np.int32) if with_entry else None,
+            kernels={name: self._read(f"{name}.distance", shape, np.float32) for name in self._kernels},
+            counts={name: (first, second) for name, (first, second) in counts.items()},
+        )
+
+    def _choices(self, num: int, places: Mapping[str, tuple[int, int]], margin: float | None) -> list[Launch]:
+        """The choice between the exact distance and the kernel's, then what is counted of each kernel."""
+        task = np.zeros((), CHOICE)
+        task["hard"], task["num"], task["margin"] = places[HARD], num, margin or 0.0
+        task["resolution"], task["takes_least"] = self.choice.resolution, not self.choice.is_single
+        bound = 0 if margin is None else self._room("bound", 4 * num)
+        task["out"] = (self._room("distance", 4 * num), places[HARD][1], bound)
+        launches = []
+        for name in self._kernels:
+            of_kernel = task.copy()
+            of_kernel["kernel"], of_kernel["counts"] = places[name], self._put(f"{name}.counts", np.zeros(2, np.int32))
+            launches.append(self._launch("settle", f"{name}.settled", of_kernel, num, CHOOSE, CHOOSE))
+        if self.choice.kernel is not None:
+            task["kernel"] = places[self.choice.kernel]
+        return [self._launch("choose", "choice", task, num, CHOOSE, CHOOSE), *launches]
+
+    def _launch(self, kernel: str, name: str, task: Array, num: int, per_block: int, threads: int) -> Launch:
+        """Of a kernel whose task is given to it by address, for `num` warps or cells."""
+        grid = (-(-num // per_block), 1, 1)
+        return Launch(kernel=kernel, grid=grid, block=threads, arguments=(self._put(name, task),))
+
+    def _with_offsets(self, base: Array, name: str, offsets: Offsets) -> Array:
+        task = base.copy()
+        task["offsets"] = (self._put(f"{name}.offsets", offsets.values), self._put(f"{name}.maxima", offsets.maxima))
+        return task
+
+    def _room(self, name: str, num_bytes: int) -> int:
+        """The address of memory of that name that holds so many bytes."""
+        address, size = self._rooms.get(name, (0, 0))
+        if size < num_bytes:
+            if address:
+                self.device.free(address)
+                del self._rooms[name]
+            address = self.device.allocate(num_bytes)
+            self._rooms[name] = (address, num_bytes)
+        return address
+
+    def _put(self, name: str, values: Array) -> int:
+        address = self._room(name, max(values.nbytes, 1))
+        self.device.write(address, values)
+        return address
+
+    def _read(self, name: str, shape: tuple[int, ...], kind: type[np.generic]) -> Array:
+        out = np.empty(shape, kind)
+        self.device.read(self._rooms[name][0], out)
+        return out
